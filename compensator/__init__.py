@@ -1,0 +1,1 @@
+"""Thermal error compensation for machine tools."""

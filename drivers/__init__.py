@@ -1,0 +1,1 @@
+"""Device drivers: protocols of thermocouple modules and displacement controllers."""

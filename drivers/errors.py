@@ -1,0 +1,64 @@
+"""Errors of the drivers.
+
+```
+DriverError                 names the device (or line) and what happened
+├── DriverConfigError       a table of the configuration is wrong: key, value, what was expected
+├── DeviceTimeout           nothing came back in time
+├── DeviceDisconnected      the port, adapter or socket is gone
+├── DeviceRefused           the device answered with an exception or error reply
+└── DeviceGarbled           what came back is not a valid frame: checksum, length, text
+```
+
+A bad sensor behind a healthy device is not an error: it is a `Reading` with a quality.
+"""
+
+from __future__ import annotations
+
+
+class DriverError(Exception):
+    """Base of all errors of the drivers.
+
+    Parameters
+    ----------
+    device : str
+        Name of the device or line, as in the configuration.
+    message : str
+        What happened, with value, limit and unit where there are any.
+    """
+
+    code = "device_error"
+
+    def __init__(self, device: str, message: str) -> None:
+        super().__init__(f"{device}: {message}")
+        self.device = device
+        self.message = message
+
+
+class DriverConfigError(DriverError):
+    """A table of the configuration cannot be used."""
+
+    code = "device_config"
+
+
+class DeviceTimeout(DriverError):
+    """Nothing came back in time."""
+
+    code = "device_timeout"
+
+
+class DeviceDisconnected(DriverError):
+    """The port, adapter or socket is gone."""
+
+    code = "device_disconnected"
+
+
+class DeviceRefused(DriverError):
+    """The device answered with an exception or an error reply."""
+
+    code = "device_refused"
+
+
+class DeviceGarbled(DriverError):
+    """What came back is not a valid frame."""
+
+    code = "device_garbled"

@@ -1,0 +1,1 @@
+"""Simulated machine and devices: an independent witness for tests and the demo."""
