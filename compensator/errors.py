@@ -1,0 +1,56 @@
+"""Errors of the compensator.
+
+```
+CompensatorError            one line: file, row or key, value, what was expected
+├── UsageError              the command was called wrongly                   exit code 2
+├── ConfigError             the configuration cannot be used                 exit code 2
+├── ModelError              a model file or its dynamics cannot be used      exit code 2
+├── DataError               a table or recording cannot be used              exit code 2
+├── ServiceError            the service cannot go on                         exit code 1
+└── AuditDifference         a recording and its recomputation differ         exit code 3
+```
+
+Errors of devices are `drivers.DriverError`; the sampler turns them into qualities.
+"""
+
+from __future__ import annotations
+
+
+class CompensatorError(Exception):
+    """Base of all errors of the compensator."""
+
+    exit_code = 1
+
+
+class UsageError(CompensatorError):
+    """The command was called wrongly."""
+
+    exit_code = 2
+
+
+class ConfigError(CompensatorError):
+    """The configuration cannot be used."""
+
+    exit_code = 2
+
+
+class ModelError(CompensatorError):
+    """A model file, or the dynamics that it describes, cannot be used."""
+
+    exit_code = 2
+
+
+class DataError(CompensatorError):
+    """A table or recording cannot be used."""
+
+    exit_code = 2
+
+
+class ServiceError(CompensatorError):
+    """The service cannot go on."""
+
+
+class AuditDifference(CompensatorError):
+    """A recording and its recomputation differ."""
+
+    exit_code = 3

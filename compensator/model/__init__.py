@@ -1,0 +1,1 @@
+"""Transfer functions, the thermal model and its file, the streaming engine, effects."""

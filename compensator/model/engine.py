@@ -1,0 +1,377 @@
+"""The streaming engine: a thermal model and its effects, one sample at a time.
+
+The service, `simulate`, `identify`, `diagnose` and `replay` run this class and no other. `run` is `step` over a
+whole record, so both give the same bits. A step takes constant time, but for the one that ends a gap: it goes
+back to the last complete sample and walks over the missing ones with interpolated inputs, at most
+`bridge_samples` of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.errors import ModelError
+from compensator.model.effects import Effect, Signals, kinds
+from compensator.model.observer import Observer, ObserverState
+from compensator.model.thermal_model import ThermalModel
+
+Vector = npt.NDArray[np.float64]
+NAN = float("nan")
+
+#: Longest run of incomplete samples that is walked over again once both temperatures are back.
+BRIDGE_SAMPLES = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Values that the inputs are taken as changes from.
+
+    Parameters
+    ----------
+    t_q_degc, at_degc : float
+        Temperatures at the zero, °C.
+    """
+
+    t_q_degc: float
+    at_degc: float
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What the engine knows after a sample.
+
+    Parameters
+    ----------
+    heat_w : float
+        Estimated heat, W; NaN in a direct model.
+    heat_std_w : float
+        Its standard deviation, W; NaN in a direct model.
+    y_dtf_um, y_tdtf_um : float
+        Shares of the two paths, µm.
+    y_effects_um : tuple of float
+        Share of each effect, µm, in the order of the model file.
+    y_um : float
+        Predicted deformation, µm.
+    y_std_um : float
+        Its standard deviation: sensor noise, missing samples and the model's own error, µm.
+    y_rate_um_per_min : float
+        Growth over the next sample, with heat and ambient as they are, µm/min.
+    """
+
+    heat_w: float
+    heat_std_w: float
+    y_dtf_um: float
+    y_tdtf_um: float
+    y_effects_um: tuple[float, ...]
+    y_um: float
+    y_std_um: float
+    y_rate_um_per_min: float
+
+
+@dataclass(frozen=True, slots=True)
+class EngineState:
+    """Everything the engine must remember to go on with the same bits."""
+
+    observer: ObserverState
+    effects: tuple[tuple[float, ...], ...]
+    channels: tuple[tuple[str, float], ...]
+    reference: Reference
+
+
+@dataclass(frozen=True, slots=True)
+class _Inputs:
+    """Inputs of one sample as the engine uses them: changes of the temperatures, channels as they are."""
+
+    t_q_k: float
+    at_k: float
+    channels: dict[str, float]
+
+    @property
+    def complete(self) -> bool:
+        return not (
+            math.isnan(self.t_q_k) or math.isnan(self.at_k) or any(map(math.isnan, self.channels.values()))
+        )
+
+
+@dataclass(slots=True)
+class _Gap:
+    """Incomplete samples since the last complete one, kept to be walked over again."""
+
+    state: EngineState
+    before: _Inputs
+    samples: list[_Inputs]
+
+
+class Engine:
+    """Runs a thermal model over samples.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        What to run.
+    bridge_samples : int
+        Longest gap that is interpolated; a longer one is left as predicted.
+
+    Raises
+    ------
+    ModelError
+        If the model has an effect of an unknown kind.
+
+    Examples
+    --------
+    >>> from compensator.model.model_file import load_model
+    >>> engine = Engine(load_model("quill"))
+    >>> engine.set_reference(20.0, 20.0)
+    >>> round(engine.step(20.0, 20.0).y_um, 6)
+    0.0
+    """
+
+    def __init__(self, model: ThermalModel, *, bridge_samples: int = BRIDGE_SAMPLES) -> None:
+        self.model = model
+        self.bridge_samples = bridge_samples
+        self._observer = Observer(model)
+        self._effects = [_make_effect(model, i) for i in range(len(model.effects))]
+        self.channels = tuple(dict.fromkeys(c for effect in self._effects for c in effect.channels))
+        self._period_min = model.period_s / 60.0
+        absolute = model.inputs == "absolute"
+        self._reference = Reference(0.0, 0.0) if absolute else Reference(NAN, NAN)
+        self._held: dict[str, float] = {}
+        self._last_complete: _Inputs | None = None
+        self._gap: _Gap | None = None
+        self._signals = Signals()
+
+    # ------------------------------------------------------------------ reference and state
+
+    @property
+    def reference(self) -> Reference:
+        """What the inputs are taken as changes from."""
+        return self._reference
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether the inputs have a reference yet."""
+        return not (math.isnan(self._reference.t_q_degc) or math.isnan(self._reference.at_degc))
+
+    def set_reference(self, t_q_degc: float, at_degc: float) -> None:
+        """Start at rest, with these temperatures as zero (ignored where the model takes them as they are).
+
+        Raises
+        ------
+        ModelError
+            If one of them is missing.
+        """
+        if math.isnan(t_q_degc) or math.isnan(at_degc):
+            raise ModelError("a zero needs both temperatures; one is missing")
+        if self.model.inputs == "changes":
+            self._reference = Reference(t_q_degc, at_degc)
+        self._observer.reset()
+        self._effects = [_make_effect(self.model, i) for i in range(len(self.model.effects))]
+        self._held = {}
+        self._last_complete = self._gap = None
+
+    def snapshot(self) -> EngineState:
+        """Return the state after the last sample."""
+        return EngineState(
+            observer=self._observer.snapshot(),
+            effects=tuple(effect.snapshot() for effect in self._effects),
+            channels=tuple(self._held.items()),
+            reference=self._reference,
+        )
+
+    def restore(self, state: EngineState) -> None:
+        """Go on from a snapshot.
+
+        Raises
+        ------
+        ValueError
+            If it belongs to another model.
+        """
+        if len(state.effects) != len(self._effects):
+            raise ValueError(f"snapshot of {len(state.effects)} effects, the model has {len(self._effects)}")
+        self._observer.restore(state.observer)
+        for effect, effect_state in zip(self._effects, state.effects, strict=True):
+            effect.restore(effect_state)
+        self._held = dict(state.channels)
+        self._reference = state.reference
+        self._last_complete = self._gap = None
+
+    # ------------------------------------------------------------------ one sample
+
+    def step(self, t_q_degc: float, at_degc: float, channels: Mapping[str, float] | None = None) -> Estimate:
+        """Take one sample in.
+
+        Parameters
+        ----------
+        t_q_degc, at_degc : float
+            Temperatures, °C; NaN where missing.
+        channels : mapping of str to float, optional
+            Auxiliary channels that the effects use; NaN or absent where missing.
+
+        Returns
+        -------
+        Estimate
+            Heat and deformation after this sample.
+
+        Raises
+        ------
+        ModelError
+            If there is no reference yet.
+        """
+        if not self.has_reference:
+            raise ModelError("the engine has no reference yet: call set_reference first")
+        given = channels or {}
+        inputs = _Inputs(
+            t_q_k=t_q_degc - self._reference.t_q_degc,
+            at_k=at_degc - self._reference.at_degc,
+            channels={name: given.get(name, NAN) for name in self.channels},
+        )
+        if inputs.complete:
+            if self._gap is not None:
+                self._walk_over(self._gap, inputs)
+                self._gap = None
+            self._last_complete = inputs
+        else:
+            self._keep(inputs)
+        return self._advance(inputs)
+
+    def run(
+        self, t_q_degc: Sequence[float] | Vector, at_degc: Sequence[float] | Vector,
+        channels: Mapping[str, Sequence[float] | Vector] | None = None,
+    ) -> list[Estimate]:  # fmt: skip
+        """Take a whole record in, sample by sample.
+
+        Parameters
+        ----------
+        t_q_degc, at_degc : array_like, shape (n,)
+            Temperatures, °C; NaN where missing.
+        channels : mapping of str to array_like, shape (n,), optional
+            Auxiliary channels.
+
+        Returns
+        -------
+        list of Estimate, length n
+            One for each sample.
+
+        Raises
+        ------
+        ModelError
+            If there is no reference yet.
+        """
+        t_q = np.asarray(t_q_degc, dtype=float).tolist()
+        at = np.asarray(at_degc, dtype=float).tolist()
+        columns = {
+            name: np.asarray(values, dtype=float).tolist() for name, values in (channels or {}).items()
+        }
+        return [
+            self.step(t_q[i], at[i], {name: values[i] for name, values in columns.items()})
+            for i in range(len(t_q))
+        ]
+
+    # ------------------------------------------------------------------ inside
+
+    def _advance(self, inputs: _Inputs, extra_t_q_k2: float = 0.0, extra_at_k2: float = 0.0) -> Estimate:
+        observer = self._observer
+        observer.step(inputs.t_q_k, inputs.at_k, extra_t_q_k2=extra_t_q_k2, extra_at_k2=extra_at_k2)
+        dtf, tdtf = observer.shares_um()
+        shares = self._step_effects(inputs, dtf, tdtf) if self._effects else ()
+        y = dtf + tdtf
+        for (
+            share
+        ) in shares:  # not sum(): newer Pythons compensate it, and the bits would depend on the version
+            y += share
+        dtf_ahead, tdtf_ahead = observer.shares_ahead_um()
+        rate = (dtf_ahead + tdtf_ahead - dtf - tdtf) / self._period_min
+        if self._effects:
+            rate += self._effects_rate(dtf_ahead, tdtf_ahead, shares)
+        heat = self.model.kind == "heat"
+        return Estimate(
+            heat_w=observer.drive if heat else NAN,
+            heat_std_w=observer.drive_std if heat else NAN,
+            y_dtf_um=dtf,
+            y_tdtf_um=tdtf,
+            y_effects_um=shares,
+            y_um=y,
+            y_std_um=math.sqrt(observer.y_variance_um2 + self.model.y_std_um**2),
+            y_rate_um_per_min=rate,
+        )
+
+    def _step_effects(self, inputs: _Inputs, dtf: float, tdtf: float) -> tuple[float, ...]:
+        """Step every effect; a channel that is missing keeps its last good value."""
+        for name, value in inputs.channels.items():
+            if not math.isnan(value):
+                self._held[name] = value
+        signals = self._signals
+        signals.drive, signals.ambient_k = self._observer.drive, self._observer.ambient_k
+        difference = inputs.t_q_k - inputs.at_k
+        signals.difference_k = self._observer.difference_k if math.isnan(difference) else difference
+        signals.y_dtf_um, signals.y_tdtf_um = dtf, tdtf
+        signals.channels = self._held
+        return tuple(effect.step(signals) for effect in self._effects)
+
+    def _effects_rate(self, dtf_ahead: float, tdtf_ahead: float, shares: tuple[float, ...]) -> float:
+        """Growth of the effects over the next sample: step them on the signals ahead, then take that back."""
+        signals = self._signals
+        signals.y_dtf_um, signals.y_tdtf_um = dtf_ahead, tdtf_ahead
+        growth = 0.0
+        for effect, share in zip(self._effects, shares, strict=True):
+            state = effect.snapshot()
+            growth += effect.step(signals) - share
+            effect.restore(state)
+        return growth / self._period_min
+
+    def _keep(self, inputs: _Inputs) -> None:
+        """Keep an incomplete sample, as long as a walk over the gap is still wanted."""
+        if self._gap is None and self._last_complete is not None:
+            self._gap = _Gap(state=self.snapshot(), before=self._last_complete, samples=[])
+        if self._gap is not None:
+            self._gap.samples.append(inputs)
+            if len(self._gap.samples) > self.bridge_samples:
+                self._gap = self._last_complete = None
+
+    def _walk_over(self, gap: _Gap, after: _Inputs) -> None:
+        """Go back to the last complete sample and step over the gap with interpolated inputs."""
+        reference = self._reference
+        self.restore(gap.state)
+        self._reference = reference
+        n = len(gap.samples) + 1
+        estimator = self.model.estimator
+        feed = self.model.ttf.sampled.b[0] if self.model.ttf else 1.0
+        at_walk = estimator.at_walk_std_k**2
+        t_q_walk = (feed * estimator.drive_walk_std) ** 2 + at_walk
+        for i, sample in enumerate(gap.samples, start=1):
+            t_q, t_q_missing = _interpolated(sample.t_q_k, gap.before.t_q_k, after.t_q_k, i / n)
+            at, at_missing = _interpolated(sample.at_k, gap.before.at_k, after.at_k, i / n)
+            channels = {
+                name: _interpolated(value, gap.before.channels[name], after.channels[name], i / n)[0]
+                for name, value in sample.channels.items()
+            }
+            # Variance of a random walk that is pinned at both ends.
+            bridge = i * (n - i) / n
+            self._advance(
+                _Inputs(t_q, at, channels),
+                extra_t_q_k2=bridge * t_q_walk if t_q_missing else 0.0,
+                extra_at_k2=bridge * at_walk if at_missing else 0.0,
+            )
+
+
+def _interpolated(value: float, before: float, after: float, part: float) -> tuple[float, bool]:
+    """Return the value, or the straight line between its neighbours where it is missing, and whether it was."""
+    if not math.isnan(value):
+        return value, False
+    return before + part * (after - before), True
+
+
+def _make_effect(model: ThermalModel, index: int) -> Effect:
+    entry = model.effects[index]
+    maker = kinds().get(entry.kind)
+    if maker is None:
+        known = ", ".join(sorted(kinds())) or "none yet"
+        raise ModelError(
+            f"model {model.name}: effect {index + 1} has kind {entry.kind!r}, expected one of: {known}"
+        )
+    return maker.from_table(entry.table, model.period_s)

@@ -1,0 +1,244 @@
+"""The model file: TOML that an engineer can read and edit.
+
+The reader takes the file apart table by table and refuses what it does not know, naming file, table, key,
+value and what was expected. The writer puts comments beside the numbers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path as FilePath
+from typing import Any
+
+from compensator.errors import CompensatorError, ModelError
+from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
+from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
+
+#: Models that ship with the package.
+BUILT_IN = ("quill",)
+
+_TOP = ("schema", "name", "kind", "sample_period_s", "inputs", "paths", "alternatives", "estimator", "validity",
+        "uncertainty", "provenance", "effect", "description")  # fmt: skip
+_ESTIMATOR = ("method", "t_q_noise_std_k", "at_noise_std_k", "at_walk_std_k")
+_FORMS = {"continuous": ("numerator", "denominator"), "sampled": ("b", "a")}
+
+
+def load_model(name: str | FilePath) -> ThermalModel:
+    """Read a model.
+
+    Parameters
+    ----------
+    name : str or pathlib.Path
+        A TOML file, or the name of a model that ships with the package.
+
+    Returns
+    -------
+    ThermalModel
+        With the hash of the file's bytes.
+
+    Raises
+    ------
+    ModelError
+        Naming file, table and key, when the file cannot be read or its dynamics cannot be run.
+
+    Examples
+    --------
+    >>> round(load_model("quill").dtf.in_s().dc_gain, 4)
+    1.0182
+    """
+    return parse_model(read_model_bytes(name), source=str(name))
+
+
+def read_model_bytes(name: str | FilePath) -> bytes:
+    """Return the bytes of a model file or of a built-in model.
+
+    Raises
+    ------
+    ModelError
+        If there is no such file.
+    """
+    if str(name) in BUILT_IN:
+        return resources.files("compensator.model").joinpath(f"{name}.toml").read_bytes()
+    try:
+        return FilePath(name).read_bytes()
+    except OSError as error:
+        known = ", ".join(BUILT_IN)
+        raise ModelError(
+            f"{name}: {error.strerror or error}; expected a model file or a built-in model ({known})"
+        ) from error
+
+
+def parse_model(data: bytes, *, source: str) -> ThermalModel:
+    """Make a model of the bytes of its file.
+
+    Parameters
+    ----------
+    data : bytes
+        TOML, UTF-8.
+    source : str
+        Name for messages.
+
+    Raises
+    ------
+    ModelError
+        As `load_model`.
+    """
+    try:
+        table = tomllib.loads(data.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ModelError(f"{source}: not a TOML file: {error}") from error
+    try:
+        return _model(table, hashlib.sha256(data).hexdigest())
+    except CompensatorError as error:
+        raise ModelError(f"{source}: {error}") from error
+
+
+class _Table:
+    """A table of the file that names itself when a key is wrong."""
+
+    def __init__(self, where: str, table: object, known: Sequence[str] | None = None) -> None:
+        if not isinstance(table, Mapping):
+            raise ModelError(f"{where}: expected a table, got {table!r}")
+        self.where, self.table = where, table
+        unknown = [key for key in table if known is not None and key not in known]
+        if unknown:
+            raise ModelError(
+                f"{where}: unknown key {unknown[0]!r}, expected one of: {', '.join(known or ())}"
+            )
+
+    def number(self, key: str, *, low: float = -math.inf, high: float = math.inf) -> float:
+        """Return a finite number between two bounds (inclusive)."""
+        value = self.table.get(key)
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        if not is_number or not low <= value <= high:  # type: ignore[operator]
+            bounds = "" if low == -math.inf and high == math.inf else f" from {low:g} to {high:g}"
+            raise ModelError(f"{self.where}: {key} = {_shown(value)}, expected a number{bounds}")
+        return float(value)  # type: ignore[arg-type]
+
+    def numbers(self, key: str, *, length: int | None = None) -> tuple[float, ...]:
+        """Return a list of finite numbers."""
+        values = self.table.get(key)
+        ok = isinstance(values, list) and values and all(
+            isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in values
+        )  # fmt: skip
+        if not ok or (length is not None and len(values) != length):  # type: ignore[arg-type]
+            count = f"{length} " if length else ""
+            raise ModelError(f"{self.where}: {key} = {_shown(values)}, expected a list of {count}numbers")
+        return tuple(float(v) for v in values)  # type: ignore[union-attr]
+
+    def text(self, key: str, choices: Sequence[str] | None = None, default: str | None = None) -> str:
+        """Return a string, one of the choices where there are any."""
+        value = self.table.get(key, default)
+        if not isinstance(value, str) or (choices is not None and value not in choices):
+            expected = "a string" if choices is None else "one of: " + ", ".join(choices)
+            raise ModelError(f"{self.where}: {key} = {_shown(value)}, expected {expected}")
+        return value
+
+
+def _shown(value: object) -> str:
+    return "missing" if value is None else repr(value)[:60]
+
+
+def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
+    top = _Table("model", table, _TOP)
+    if table.get("schema") != 1:
+        raise ModelError(f"schema = {_shown(table.get('schema'))}, expected 1")
+    kind = top.text("kind", ("heat", "direct"))
+    period_s = top.number("sample_period_s", low=0.1, high=3600.0)
+    names = ("TTF", "DTF", "TDTF") if kind == "heat" else ("DTF", "TDTF")
+    paths_table = _Table("paths", table.get("paths", {}), names)
+    paths = {name: _path(f"paths.{name}", value, period_s) for name, value in paths_table.table.items()}
+    for name in names[:-1]:
+        if name not in paths:
+            raise ModelError(f"paths.{name} is missing; a model of kind {kind!r} needs it")
+    return ThermalModel(
+        name=top.text("name"),
+        kind=kind,  # type: ignore[arg-type]
+        period_s=period_s,
+        ttf=paths.get("TTF"),
+        dtf=paths["DTF"],
+        tdtf=paths.get("TDTF"),
+        estimator=_estimator(table.get("estimator"), kind),
+        inputs=top.text("inputs", ("changes", "absolute"), "changes"),  # type: ignore[arg-type]
+        validity=_validity(table.get("validity", {})),
+        y_std_um=_Table("uncertainty", table.get("uncertainty", {"y_std_um": 0.0}), ("y_std_um",)).number("y_std_um", low=0.0),
+        effects=_effects(table.get("effect", [])),
+        alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
+        provenance=dict(_Table("provenance", table.get("provenance", {})).table),
+        sha256=sha256,
+    )  # fmt: skip
+
+
+def _path(where: str, value: object, period_s: float, extra: Sequence[str] = ()) -> Path:
+    table = _Table(where, value)
+    form = table.text("form", tuple(_FORMS))
+    upper, lower = _FORMS[form]
+    table = _Table(where, value, ("unit", "form", upper, lower, "covariance", *extra))
+    unit = table.text("unit")
+    top, bottom = table.numbers(upper), table.numbers(lower)
+    try:
+        if form == "continuous":
+            return Path.from_continuous(
+                TransferFunction(numerator=top, denominator=bottom, unit=unit), period_s
+            )
+        sampled = SampledTransferFunction(b=top, a=bottom, period_s=period_s)
+    except CompensatorError as error:
+        raise ModelError(f"{where}: {error}") from error
+    return Path(sampled=sampled, unit=unit, covariance=_covariance(table, len(top) + len(bottom) - 1))
+
+
+def _covariance(table: _Table, size: int) -> tuple[tuple[float, ...], ...] | None:
+    rows = table.table.get("covariance")
+    if rows is None:
+        return None
+    if not isinstance(rows, list) or len(rows) != size:
+        raise ModelError(f"{table.where}: covariance, expected {size} rows of {size} numbers")
+    return tuple(_Table(table.where, {"covariance": row}).numbers("covariance", length=size) for row in rows)
+
+
+def _estimator(value: object, kind: str) -> Estimator:
+    walk = "heat_walk_std_w" if kind == "heat" else "difference_walk_std_k"
+    table = _Table("estimator", value if value is not None else {}, (*_ESTIMATOR, walk))
+    return Estimator(
+        method=table.text("method", ("kalman", "inverse")),  # type: ignore[arg-type]
+        t_q_noise_std_k=table.number("t_q_noise_std_k"),
+        at_noise_std_k=table.number("at_noise_std_k"),
+        drive_walk_std=table.number(walk),
+        at_walk_std_k=table.number("at_walk_std_k"),
+    )
+
+
+def _validity(value: object) -> dict[str, tuple[float, float]]:
+    table = _Table("validity", value)
+    ranges: dict[str, tuple[float, float]] = {}
+    for key in table.table:
+        low, high = table.numbers(key, length=2)
+        if low >= high:
+            raise ModelError(f"validity: {key} = [{low:g}, {high:g}], expected the lower bound first")
+        ranges[key] = (low, high)
+    return ranges
+
+
+def _effects(value: object) -> tuple[EffectTable, ...]:
+    if not isinstance(value, list):
+        raise ModelError("effect: expected a list of tables, [[effect]]")
+    result = []
+    for i, entry in enumerate(value, start=1):
+        table = _Table(f"effect {i}", entry)
+        result.append(
+            EffectTable(kind=table.text("kind"), table={k: v for k, v in table.table.items() if k != "kind"})
+        )
+    return tuple(result)
+
+
+def _alternatives(value: object, names: Sequence[str], period_s: float) -> dict[str, tuple[str, Path]]:
+    result = {}
+    for name, entry in _Table("alternatives", value).table.items():
+        where = f"alternatives.{name}"
+        replaces = _Table(where, entry).text("replaces", names)
+        result[name] = (replaces, _path(where, entry, period_s, ("replaces",)))
+    return result

@@ -1,0 +1,320 @@
+"""Heat, path states and their uncertainty from T_Q and AT, one sample at a time.
+
+The three paths stand in one state vector, each in observer canonical form, with the drive *q* (heat, W, or
+T_Q − AT, K, in a direct model) and the ambient change *a* as random walks beside them:
+
+    x[k+1] = F x[k] + w,   w_q ~ N(0, drive_walk²),  w_a ~ N(0, at_walk²)
+    AT     = a + v_a
+    T_Q    = C₁ x₁ + D₁ q + a + v_q
+    y      = C₂ x₂ + D₂ q + C₃ x₃ + D₃ a
+
+Both ways to get the heat are observers of this one system and differ in their gains only:
+
+- `inverse`: a = AT and q = (T_Q − AT − C₁ x₁) / D₁, which is the paper's TTF⁻¹ to the letter;
+- `kalman`: the optimal gains for white sensor noise.
+
+A missing measurement leaves out its update: the drive stays where it was, the state moves on, and the
+covariance *P* grows. Arithmetic is scalar float or element-wise, never a matrix product of a BLAS, whose
+order of summation depends on the processor: the same inputs give the same bits on every machine, which is
+what lets an audit compare bit by bit. Once *P* has settled its recursion is left out until a sample is
+missing.
+
+Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential update, general gain).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.model.thermal_model import ThermalModel
+from compensator.model.transfer_function import SampledTransferFunction
+
+Matrix = npt.NDArray[np.float64]
+
+#: P counts as settled when no element moves by more than this, relative to its standard deviations.
+SETTLED = 1e-7
+
+_UNITY = SampledTransferFunction(b=(1.0,), a=(1.0,), period_s=60.0)
+_ZERO = SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=60.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ObserverState:
+    """What the observer must remember between two samples.
+
+    Parameters
+    ----------
+    x : tuple of float
+        State vector after the last update.
+    p : tuple of float
+        Upper triangle of its covariance, row by row.
+    settled : bool
+        Whether the covariance has reached its steady value.
+    """
+
+    x: tuple[float, ...]
+    p: tuple[float, ...]
+    settled: bool
+
+
+def _corrected(p: Matrix, gain: Matrix, column: Matrix, s: float) -> Matrix:
+    """Return P − K L' − L K' + K S K' with L = P H', which is right for any gain K."""
+    cross = np.multiply.outer(gain, column)
+    return p - (cross + cross.T) + s * np.multiply.outer(gain, gain)
+
+
+class Observer:
+    """The augmented observer of a thermal model.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        Paths, noise levels and the method of getting the heat.
+    """
+
+    def __init__(self, model: ThermalModel) -> None:
+        ttf = model.ttf.sampled if model.ttf else _UNITY
+        tdtf = model.tdtf.sampled if model.tdtf else _ZERO
+        estimator = model.estimator
+        self._kalman = estimator.method == "kalman"
+        self._r_tq = estimator.t_q_noise_std_k**2
+        self._r_at = estimator.at_noise_std_k**2
+        self._lay_out(ttf, model.dtf.sampled, tdtf)
+        self._walk = np.zeros(self.size)
+        self._walk[self._q] = estimator.drive_walk_std**2
+        self._walk[self._a] = estimator.at_walk_std_k**2
+        self._diagonal = np.arange(self.size)
+        self._upper = np.triu_indices(self.size)
+        self.reset()
+
+    def _lay_out(self, *functions: SampledTransferFunction) -> None:
+        """Number the states and write F as rows (next, first, source, a, B)."""
+        orders = [f.order for f in functions]
+        total = sum(orders)
+        self._q, self._a, self.size = total, total + 1, total + 2
+        nil = self.size  # index of a state that is always zero
+        self._first: list[int] = []
+        self._d: list[float] = []
+        rows: list[tuple[int, int, int, float, float]] = []
+        start = 0
+        for function, source in zip(functions, (self._q, self._q, self._a), strict=True):
+            a, b, d = function.observer_form()
+            n = function.order
+            self._first.append(start if n else nil)
+            self._d.append(d)
+            rows += [(start + i + 1 if i + 1 < n else nil, start, source, a[i], b[i]) for i in range(n)]
+            start += n
+        rows += [(self._q, nil, nil, 0.0, 0.0), (self._a, nil, nil, 0.0, 0.0)]
+        self._rows = rows
+        nxt, first, source, a_col, b_col = (np.array(column) for column in zip(*rows, strict=True))
+        self._next_row, self._first_row, self._source_row = nxt, first, source
+        self._a_column, self._b_column = a_col[:, None], b_col[:, None]
+
+    def reset(self) -> None:
+        """Return to rest: every state zero and known."""
+        self._x = [0.0] * (self.size + 1)
+        self._P: Matrix = np.zeros((self.size, self.size))
+        self._settled = False
+        self._started = False
+        self._steady: tuple[list[float], list[float]] = ([], [])
+        self._y_var = 0.0
+
+    # ------------------------------------------------------------------ one sample
+
+    def step(self, t_q_k: float, at_k: float, *, extra_t_q_k2: float = 0.0, extra_at_k2: float = 0.0) -> None:
+        """Move on by one sample and take its measurements in.
+
+        Parameters
+        ----------
+        t_q_k, at_k : float
+            T_Q and AT as changes from their reference, K; NaN where missing.
+        extra_t_q_k2, extra_at_k2 : float
+            Variance added to that of the sensor, K², for a value that was interpolated.
+        """
+        has_tq, has_at = not math.isnan(t_q_k), not math.isnan(at_k)
+        complete = has_tq and has_at and extra_t_q_k2 == extra_at_k2 == 0.0
+        if self._started:
+            self._x = self._moved(self._x)
+        if self._settled and complete:
+            gain_at, gain_tq = self._steady
+        else:
+            r_at = self._r_at + extra_at_k2 if has_at else None
+            r_tq = self._r_tq + extra_t_q_k2 if has_tq else None
+            gain_at, gain_tq = self._recurse(r_at, r_tq, complete)
+        if has_at:
+            self._correct(gain_at, at_k - self._x[self._a])
+        if has_tq:
+            self._correct(gain_tq, t_q_k - self._expected_t_q())
+        self._started = True
+
+    def _moved(self, x: list[float]) -> list[float]:
+        moved = [x[n] - a * x[f] + b * x[s] for n, f, s, a, b in self._rows]
+        moved.append(0.0)
+        return moved
+
+    def _correct(self, gain: list[float], innovation: float) -> None:
+        x = [value + k * innovation for value, k in zip(self._x, gain, strict=False)]
+        x.append(0.0)
+        self._x = x
+
+    def _expected_t_q(self) -> float:
+        x = self._x
+        return x[self._first[0]] + self._d[0] * x[self._q] + x[self._a]
+
+    # ------------------------------------------------------------------ covariance
+
+    def _recurse(
+        self, r_at: float | None, r_tq: float | None, complete: bool
+    ) -> tuple[list[float], list[float]]:
+        """Move the covariance on by one sample and return the gains for AT and T_Q (None: missing)."""
+        before = self._P
+        p = self._moved_covariance(before) if self._started else before
+        gain_at: list[float] = []
+        gain_tq: list[float] = []
+        if r_at is not None:
+            gain_at, p = self._update_at(p, r_at)
+        if r_tq is not None:
+            gain_tq, p = self._update_t_q(p, r_tq)
+        self._P = p
+        self._y_var = self._variance_of_y()
+        self._settled = complete and self._started and self._has_settled(before)
+        if self._settled:
+            self._steady = self._steady_gains()
+        return gain_at, gain_tq
+
+    def _steady_gains(self) -> tuple[list[float], list[float]]:
+        """Compute the gains of the steady state, a function of *P* alone so that a restart finds the same."""
+        gain_at, p = self._update_at(self._moved_covariance(self._P), self._r_at)
+        gain_tq, _ = self._update_t_q(p, self._r_tq)
+        return gain_at, gain_tq
+
+    def _f_times(self, matrix: Matrix) -> Matrix:
+        rows = np.vstack((matrix, np.zeros((1, self.size))))
+        return (
+            rows[self._next_row]
+            - self._a_column * rows[self._first_row]
+            + self._b_column * rows[self._source_row]
+        )
+
+    def _moved_covariance(self, p: Matrix) -> Matrix:
+        moved = self._f_times(self._f_times(p).T)
+        # Symmetric to the bit, because a snapshot keeps the upper triangle only.
+        moved.T[self._upper] = moved[self._upper]
+        moved[self._diagonal, self._diagonal] += self._walk
+        return moved
+
+    def _update_at(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
+        column = p[:, self._a]
+        s = float(column[self._a]) + variance
+        if self._kalman:
+            gain = column / s
+        else:
+            gain = np.zeros(self.size)
+            gain[self._a] = 1.0
+        return gain.tolist(), _corrected(p, gain, column, s)
+
+    def _update_t_q(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
+        column = self._d[0] * p[:, self._q] + p[:, self._a]
+        first = self._first[0]
+        if first < self.size:
+            column = column + p[:, first]
+        s = self._d[0] * float(column[self._q]) + float(column[self._a]) + variance
+        if first < self.size:
+            s += float(column[first])
+        if self._kalman:
+            gain = column / s
+        else:
+            gain = np.zeros(self.size)
+            gain[self._q] = 1.0 / self._d[0]
+        return gain.tolist(), _corrected(p, gain, column, s)
+
+    def _has_settled(self, before: Matrix) -> bool:
+        deviation = np.sqrt(np.maximum(self._P[self._diagonal, self._diagonal], 0.0))
+        scale = np.multiply.outer(deviation, deviation)
+        return bool(np.all(np.abs(self._P - before) <= SETTLED * scale))
+
+    def _variance_of_y(self) -> float:
+        terms = [
+            (index, weight)
+            for index, weight in (
+                (self._first[1], 1.0), (self._q, self._d[1]), (self._first[2], 1.0), (self._a, self._d[2])
+            )
+            if index < self.size
+        ]  # fmt: skip
+        total = 0.0
+        for i, wi in terms:
+            for j, wj in terms:
+                total += wi * wj * float(self._P[i, j])
+        return max(total, 0.0)
+
+    # ------------------------------------------------------------------ what it knows
+
+    @property
+    def drive(self) -> float:
+        """Estimated heat, W (T_Q − AT, K, in a direct model)."""
+        return self._x[self._q]
+
+    @property
+    def ambient_k(self) -> float:
+        """Estimated change of the ambient, K."""
+        return self._x[self._a]
+
+    @property
+    def drive_std(self) -> float:
+        """Standard deviation of the drive, in its unit."""
+        return math.sqrt(max(float(self._P[self._q, self._q]), 0.0))
+
+    @property
+    def difference_k(self) -> float:
+        """Estimated T_Q − AT, as a change from the reference, K."""
+        return self._expected_t_q() - self._x[self._a]
+
+    @property
+    def y_variance_um2(self) -> float:
+        """Variance of y that sensor noise and missing samples cause, µm²."""
+        return self._y_var
+
+    def shares_um(self) -> tuple[float, float]:
+        """Return the shares of DTF and TDTF in y, µm."""
+        return self._shares(self._x)
+
+    def shares_ahead_um(self) -> tuple[float, float]:
+        """Return the shares one sample ahead, with drive and ambient as they are, µm."""
+        return self._shares(self._moved(self._x))
+
+    def _shares(self, x: list[float]) -> tuple[float, float]:
+        dtf = x[self._first[1]] + self._d[1] * x[self._q]
+        tdtf = x[self._first[2]] + self._d[2] * x[self._a]
+        return dtf, tdtf
+
+    # ------------------------------------------------------------------ state
+
+    def snapshot(self) -> ObserverState:
+        """Return what must be kept to go on from here with the same bits."""
+        return ObserverState(
+            x=tuple(self._x[: self.size]), p=tuple(self._P[self._upper].tolist()), settled=self._settled
+        )
+
+    def restore(self, state: ObserverState) -> None:
+        """Go on from a snapshot.
+
+        Raises
+        ------
+        ValueError
+            If the snapshot belongs to a model of another size.
+        """
+        if len(state.x) != self.size or len(state.p) != self._upper[0].size:
+            raise ValueError(f"snapshot of {len(state.x)} states, the model has {self.size}")
+        self._x = [*state.x, 0.0]
+        self._P = np.zeros((self.size, self.size))
+        self._P[self._upper] = state.p
+        self._P.T[self._upper] = state.p
+        self._started = True
+        self._y_var = self._variance_of_y()
+        self._settled = state.settled
+        if state.settled:
+            self._steady = self._steady_gains()

@@ -1,0 +1,242 @@
+"""The thermal model: heat from temperatures, deformation from heat and ambient.
+
+    heat = TTF⁻¹ · (T_Q − AT)
+    y    = DTF · heat + TDTF · ΔAT + Σ effects
+
+Where nobody ever measured the heat there is no TTF: the DTF then leads from T_Q − AT straight to the
+deformation, in µm/K (`kind = "direct"`), and everything else stays as it is.
+
+Source: Mares and Barta, Mechatronic approach in modeling, identification and control of thermal
+deformation of quill, equations (1) to (5).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from compensator.errors import ModelError
+from compensator.model.transfer_function import SampledTransferFunction, TransferFunction, continuous_image
+
+Kind = Literal["heat", "direct"]
+Method = Literal["kalman", "inverse"]
+PathName = Literal["TTF", "DTF", "TDTF"]
+
+#: Unit of every path, by the kind of model.
+PATH_UNITS: Mapping[Kind, Mapping[str, str]] = {
+    "heat": {"TTF": "K/W", "DTF": "um/W", "TDTF": "um/K"},
+    "direct": {"DTF": "um/K", "TDTF": "um/K"},
+}
+
+#: An inverse pole closer to −1 than this rings for more than about a dozen samples.
+RINGING_LIMIT = -0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Path:
+    """One path of the model: a transfer function as it stands in the model file.
+
+    Parameters
+    ----------
+    sampled : SampledTransferFunction
+        What the engine evaluates.
+    unit : str
+        Unit of the gain.
+    continuous : TransferFunction, optional
+        The function in s, where the file gives that form.
+    covariance : tuple of tuple of float, optional
+        Covariance of the sampled coefficients `b_0 … b_n, a_1 … a_n`, where an identification left it.
+    """
+
+    sampled: SampledTransferFunction
+    unit: str
+    continuous: TransferFunction | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
+
+    @classmethod
+    def from_continuous(cls, function: TransferFunction, period_s: float) -> Path:
+        """Make a path from a function in s, sampled by Tustin's rule."""
+        return cls(sampled=function.sampled(period_s), unit=function.unit, continuous=function)
+
+    def in_s(self) -> TransferFunction:
+        """Return the function in s, made by the inverse of Tustin's rule where the file has z."""
+        return self.continuous or continuous_image(self.sampled, unit=self.unit)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimator:
+    """How the heat is got from the temperatures.
+
+    Parameters
+    ----------
+    method : {"kalman", "inverse"}
+        `inverse` reverses the TTF, as the paper does. `kalman` estimates heat and the states of all
+        paths together, the heat as a random walk: less noise in y, and the lag stays small.
+    t_q_noise_std_k, at_noise_std_k : float
+        White noise of a sample of T_Q and AT, K.
+    drive_walk_std : float
+        Standard deviation of the change of the drive in one sample: heat, W, or T_Q − AT, K, in a
+        direct model.
+    at_walk_std_k : float
+        Standard deviation of the change of the ambient in one sample, K.
+    """
+
+    method: Method
+    t_q_noise_std_k: float
+    at_noise_std_k: float
+    drive_walk_std: float
+    at_walk_std_k: float
+
+    def __post_init__(self) -> None:
+        for name in ("t_q_noise_std_k", "at_noise_std_k", "drive_walk_std", "at_walk_std_k"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ModelError(f"estimator: {name} = {value!r}, expected a finite number above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EffectTable:
+    """One `[[effect]]` of the model file, not yet given to its kind.
+
+    Parameters
+    ----------
+    kind : str
+        One of the registered kinds of `compensator.model.effects`.
+    table : mapping
+        Its other keys, as they stand in the file.
+    """
+
+    kind: str
+    table: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThermalModel:
+    """A thermal model that the engine can run.
+
+    Parameters
+    ----------
+    name : str
+        Name for people.
+    kind : {"heat", "direct"}
+        With a TTF, or with a DTF in µm/K and no heat.
+    period_s : float
+        Sample period, s.
+    ttf, tdtf : Path or None
+        Heat to T_Q − AT; ambient change to deformation.
+    dtf : Path
+        Heat (or T_Q − AT) to deformation.
+    estimator : Estimator
+        How the heat is got.
+    inputs : {"changes", "absolute"}
+        Whether the temperatures count from their reference or as they are.
+    validity : mapping of str to (float, float)
+        Range of `t_q_degc`, `at_degc`, `heat_w`, … on which the model was made.
+    y_std_um : float
+        Standard deviation of the model's own error in y, µm, over and above sensor noise.
+    effects : tuple of EffectTable
+        Effects added to the base.
+    alternatives : mapping of str to (str, Path)
+        Other published versions of a path, by name: the path that it replaces, and itself.
+    provenance : mapping
+        Where it comes from: source, date, hash of the data, fits.
+    sha256 : str
+        Hash of the model file's bytes; empty for a model that never was a file.
+    """
+
+    name: str
+    kind: Kind
+    period_s: float
+    ttf: Path | None
+    dtf: Path
+    tdtf: Path | None
+    estimator: Estimator
+    inputs: Literal["changes", "absolute"] = "changes"
+    validity: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    y_std_um: float = 0.0
+    effects: tuple[EffectTable, ...] = ()
+    alternatives: Mapping[str, tuple[str, Path]] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    sha256: str = ""
+
+    def __post_init__(self) -> None:
+        check_runnable(self)
+
+    def with_alternative(self, name: str) -> ThermalModel:
+        """Return the model with one of its alternative paths in place.
+
+        Raises
+        ------
+        ModelError
+            If there is no such alternative.
+        """
+        if name not in self.alternatives:
+            known = ", ".join(self.alternatives) or "none"
+            raise ModelError(f"model {self.name}: no alternative {name!r}; it has: {known}")
+        replaced, path = self.alternatives[name]
+        return dataclasses.replace(self, **{replaced.lower(): path})
+
+    @property
+    def drive_unit(self) -> str:
+        """Unit of what drives the DTF: `W` or `K`."""
+        return "W" if self.kind == "heat" else "K"
+
+
+def check_runnable(model: ThermalModel) -> None:
+    """Refuse dynamics that cannot be run in a service.
+
+    Raises
+    ------
+    ModelError
+        For an unstable path, or a TTF whose inverse is improper, unstable or rings.
+    """
+    if not (math.isfinite(model.period_s) and model.period_s > 0):
+        raise ModelError(
+            f"model {model.name}: sample_period_s = {model.period_s!r}, expected a number above 0"
+        )
+    if (model.ttf is None) != (model.kind == "direct"):
+        raise ModelError(f"model {model.name}: kind {model.kind!r} and its paths do not fit: TTF "
+                         f"{'missing' if model.ttf is None else 'present'}")  # fmt: skip
+    for name in ("TTF", "DTF", "TDTF"):
+        path: Path | None = getattr(model, name.lower())
+        if path is not None:
+            _check_path(model, name, path)
+    if model.ttf is not None:
+        _check_inverse(model.name, model.ttf.sampled)
+
+
+def _check_path(model: ThermalModel, name: str, path: Path) -> None:
+    expected = PATH_UNITS[model.kind][name]
+    if path.unit != expected:
+        raise ModelError(f"model {model.name}: path {name} has unit {path.unit!r}, expected {expected!r}")
+    if path.sampled.period_s != model.period_s:
+        raise ModelError(
+            f"model {model.name}: path {name} is sampled at {path.sampled.period_s:g} s, the model at {model.period_s:g} s"
+        )
+    if not path.sampled.is_stable():
+        worst = max(path.sampled.poles(), key=abs)
+        raise ModelError(
+            f"model {model.name}: path {name} is unstable: pole at z = {worst:.6g}, expected |z| < 1"
+        )
+
+
+def _check_inverse(model_name: str, ttf: SampledTransferFunction) -> None:
+    where = f"model {model_name}: TTF cannot be inverted: "
+    if ttf.b[0] == 0.0:
+        raise ModelError(where + "no direct feed-through (b0 = 0), so its inverse needs the future")
+    zeros = ttf.zeros()
+    if zeros.size == 0:
+        return
+    worst = max(zeros, key=abs)
+    if abs(worst) >= 1.0:
+        raise ModelError(where + f"zero at z = {worst:.6g} makes the inverse unstable, expected |z| < 1")
+    ringing = min(zeros, key=lambda z: float(np.real(z)))
+    if ringing.real < RINGING_LIMIT:
+        raise ModelError(
+            where + f"zero at z = {ringing:.6g} makes the inverse ring, expected Re z > {RINGING_LIMIT}"
+        )
