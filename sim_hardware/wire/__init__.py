@@ -1,0 +1,28 @@
+"""Simulated measuring devices that speak the real protocols over TCP ports and pseudo-terminals."""
+
+from sim_hardware.wire.adam import Adam
+from sim_hardware.wire.faults import DEVICE_FAULTS, INPUT_FAULTS, Faults
+from sim_hardware.wire.icpdas import IcpDas
+from sim_hardware.wire.modbus_servers import ModbusRtuLine, ModbusRtuTcpServer, ModbusTcpServer
+from sim_hardware.wire.module import Module, Source
+from sim_hardware.wire.moxa import MoxaE1262
+from sim_hardware.wire.rack import Rack, Server
+from sim_hardware.wire.register_map import Register, RegisterMap
+
+__all__ = [
+    "DEVICE_FAULTS",
+    "INPUT_FAULTS",
+    "Adam",
+    "Faults",
+    "IcpDas",
+    "ModbusRtuLine",
+    "ModbusRtuTcpServer",
+    "ModbusTcpServer",
+    "Module",
+    "MoxaE1262",
+    "Rack",
+    "Register",
+    "RegisterMap",
+    "Server",
+    "Source",
+]
