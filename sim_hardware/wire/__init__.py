@@ -1,6 +1,8 @@
 """Simulated measuring devices that speak the real protocols over TCP ports and pseudo-terminals."""
 
 from sim_hardware.wire.adam import Adam
+from sim_hardware.wire.dcon import DconLine
+from sim_hardware.wire.dcon_slave import DconSettings
 from sim_hardware.wire.faults import DEVICE_FAULTS, INPUT_FAULTS, Faults
 from sim_hardware.wire.icpdas import IcpDas
 from sim_hardware.wire.modbus_servers import ModbusRtuLine, ModbusRtuTcpServer, ModbusTcpServer
@@ -13,6 +15,8 @@ __all__ = [
     "DEVICE_FAULTS",
     "INPUT_FAULTS",
     "Adam",
+    "DconLine",
+    "DconSettings",
     "Faults",
     "IcpDas",
     "ModbusRtuLine",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 
 from sim_hardware.wire.faults import Layers, number
-from sim_hardware.wire.module import ILLEGAL_FUNCTION, ILLEGAL_VALUE, RefusalError, Module
+from sim_hardware.wire.module import ILLEGAL_FUNCTION, ILLEGAL_VALUE, Module, RefusalError
 
 GATEWAY_NO_RESPONSE = 0x0B
 MOST_WORDS = 125

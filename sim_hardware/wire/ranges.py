@@ -169,7 +169,8 @@ def encode_hex(value: float, span: Range) -> int:
     if span.unsigned:
         return round(min(max((value - span.low) / (span.high - span.low), 0.0), 1.0) * 0xFFFF)
     raw = value / span.full_scale * (32767.0 if value >= 0.0 else 32768.0)
-    return round(min(max(raw, -32768.0), 32767.0)) & 0xFFFF
+    # Towards zero: so the ends of types K and N come out as the maker's table has them.
+    return int(min(max(raw, -32768.0), 32767.0)) & 0xFFFF
 
 
 def decode_hex(word: int, span: Range) -> float:
