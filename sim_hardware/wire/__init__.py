@@ -1,6 +1,7 @@
 """Simulated measuring devices that speak the real protocols over TCP ports and pseudo-terminals."""
 
 from sim_hardware.wire.adam import Adam
+from sim_hardware.wire.capancdt import CapaNcdt
 from sim_hardware.wire.dcon import DconLine
 from sim_hardware.wire.dcon_slave import DconSettings
 from sim_hardware.wire.faults import DEVICE_FAULTS, INPUT_FAULTS, Faults
@@ -15,6 +16,7 @@ __all__ = [
     "DEVICE_FAULTS",
     "INPUT_FAULTS",
     "Adam",
+    "CapaNcdt",
     "DconLine",
     "DconSettings",
     "Faults",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import select
 import socket
 from collections.abc import Callable
 
@@ -63,6 +64,11 @@ class TcpPort:
         self._accept = accept
         self._server: asyncio.Server | None = None
         self._placeholder: socket.socket | None = None
+
+    def pending(self) -> bool:
+        """Tell whether a client has connected that has not been accepted yet."""
+        sockets = () if self._server is None else self._server.sockets
+        return bool(sockets) and bool(select.select(sockets, (), (), 0)[0])
 
     async def listen(self) -> None:
         """Accept connections. Does nothing if the port does so already."""
