@@ -1,0 +1,1 @@
+"""Undeclared effects."""
