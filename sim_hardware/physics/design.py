@@ -16,48 +16,48 @@ class QuillDesign:
 
     # The quill: a hollow steel body along Y, cut into nodes from its rear (0) to its nose (1).
     quill_nodes: int = 18
-    quill_length_m: float = 1.30
-    quill_section_m2: float = 2.6e-3
-    quill_perimeter_m: float = 0.75
+    quill_length_m: float = 1.85
+    quill_section_m2: float = 0.00259
+    quill_perimeter_m: float = 0.473
     steel_w_per_mk: float = 46.0
     steel_j_per_m3k: float = 3.67e6
     expansion_per_k: float = 11.7e-6
     growth_factor: float = 1.0
 
     # The heater plate on it, and the thermocouple T_Q beside the plate.
-    plate_centre: float = 0.55
-    plate_length_m: float = 0.36
-    plate_j_per_k: float = 700.0
-    plate_contact_w_per_k: float = 8.0
-    plate_area_m2: float = 0.02
-    sensor_place: float = 0.60
-    sensor_j_per_k: float = 6.0
+    plate_centre: float = 0.443
+    plate_length_m: float = 0.255
+    plate_j_per_k: float = 415.0
+    plate_contact_w_per_k: float = 20.9
+    plate_area_m2: float = 0.0124
+    sensor_place: float = 0.417
+    sensor_j_per_k: float = 2.62
     sensor_contact_w_per_k: float = 0.12
     sensor_area_m2: float = 1.0e-4
 
     # The nose with the front bearing.
-    nose_j_per_k: float = 1500.0
-    nose_area_m2: float = 0.05
-    nose_link_w_per_k: float = 1.5
-    nose_length_m: float = 0.12
+    nose_j_per_k: float = 737.0
+    nose_area_m2: float = 0.115
+    nose_link_w_per_k: float = 0.614
+    nose_length_m: float = 0.319
 
     # The headstock around the rear of the quill, its coolant jacket, the column's front and rear wall, the base.
     guided_share: float = 0.45
-    guide_w_per_mk: float = 5.0
-    housing_j_per_k: float = 60e3
-    housing_area_m2: float = 0.5
-    housing_lever_m: float = -0.5
+    guide_w_per_mk: float = 6.95
+    housing_j_per_k: float = 63900.0
+    housing_area_m2: float = 0.175
+    housing_lever_m: float = -0.693
     jacket_j_per_k: float = 3e3
     jacket_link_w_per_k: float = 40.0
-    housing_column_w_per_k: float = 20.0
-    front_j_per_k: float = 150e3
-    front_area_m2: float = 1.0
-    front_lever_m: float = -1.0
-    walls_w_per_k: float = 10.0
-    rear_j_per_k: float = 150e3
-    rear_area_m2: float = 1.0
-    rear_lever_m: float = 1.0
-    column_base_w_per_k: float = 10.0
+    housing_column_w_per_k: float = 3.71
+    front_j_per_k: float = 91500.0
+    front_area_m2: float = 0.671
+    front_lever_m: float = -1.56
+    walls_w_per_k: float = 1.07
+    rear_j_per_k: float = 137000.0
+    rear_area_m2: float = 0.93
+    rear_lever_m: float = 0.971
+    column_base_w_per_k: float = 0.556
     base_j_per_k: float = 400e3
     base_area_m2: float = 1.5
 
