@@ -4,11 +4,11 @@ r"""A quill as masses that store, conduct and lose heat, and that expand.
           \theta_r \right)
 
 with the rises θ over 20 °C of the quill's nodes, nose, housing, and of the column's front and rear wall. The
-quill grows towards +Y; the housing's slow warming moves it back (negative lever), and so does the column, which
-bends while its front wall is warmer than its rear wall.
+quill grows towards +Y; the housing's slow warming moves it back (negative lever), and so does the column,
+which bends while its front wall is warmer than its rear wall.
 
-The conduction is stepped exactly (``network.py``). What is not linear, the film's dependence on temperature and
-everything that an effect adds, is held over a substep of at most 10 s, which is short against every time
+The conduction is stepped exactly (``network.py``). What is not linear, the film's dependence on temperature
+and everything that an effect adds, is held over a substep of at most 10 s, which is short against every time
 constant it acts on.
 """
 
@@ -122,7 +122,7 @@ class QuillMachine:
         self._at_degc = inputs.ambient_degc
         linear = self.film.linear_w_per_k * inputs.ambient_degc
         self.degc = np.full(len(self.degc), inputs.ambient_degc)
-        # Half of the way at each pass: the films and jackets of an effect may be stronger than the linear part.
+        # Half of the way at each pass: an effect's films may be stronger than the linear part.
         for _ in range(400):
             target = self.conduction.steady(linear + self._heat_w(inputs))
             moved = target - self.degc

@@ -41,7 +41,7 @@ class QuillDesign:
     nose_link_w_per_k: float = 0.614
     nose_length_m: float = 0.319
 
-    # The headstock around the rear of the quill, its coolant jacket, the column's front and rear wall, the base.
+    # The headstock around the quill's rear, its coolant jacket, the column's front and rear wall, the base.
     guided_share: float = 0.45
     guide_w_per_mk: float = 6.95
     housing_j_per_k: float = 63900.0

@@ -27,8 +27,8 @@ class Duty:
     duration_s : float
         Length, s; afterwards the last inputs go on.
     **columns : array or float
-        Inputs by the names of :class:`Inputs`, each of the grid's length or constant. Other names are channels
-        that act on nothing.
+        Inputs by the names of :class:`Inputs`, each of the grid's length or constant. Other names are
+        channels that act on nothing.
 
     Examples
     --------
@@ -40,15 +40,17 @@ class Duty:
     def __init__(self, duration_s: float, **columns: Array | float) -> None:
         self.duration_s = duration_s
         n = int(np.ceil(duration_s / GRID_S)) + 1
-        self.columns: dict[str, Array] = {k: np.broadcast_to(v, n).astype(np.float64) for k, v in columns.items()}
-        self._extras = [name for name in columns if name not in CHANNELS]
+        self.columns: dict[str, Array] = {
+            k: np.broadcast_to(v, n).astype(np.float64) for k, v in columns.items()
+        }
+        self.extra_names = [name for name in columns if name not in CHANNELS]
         named = [name for name in columns if name in CHANNELS]
         parts = zip(*(self.columns[name].tolist() for name in named), strict=True) if named else ((),) * n
         values = [dict(zip(named, row, strict=True)) for row in parts]
         others: list[Mapping[str, float]] = [{} for _ in range(n)]
-        if self._extras:
-            rows = zip(*(self.columns[name].tolist() for name in self._extras), strict=True)
-            others = [dict(zip(self._extras, row, strict=True)) for row in rows]
+        if self.extra_names:
+            rows = zip(*(self.columns[name].tolist() for name in self.extra_names), strict=True)
+            others = [dict(zip(self.extra_names, row, strict=True)) for row in rows]
         self._inputs = [Inputs(**v, extras=x) for v, x in zip(values, others, strict=True)]
 
     def at(self, t_s: float) -> Inputs:
@@ -63,7 +65,7 @@ class Duty:
 
     @classmethod
     def paper_calibration(cls, seed: int = 0, ambient_swing_k: float = 1.0) -> Duty:
-        """Return 12 h with 90 W from 0:30 to 6:30; the air swings by ±`ambient_swing_k` a day, with slow noise."""
+        """Return 12 h with 90 W from 0:30 to 6:30 in air that swings by ±`ambient_swing_k` a day."""
         return cls._blocks(12.0, [(0.5, 90.0), (6.5, 0.0)], seed, ambient_swing_k)
 
     @classmethod
@@ -74,7 +76,7 @@ class Duty:
 
     @classmethod
     def working_day(cls, seed: int, hours: float = 24.0) -> Duty:
-        """Return a realistic job: heat on and off at several levels, spindle, coolant with thermostat, fan, air.
+        """Return a realistic job: heat at several levels, spindle, coolant with its thermostat, fan, air.
 
         The channels have schedules of their own, so that an observer can tell them apart; the coolant flows
         mostly while the spindle turns. ``cabinet_degc`` and ``hydraulic_bar`` act on nothing.

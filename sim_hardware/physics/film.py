@@ -34,7 +34,12 @@ class Film:
     """
 
     def __init__(
-        self, area_m2: Array, forced_w_per_m2k: float, height_m: float, emissivity: float, reference_degc: float
+        self,
+        area_m2: Array,
+        forced_w_per_m2k: float,
+        height_m: float,
+        emissivity: float,
+        reference_degc: float,
     ) -> None:
         self.area_m2 = area_m2
         self._forced = forced_w_per_m2k

@@ -39,7 +39,9 @@ class Layout:
         self.front = self._add("column front", d.front_j_per_k, d.front_area_m2, d.front_lever_m)
         self.rear = self._add("column rear", d.rear_j_per_k, d.rear_area_m2, d.rear_lever_m)
         self.base = self._add("base", d.base_j_per_k, d.base_area_m2, 0.0)
-        self.second = self._add("second mass", d.second_j_per_k, 0.0, d.second_lever_m) if d.second_j_per_k else None
+        self.second = (
+            self._add("second mass", d.second_j_per_k, 0.0, d.second_lever_m) if d.second_j_per_k else None
+        )
         self.names = [name for name, *_ in self._masses]
         self.area_m2: Array = np.array([area for _, _, area, _ in self._masses])
         lever = 1e6 * d.expansion_per_k * np.array([lever for *_, lever in self._masses])

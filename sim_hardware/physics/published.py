@@ -1,9 +1,9 @@
 """The published transfer functions as a machine.
 
-M. Mareš, P. Bárta, Mechatronic approach in modeling, identification and control of thermal deformation of quill:
-equations (3) to (5). Time in them is in minutes; DTF is in µm/W, TDTF in µm/K of the ambient's change, TTF in
-K/W of T_Q − AT. The functions came out of a discrete identification at 60 s, and Tustin's rule at 60 s gives those
-polynomials back; they are what runs here.
+M. Mareš, P. Bárta, Mechatronic approach in modeling, identification and control of thermal deformation of
+quill: equations (3) to (5). Time in them is in minutes; DTF is in µm/W, TDTF in µm/K of the ambient's change,
+TTF in K/W of T_Q − AT. The functions came out of a discrete identification at 60 s, and Tustin's rule at 60 s
+gives those polynomials back; they are what runs here.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ TTF = (0.008079, 0.01629, 0.0002567)
 TTF_POLES = (1.0, 0.09112, 0.001022)
 
 
-def tustin(numerator: Sequence[float], denominator: Sequence[float], step_min: float = 1.0) -> tuple[Array, Array]:
+def tustin(
+    numerator: Sequence[float], denominator: Sequence[float], step_min: float = 1.0
+) -> tuple[Array, Array]:
     r"""Return the polynomials in z⁻¹ for :math:`s = \frac{2}{h} \frac{1 - z^{-1}}{1 + z^{-1}}`.
 
     Examples
@@ -74,7 +76,7 @@ class Filter:
 
 
 def step_responses(minutes: int, heat_w: float = 90.0) -> tuple[Array, Array, Array]:
-    """Return displacement (µm) and T_Q − AT (K) after a step of heat, and displacement after +1 K, by minute."""
+    """Return y (µm) and T_Q − AT (K) after a step of heat, and y after +1 K of air, by minute."""
     one = np.ones(minutes + 1)
     dtf, tdtf = tustin(DTF, DEFORMATION_POLES), tustin(TDTF, DEFORMATION_POLES)
     ttf = tustin(TTF, TTF_POLES)
@@ -85,9 +87,9 @@ def step_responses(minutes: int, heat_w: float = 90.0) -> tuple[Array, Array, Ar
 class PublishedQuill:
     """The quill as the paper's equations have it.
 
-    The functions step at the whole minutes, with the inputs given to the first piece of that minute, and their
-    outputs hold until the next one: a sample of a minute's mean is exactly one step. T_Q is the present ambient
-    temperature plus the function's output.
+    The functions step at the whole minutes, with the inputs given to the first piece of that minute, and
+    their outputs hold until the next one: a sample of a minute's mean is exactly one step. T_Q is the present
+    ambient temperature plus the function's output.
 
     Parameters
     ----------
@@ -110,8 +112,8 @@ class PublishedQuill:
 
     def __init__(self, effects: Sequence[Effect] = ()) -> None:
         for effect in effects:
-            if effect.thermal:
-                raise ValueError(f"{type(effect.reveal()).__name__} needs a machine of masses: use QuillMachine")
+            if effect.reveal().thermal:
+                raise ValueError(f"{effect!r} needs a machine of masses: use QuillMachine")
         actions = [effect.begin() for effect in effects]
         self._joints = overriding(actions, "growth_um")
         self._probes = overriding(actions, "probe_um")

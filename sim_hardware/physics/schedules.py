@@ -55,7 +55,7 @@ def flow_while(random: np.random.Generator, turning: NDArray[np.bool_]) -> Array
 
 
 def coolant(random: np.random.Generator, air_degc: Array, flow_lpm: Array) -> Array:
-    """Return the coolant's temperature in °C under a two-point thermostat, warmed by the air and by cutting."""
+    """Return the coolant's °C under a two-point thermostat, warmed by the air and by cutting."""
     upper, lower = REST_DEGC + random.uniform(0.5, 2.0), REST_DEGC - random.uniform(1.0, 3.0)
     cutting_k_per_s = random.uniform(1.0, 3.0) / 1200.0
     chilling_k_per_s = random.uniform(4.0, 8.0) / 1200.0
@@ -70,7 +70,7 @@ def coolant(random: np.random.Generator, air_degc: Array, flow_lpm: Array) -> Ar
 
 
 def cabinet(random: np.random.Generator, air_degc: Array) -> Array:
-    """Return the temperature of a cabinet in °C that follows the air and its own load, and acts on nothing."""
+    """Return a cabinet's °C that follows the air and its own load, and acts on nothing."""
     load_k = levels(random, len(air_degc), np.array([3.0, 6.0, 9.0]), (30.0, 240.0))
     keep = float(np.exp(-GRID_S / 1800.0))
     start = [keep * float(load_k[0])]

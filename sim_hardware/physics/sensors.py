@@ -1,9 +1,10 @@
-"""Sensors between the true value and the wire: bias, noise, steps of the converter, lag, wild readings, dropouts."""
+"""Sensors between the true value and the wire: bias, noise, quantisation, lag, wild readings, dropouts."""
 
 from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,10 +123,18 @@ class Sensor:
         return self._lagged
 
 
-def usual_sensors(temperature_noise_k: float = 0.02, y_noise_um: float = 0.3) -> dict[str, SensorSpec]:
-    """Return the sensors of a usual set-up: thermocouples, a capacitive probe and the control's own values."""
+def usual_sensors(
+    extras: Sequence[str] = (),
+    temperature_noise_k: float = 0.02,
+    y_noise_um: float = 0.3,
+    heat_known: bool = False,
+) -> dict[str, SensorSpec]:
+    """Return the sensors of a usual set-up: thermocouples, a capacitive probe and the control's own values.
+
+    `extras` are the channels of a duty that act on nothing; with `heat_known`, a wattmeter reads the heater.
+    """
     couple = SensorSpec(noise_std=temperature_noise_k, quantum=0.01)
-    return {
+    usual = {
         "t_q_degc": couple,
         "at_degc": couple,
         "y_um": SensorSpec(noise_std=y_noise_um),
@@ -134,4 +143,6 @@ def usual_sensors(temperature_noise_k: float = 0.02, y_noise_um: float = 0.3) ->
         "spindle_rpm": SensorSpec(quantum=1.0),
         "fan_rpm": SensorSpec(quantum=1.0),
         "coolant_flow_lpm": SensorSpec(noise_std=0.02, quantum=0.01),
+        **dict.fromkeys(extras, couple),
     }
+    return {**usual, "heat_w": SensorSpec(quantum=0.1)} if heat_known else usual

@@ -1,9 +1,10 @@
 """Size the quill: fit the dimensions of :class:`QuillDesign` to the published responses.
 
-Run ``python -m sim_hardware.physics.sizing`` to see how near the stored dimensions come, with ``--fit`` to search
-again (some minutes) and print the new ones, rounded. Least squares over three responses: displacement and T_Q − AT
-after 90 W from rest, and the displacement after the air has become 1 K warmer; dimensions are searched in their
-logarithms (masses, films and contacts are positive) within bounds that a workshop would believe.
+Run ``python -m sim_hardware.physics.sizing`` to see how near the stored dimensions come, with ``--fit`` to
+search again (some minutes) and print the new ones, rounded. Least squares over three responses: displacement
+and T_Q − AT after 90 W from rest, and the displacement after the air has become 1 K warmer; dimensions are
+searched in their logarithms (masses, films and contacts are positive) within bounds that a workshop would
+believe.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def fit_pct(measured: Array, simulated: Array) -> float:
 
 
 def responses(design: QuillDesign, longest_substep_s: float = 60.0) -> tuple[Array, Array, Array]:
-    """Return displacement in µm and T_Q − AT in K after 90 W, and displacement after +1 K of air, by minute."""
+    """Return y in µm and T_Q − AT in K after 90 W, and y after +1 K of air, by minute."""
     heated = QuillMachine(design, longest_substep_s=longest_substep_s)
     aired = QuillMachine(design, longest_substep_s=longest_substep_s)
     heat, air = Inputs(heat_w=STEP_W), Inputs(ambient_degc=REST_DEGC + 1.0)
@@ -96,9 +97,7 @@ def fit(start: QuillDesign, evaluations: int = 40) -> QuillDesign:
     def errors(x: Array) -> Array:
         y_m, t_m, a_m = responses(design(x))
         # 1 µm, 0.2 K and 0.3 µm weigh the same; a weak pull keeps what the responses do not determine.
-        return np.concatenate(
-            [(y_m - y)[at], (t_m - t)[at] / 0.2, (a_m - a)[at] / 0.3, 0.15 * (x - x0)]
-        )
+        return np.concatenate([(y_m - y)[at], (t_m - t)[at] / 0.2, (a_m - a)[at] / 0.3, 0.15 * (x - x0)])
 
     found = least_squares(
         errors, x0, bounds=(lower, upper), x_scale=0.3, diff_step=1e-3, max_nfev=evaluations, verbose=2

@@ -48,7 +48,7 @@ class World:
     ) -> None:
         self.duty = duty
         self._plant = plant
-        self._specs = dict(usual_sensors() if sensors is None else sensors)
+        self._specs = dict(usual_sensors(duty.extra_names) if sensors is None else sensors)
         self._seed = seed
         self._lock = threading.Lock()
         self._t_s = 0.0
@@ -113,8 +113,8 @@ class World:
     def record(self, period_s: float = 60.0, until_s: float | None = None) -> dict[str, Array]:
         """Run on to the duty's end, or to `until_s`, and return what a logger would have written.
 
-        Each row is the mean of one reading a second over ``(t_s, t_s + period_s]``. The readings draw from streams
-        of their own, so that a recording is the same whatever has been read before.
+        Each row is the mean of one reading a second over ``(t_s, t_s + period_s]``. The readings draw from
+        streams of their own, so that a recording is the same whatever has been read before.
 
         Returns
         -------
@@ -130,14 +130,14 @@ class World:
         when = start_s + (np.arange(count * each) + 1.0) * (period_s / each)
         # The truth holds from one step's end back to its start: that is what a held input did.
         index = np.minimum(np.searchsorted(past["t_s"], when - 1e-6), len(past["t_s"]) - 1)
-        table = {"t_s": np.arange(count) * period_s}
+        table: dict[str, Array] = {"t_s": np.arange(count, dtype=np.float64) * period_s}
         for name, spec in self._specs.items():
             sensor = Sensor(spec, self._seed + zlib.crc32(b"record"), name)
             readings = sensor.read_many(past[name][index], period_s / each).reshape(count, each)
             there = ~np.isnan(readings)
             number = there.sum(axis=1)
             total = np.where(there, readings, 0.0).sum(axis=1)
-            table[name] = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+            table[name] = np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
         return table
 
     def _step(self, t_s: float) -> None:

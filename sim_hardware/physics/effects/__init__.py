@@ -1,1 +1,41 @@
-"""Undeclared effects."""
+"""Undeclared effects: what a machine may have that its calibration never saw."""
+
+from sim_hardware.physics.effects.base import Action, Effect
+from sim_hardware.physics.effects.draw import SealedEffect, draw_effect
+from sim_hardware.physics.effects.mechanical import (
+    Cycle,
+    LateSensor,
+    MountSlip,
+    ProbeDrift,
+    SizeDependent,
+    StickSlip,
+    WrongStrength,
+)
+from sim_hardware.physics.effects.thermal import (
+    BearingFriction,
+    CoolantJacket,
+    FanOnFilm,
+    HiddenSource,
+    SecondMass,
+    WetGuide,
+)
+
+__all__ = [
+    "Action",
+    "BearingFriction",
+    "CoolantJacket",
+    "Cycle",
+    "Effect",
+    "FanOnFilm",
+    "HiddenSource",
+    "LateSensor",
+    "MountSlip",
+    "ProbeDrift",
+    "SealedEffect",
+    "SecondMass",
+    "SizeDependent",
+    "StickSlip",
+    "WetGuide",
+    "WrongStrength",
+    "draw_effect",
+]

@@ -19,7 +19,7 @@ Places = Mapping[str, Sequence[int]]
 class Action:
     """An effect at work in one machine; everything here does nothing."""
 
-    def forced_factor(self, inputs: Inputs) -> float:  # noqa: ARG002
+    def forced_factor(self, inputs: Inputs) -> float:
         """Return the factor on the forced film coefficient."""
         return 1.0
 
@@ -30,11 +30,11 @@ class Action:
         """Return how much of the quill's growth arrives at its nose, µm; called once a step, in order."""
         return growth_um
 
-    def probe_um(self, t_s: float, y_um: float) -> float:  # noqa: ARG002
+    def probe_um(self, t_s: float, y_um: float) -> float:
         """Return what lies in front of the displacement probe, µm."""
         return y_um
 
-    def t_q_degc(self, t_s: float, t_q_degc: float) -> float:  # noqa: ARG002
+    def t_q_degc(self, t_s: float, t_q_degc: float) -> float:
         """Return the temperature that has reached the thermocouple, °C; called once a step, in order."""
         return t_q_degc
 

@@ -81,8 +81,8 @@ class FanOnFilm(Effect):
     Parameters
     ----------
     full_speed_factor : float
-        Factor on the forced coefficient at 3000 rpm, at least 1. Between, by the 0.8th power of the speed, as in
-        turbulent flow along a plate.
+        Factor on the forced coefficient at 3000 rpm, at least 1. Between, by the 0.8th power of the speed, as
+        in turbulent flow along a plate.
     """
 
     kind: ClassVar[str] = "scheduled"
@@ -97,7 +97,8 @@ class FanOnFilm(Effect):
 
     def forced_factor(self, inputs: Inputs) -> float:
         """Return the factor on the forced film coefficient."""
-        return 1.0 + (self.full_speed_factor - 1.0) * (abs(inputs.fan_rpm) / MAX_FAN_RPM) ** 0.8
+        share = abs(inputs.fan_rpm) / MAX_FAN_RPM
+        return 1.0 + (self.full_speed_factor - 1.0) * float(share**0.8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
