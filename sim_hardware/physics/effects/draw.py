@@ -72,7 +72,7 @@ class _Draw:
 
     def __init__(self, random: np.random.Generator, size_um: float, hours: float) -> None:
         self.random = random
-        self.size_um = size_um
+        self.size_um = size_um * float(random.uniform(0.75, 1.3))
         self.hours = hours
         self.sign = float(random.choice([-1.0, 1.0]))
 
