@@ -175,18 +175,25 @@ def test_drawing_is_by_seed_covers_every_kind_and_keeps_its_secret():
         assert effect.reveal().describe()["kind"] in KINDS
 
 
-@pytest.mark.parametrize("seed", range(13))
-def test_drawn_effects_have_about_the_size_asked_for(seed):
+@pytest.fixture(scope="module")
+def plain_day():
+    """Return a working day and what the machine does in it without any effect."""
     duty = Duty.working_day(4)
+    world = World(QuillMachine(), duty)
+    world.advance_to(duty.duration_s)
+    return duty, world.history()
+
+
+@pytest.mark.parametrize("seed", range(13))
+def test_drawn_effects_have_about_the_size_asked_for(seed, plain_day):
+    duty, plain = plain_day
     effect = draw_effect(seed, 6.0)
-    world, plain = World(QuillMachine(effects=[effect]), duty), World(QuillMachine(), duty)
-    for each in (world, plain):
-        each.advance_to(duty.duration_s)
-    spread = np.std(world.history()["y_um"] - plain.history()["y_um"])
+    world = World(QuillMachine(effects=[effect]), duty)
+    world.advance_to(duty.duration_s)
+    spread = np.std(world.history()["y_um"] - plain["y_um"])
     if effect.reveal().kind == "delay":
         assert spread == 0.0
-        late = world.history()["t_q_degc"] - plain.history()["t_q_degc"]
-        assert np.std(late) > 0.3
+        assert np.std(world.history()["t_q_degc"] - plain["t_q_degc"]) > 0.3
     else:
         assert 0.4 < spread / 6.0 < 2.5
 
