@@ -1,0 +1,94 @@
+"""The clock that is handed in: the machine's own, or a virtual one in which a day takes seconds."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Collection
+from typing import Any, Protocol
+
+NS = 1_000_000_000
+
+
+class Clock(Protocol):
+    """What the service needs of a clock."""
+
+    def utc_ns(self) -> int:
+        """Return the wall clock, ns since 1970 UTC. It may be set back or forward."""
+
+    def monotonic_ns(self) -> int:
+        """Return a clock that nobody sets, ns."""
+
+    async def sleep(self, seconds: float) -> None:
+        """Wait."""
+
+    async def settle(self, tasks: Collection[asyncio.Task[Any]], timeout_s: float) -> None:
+        """Wait until the tasks are done, or for a while; the tasks go on."""
+
+
+class SystemClock:
+    """The clock of the machine."""
+
+    def utc_ns(self) -> int:
+        """Return the wall clock, ns since 1970 UTC."""
+        return time.time_ns()
+
+    def monotonic_ns(self) -> int:
+        """Return the monotonic clock, ns."""
+        return time.monotonic_ns()
+
+    async def sleep(self, seconds: float) -> None:
+        """Wait."""
+        await asyncio.sleep(max(seconds, 0.0))
+
+    async def settle(self, tasks: Collection[asyncio.Task[Any]], timeout_s: float) -> None:
+        """Wait until the tasks are done, or for a while."""
+        if tasks:
+            await asyncio.wait(tasks, timeout=timeout_s)
+
+
+class VirtualClock:
+    """A clock that stands still while work is done and leaps when somebody sleeps.
+
+    Only one task may sleep on it, the sampling loop. What it waits for with `settle` runs in real time, each
+    task within its own limit, and virtual time stands still meanwhile.
+
+    Parameters
+    ----------
+    start_utc_ns : int
+        Where it starts, ns since 1970 UTC.
+    on_advance : callable, optional
+        Awaited with the seconds since the start whenever the time has moved: the simulated machine moves there.
+    """
+
+    def __init__(
+        self, start_utc_ns: int, on_advance: Callable[[float], Awaitable[None]] | None = None
+    ) -> None:
+        self._start_ns = start_utc_ns
+        self._elapsed_ns = 0
+        self._step_ns = 0
+        self._on_advance = on_advance
+
+    def utc_ns(self) -> int:
+        """Return the virtual wall clock, ns since 1970 UTC."""
+        return self._start_ns + self._elapsed_ns + self._step_ns
+
+    def monotonic_ns(self) -> int:
+        """Return the virtual time since the start, ns."""
+        return self._elapsed_ns
+
+    def set_wall_clock(self, by_s: float) -> None:
+        """Set the wall clock forward (or back), as an administrator would."""
+        self._step_ns += round(by_s * NS)
+
+    async def sleep(self, seconds: float) -> None:
+        """Leap ahead."""
+        self._elapsed_ns += max(round(seconds * NS), 0)
+        if self._on_advance is not None:
+            await self._on_advance(self._elapsed_ns / NS)
+        await asyncio.sleep(0)
+
+    async def settle(self, tasks: Collection[asyncio.Task[Any]], timeout_s: float) -> None:
+        """Wait until the tasks are done, however long that takes in real time."""
+        if tasks:
+            await asyncio.wait(tasks)

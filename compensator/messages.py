@@ -1,0 +1,238 @@
+"""What the service records and publishes: JSON messages with a schema each.
+
+A missing value is NaN in memory and null in JSON; the encoder turns one into the other, and `number` turns
+it back. The JSON Schemas in `compensator/schemas` are made from these classes by `schemas()`; a test keeps
+the two together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any, Literal
+
+import msgspec
+
+NAN = float("nan")
+
+#: Version of the messages.
+SCHEMA = 1
+
+State = Literal["starting", "ok", "degraded", "hold", "fault"]
+
+
+class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):
+    """One channel over one sample.
+
+    Parameters
+    ----------
+    mean, min, max : float or None
+        Robust mean of the good readings and extremes of those that it is made of, in the channel's unit.
+    spread : float or None
+        Standard deviation of the same readings.
+    count : int
+        Number of readings that the mean is made of.
+    polls : int
+        Number of readings that were asked for.
+    quality : str
+        `good`, or the code of what makes it unusable.
+    device_quality : str
+        What the device alone said, before the guards.
+    errors : dict of str to int
+        Codes of bad readings and device errors in this sample, with their number.
+    """
+
+    mean: float | None
+    min: float | None
+    max: float | None
+    spread: float | None
+    count: int
+    polls: int
+    quality: str
+    device_quality: str
+    errors: dict[str, int] = {}
+
+
+class Sample(msgspec.Struct, frozen=True, kw_only=True):
+    """Every raw channel of one sample, `/sample` and `thermal/sample`.
+
+    Parameters
+    ----------
+    seq : int
+        Number of the sample; the estimate and the offset of the sample carry the same.
+    time_utc_ns : int
+        End of the sample, ns since 1970 UTC.
+    period_s : float
+        Length of the sample, s.
+    channels : dict of str to ChannelSample
+        By channel name, unit in the name.
+    """
+
+    schema: int
+    machine: str
+    seq: int
+    time_utc_ns: int
+    period_s: float
+    channels: dict[str, ChannelSample]
+
+
+class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """What the model makes of one sample, `/estimate` and `thermal/estimate`.
+
+    Parameters
+    ----------
+    t_q_ref_degc, at_ref_degc, y_ref_um : float or None
+        Zero of the two temperatures and of the measured deformation.
+    heat_w, heat_std_w : float or None
+        Estimated heat and its standard deviation, W.
+    y_dtf_um, y_tdtf_um, y_effects_um
+        Share of each path and effect, µm.
+    y_base_um : float
+        Predicted deformation at the last zero on a warm machine, µm; it is subtracted from the sum of the shares.
+    y_pred_um, y_std_um : float or None
+        Predicted deformation since the zero and its standard deviation, µm.
+    y_rate_um_per_min : float or None
+        Growth over the next sample, µm/min.
+    y_um, residual_um : float or None
+        Measured deformation since the zero, and measured − predicted, µm.
+    """
+
+    schema: int
+    machine: str
+    seq: int
+    time_utc_ns: int
+    t_q_ref_degc: float | None
+    at_ref_degc: float | None
+    y_ref_um: float | None
+    heat_w: float | None
+    heat_std_w: float | None
+    y_dtf_um: float | None
+    y_tdtf_um: float | None
+    y_effects_um: list[float]
+    y_base_um: float
+    y_pred_um: float | None
+    y_std_um: float | None
+    y_rate_um_per_min: float | None
+    y_um: float | None
+    residual_um: float | None
+
+
+class Offset(msgspec.Struct, frozen=True, kw_only=True):
+    """The correction, `/offset` and `thermal/y/offset`.
+
+    Parameters
+    ----------
+    seq : int
+        Never repeats for a machine.
+    valid_for_s : float
+        How long after `time_utc_ns` a receiver may use it, s.
+    y_offset_um : float or None
+        To be added to the commanded Y, µm; null while there is none yet.
+    y_offset_rate_um_per_min : float or None
+        How it is expected to move until the next sample, µm/min.
+    y_offset_std_um : float or None
+        Standard deviation, µm.
+    state : str
+        `starting`, `ok`, `degraded`, `hold` or `fault`.
+    reasons : list of str
+        Codes of why the state is not `ok`, see `compensator.reasons`.
+    model_sha256 : str
+        Hash of the model file.
+    """
+
+    schema: int
+    machine: str
+    seq: int
+    time_utc_ns: int
+    valid_for_s: float
+    y_offset_um: float | None
+    y_offset_rate_um_per_min: float | None
+    y_offset_std_um: float | None
+    state: State
+    reasons: list[str]
+    model_sha256: str
+
+
+class Event(msgspec.Struct, frozen=True, kw_only=True):
+    """Something that happened, `/event` and `thermal/event`.
+
+    Parameters
+    ----------
+    kind : str
+        `start`, `stop`, `zero`, `command`, `state`, `device`, `clock`, `recording`, ….
+    text : str
+        One line for people.
+    data : dict
+        Numbers and names that belong to it.
+    """
+
+    schema: int
+    machine: str
+    seq: int
+    time_utc_ns: int
+    kind: str
+    text: str
+    data: dict[str, Any] = {}
+
+
+class Status(msgspec.Struct, frozen=True, kw_only=True):
+    """How the service is, `thermal/status`.
+
+    Parameters
+    ----------
+    devices : dict of str to str
+        `ok` or the last error of each device.
+    """
+
+    schema: int
+    machine: str
+    seq: int
+    time_utc_ns: int
+    state: State
+    reasons: list[str]
+    version: str
+    model: str
+    model_kind: str
+    model_sha256: str
+    started_utc_ns: int
+    recording: str
+    devices: dict[str, str]
+
+
+#: Message of each recorded channel and Zenoh key.
+MESSAGES: Mapping[str, type[msgspec.Struct]] = {
+    "sample": Sample,
+    "estimate": EstimateMessage,
+    "offset": Offset,
+    "event": Event,
+    "status": Status,
+}
+
+_ENCODER = msgspec.json.Encoder()
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    """Encode a message as JSON; NaN becomes null, floats keep every bit."""
+    return _ENCODER.encode(message)
+
+
+def number(value: float | None) -> float:
+    """Return a decoded number, NaN where it is missing."""
+    return NAN if value is None else value
+
+
+def schemas() -> dict[str, dict[str, Any]]:
+    """Make the JSON Schema of every message from its class."""
+    made = {}
+    for name, message in MESSAGES.items():
+        schema = msgspec.json.schema(message)
+        definition = schema["$defs"].pop(message.__name__)
+        made[name] = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"thermal.{name}",
+                      **definition, "$defs": schema["$defs"]}  # fmt: skip
+        made[name]["title"] = f"thermal.{name}"
+    return made
+
+
+def shipped_schema(name: str) -> bytes:
+    """Return the JSON Schema of a message as it ships with the package."""
+    return resources.files("compensator.schemas").joinpath(f"{name}.schema.json").read_bytes()
