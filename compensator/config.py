@@ -1,0 +1,253 @@
+"""The configuration of the service: one TOML file, units in the keys, an unknown key is an error.
+
+Physical limits have no default: whoever commissions the machine states them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from compensator.errors import ConfigError
+
+Positive = Annotated[float, Meta(gt=0)]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+
+#: Roles that the model and the residual need; every other channel is auxiliary.
+ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
+#: Unit suffix of a channel name for each unit that a device gives.
+UNIT_SUFFIX = {"degc": "_degc", "um": "_um", "v": "_v", "rpm": "_rpm", "w": "_w"}
+
+
+class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table that refuses unknown keys."""
+
+
+class Machine(_Table):
+    """`[machine]`: the name that stands in every message and file."""
+
+    name: Name
+
+
+class ModelChoice(_Table):
+    """`[model]`: a model file (relative to the configuration) or `quill`."""
+
+    file: str
+    alternative: str | None = None
+
+
+class Sampling(_Table):
+    """`[sampling]`: how often devices are asked, and how many readings make a sample."""
+
+    poll_interval_s: Positive = 1.0
+    min_good_fraction: Annotated[float, Meta(gt=0, le=1)] = 0.5
+
+
+class Channel(_Table):
+    """`[[channel]]`: one measured quantity, and what is plausible for it.
+
+    The guards are optional for auxiliary channels and required for T_Q, AT and Y.
+    """
+
+    name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
+    device: str
+    input: Annotated[int, Meta(ge=0)]
+    range: tuple[float, float] | None = None
+    rate_max_per_min: Positive | None = None
+    stuck_after_min: Positive | None = None
+
+
+class Guards(_Table):
+    """`[guards]`: plausibility between channels."""
+
+    t_q_below_at_max_k: Positive
+
+
+class Validity(_Table):
+    """`[limits.validity]`: temperatures on which the machine was calibrated, °C."""
+
+    t_q_degc: tuple[float, float]
+    at_degc: tuple[float, float]
+
+
+class Limits(_Table):
+    """`[limits]`: what the offset may do."""
+
+    offset_max_um: Positive
+    offset_rate_max_um_per_min: Positive
+    validity: Validity
+
+
+class Loss(_Table):
+    """`[loss]`: how long the model's own prediction replaces a lost temperature."""
+
+    predict_for_min: Positive
+
+
+class Zero(_Table):
+    """`[zero]`: when and how the references are set.
+
+    `rest_rate_um_per_min`: a machine that grows slower than this counts as at rest when it is zeroed.
+    """
+
+    rest_rate_um_per_min: Positive
+    at_start: bool = True
+
+
+class Zenoh(_Table):
+    """`[zenoh]`: where the offset goes. Nothing is listened on unless it stands here."""
+
+    prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$")]
+    mode: Literal["peer", "client", "router"] = "peer"
+    listen: list[str] = []
+    connect: list[str] = []
+
+
+class Recording(_Table):
+    """`[recording]`: folder of the MCAP files, relative to the configuration."""
+
+    folder: str
+
+
+class Config(_Table):
+    """A whole configuration file."""
+
+    machine: Machine
+    model: ModelChoice
+    limits: Limits
+    loss: Loss
+    zero: Zero
+    guards: Guards
+    zenoh: Zenoh
+    recording: Recording
+    line: list[dict[str, Any]]
+    device: list[dict[str, Any]]
+    channel: list[Channel]
+    sampling: Sampling = Sampling()
+
+
+class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
+    """A configuration with where it came from.
+
+    Parameters
+    ----------
+    config : Config
+        The settings.
+    path : pathlib.Path
+        The file.
+    data : bytes
+        Its bytes, which travel in every recording.
+    sha256 : str
+        Their hash.
+    """
+
+    config: Config
+    path: Path
+    data: bytes
+    sha256: str
+
+    def resolve(self, name: str) -> Path:
+        """Return a path of the file relative to the file's folder."""
+        return (self.path.parent / name).resolve()
+
+    def model_name(self) -> str | Path:
+        """Return the model's name if it is built in, else its path."""
+        name = self.config.model.file
+        return self.resolve(name) if name.endswith(".toml") or "/" in name else name
+
+
+def load_config(path: str | Path) -> LoadedConfig:
+    """Read and check a configuration; nothing is opened.
+
+    Raises
+    ------
+    ConfigError
+        One line that names file, table, key, value and what was expected.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}; expected a configuration file") from error
+    config = parse_config(data, source=str(path))
+    return LoadedConfig(config=config, path=path, data=data, sha256=hashlib.sha256(data).hexdigest())
+
+
+def parse_config(data: bytes, *, source: str) -> Config:
+    """Make a configuration of the bytes of its file.
+
+    Raises
+    ------
+    ConfigError
+        As `load_config`.
+    """
+    try:
+        table = tomllib.loads(data.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"{source}: not a TOML file: {error}") from error
+    try:
+        config = msgspec.convert(table, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {_in_words(str(error), table)}") from error
+    try:
+        _check(config)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from error
+    return config
+
+
+def _in_words(message: str, table: object) -> str:
+    """Turn "…- at `$.limits.offset_max_um`" into "limits.offset_max_um = …: …"."""
+    match = re.search(r" - at `\$\.?([^`]*)`$", message)
+    if match is None:
+        return message
+    where, text = match.group(1), message[: match.start()]
+    value = table
+    for part in re.findall(r"[^.\[\]]+", where):
+        try:
+            value = value[int(part)] if isinstance(value, list) else value[part]  # type: ignore[index]
+        except (KeyError, IndexError, ValueError, TypeError):
+            value = None
+            break
+    shown = "" if value is None or isinstance(value, (dict, list)) else f" = {value!r}"
+    return f"{where}{shown}: {text}"
+
+
+def _check(config: Config) -> None:
+    names = [channel.name for channel in config.channel]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"channel: name {name!r} stands twice")
+    for role in ("t_q_degc", "at_degc"):
+        if role not in names:
+            raise ConfigError(f"channel: no channel named {role!r}; the model needs it")
+    devices = {str(device.get("name")) for device in config.device}
+    for channel in config.channel:
+        _check_channel(channel, devices)
+    for key in ("t_q_degc", "at_degc"):
+        _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key))
+
+
+def _check_channel(channel: Channel, devices: set[str]) -> None:
+    where = f"channel {channel.name!r}"
+    if channel.device not in devices:
+        raise ConfigError(
+            f"{where}: device {channel.device!r} is not configured, expected one of: {', '.join(sorted(devices))}"
+        )
+    if channel.name in ROLES[:3]:
+        for key in ("range", "rate_max_per_min", "stuck_after_min"):
+            if getattr(channel, key) is None:
+                raise ConfigError(f"{where}: {key} is missing; a limit of {channel.name} has no default")
+    if channel.range is not None:
+        _check_range(f"{where}: range", channel.range)
+
+
+def _check_range(where: str, bounds: tuple[float, float]) -> None:
+    if not bounds[0] < bounds[1]:
+        raise ConfigError(f"{where} = [{bounds[0]:g}, {bounds[1]:g}], expected the lower bound first")

@@ -1,0 +1,78 @@
+"""States and reasons in words: what each means, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+#: code → (what it means, what to do)
+WORDS: Mapping[str, tuple[str, str]] = {
+    "starting": (
+        "The service runs but has no zero yet, so there is no offset.",
+        "Wait for the first good sample of T_Q and AT; if it does not come, run `compensator probe`.",
+    ),
+    "ok": ("Everything is measured and the offset is the model's.", "Nothing."),
+    "degraded": (
+        "The service compensates with less than everything; the reasons say what is missing or limited.",
+        "Look at the reasons.",
+    ),
+    "hold": ("The last good offset stands and does not follow the machine.", "Look at the reasons; find the cause before the next precise cut."),
+    "fault": ("There is no offset to rely on.", "Do not rely on compensation; look at the reasons and the events."),
+    "no_zero": ("No zero has been set yet.", "Bring T_Q and AT back, or send the command zero."),
+    "t_q_missing": ("T_Q cannot be used in this sample.", "See the quality of t_q_degc: check couple, module and line."),
+    "at_missing": ("AT cannot be used in this sample.", "See the quality of at_degc: check couple, module and line."),
+    "channel_missing": (
+        "A channel that an effect of the model uses is missing; its last good value stands in.",
+        "Check the sensor of that channel.",
+    ),
+    "predicting": (
+        "A temperature is missing and the model predicts with the heat as it last was.",
+        "Bring the sensor back before loss.predict_for_min is over; then the offset is held.",
+    ),
+    "prediction_expired": (
+        "A temperature has been missing for longer than the model may predict.",
+        "Repair the sensor; the offset then moves to its right value at the permitted rate.",
+    ),
+    "outside_validity": (
+        "T_Q, AT or the heat lies outside the range on which the model was made.",
+        "Calibrate on a wider range, or bring the machine back into it.",
+    ),
+    "offset_limited": ("The offset has reached its largest permitted value.", "Check sensors and model before raising limits.offset_max_um."),
+    "rate_limited": (
+        "The offset moves at its largest permitted rate and has not arrived yet.",
+        "Wait; if it stays so, check sensors and limits.offset_rate_max_um_per_min.",
+    ),
+    "operator_hold": ("An operator has frozen the offset.", "Send the command resume."),
+    "recording_failed": (
+        "The sample could not be written to disk; compensation goes on.",
+        "Check free space, permissions and the disk.",
+    ),
+    "internal_error": ("The service met an error of its own and holds the offset.", "Report the event with its text."),
+    "good": ("The value can be used.", "Nothing."),
+    "open_circuit": ("The thermocouple or its wiring is broken.", "Check couple and terminals."),
+    "over_range": ("The value is above what device or sensor can measure.", "Check sensor, range and wiring."),
+    "under_range": ("The value is below what device or sensor can measure.", "Check sensor, range and wiring."),
+    "stale": ("The device gives no new values.", "Check device and connection."),
+    "invalid": ("The device marks the value as invalid.", "Check the device."),
+    "too_few": ("Too few good readings in the sample.", "Look at the errors of the channel: line, module, noise."),
+    "device_timeout": ("The device did not answer in time.", "Check power, address and line."),
+    "device_disconnected": ("The port, adapter or socket of the device is gone.", "Check cable, adapter and network."),
+    "device_refused": ("The device answered with an error.", "Check address, registers and its configuration."),
+    "device_garbled": ("What the device sent is no valid frame.", "Check line settings, termination and shielding."),
+    "device_error": ("The device could not be read.", "See the events for its message."),
+    "device_config": ("The configuration of the device cannot be used.", "Run `compensator check`."),
+    "out_of_range": ("The value lies outside the plausible range of the channel.", "Check sensor and range."),
+    "too_fast": ("The value changed faster than the sensor's place can.", "Check for a loose sensor or a disturbed line."),
+    "stuck": ("The value has not moved at all for longer than it may.", "Check that sensor and module still measure."),
+    "t_q_below_at": ("T_Q lies below AT although the machine is heated.", "Check for exchanged or fallen-off sensors."),
+}  # fmt: skip
+
+
+def explain(code: str) -> tuple[str, str] | None:
+    """Return what a code means and what to do, or None where it is unknown.
+
+    Examples
+    --------
+    >>> explain("ok")[1]
+    'Nothing.'
+    """
+    return WORDS.get(code.split(":")[0])
