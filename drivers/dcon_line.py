@@ -36,7 +36,7 @@ class DconLine:
     """Exchange commands and replies over one serial port, in a thread of its own.
 
     After a failure the line is drained for half the time limit; then `$AAM`, whose reply carries the address,
-    must be answered before `#AA` is sent. For `DISTRUST_S` more each `#AA` is followed by `$AAM` too. A module
+    must be answered before `#AA` is sent. For `DISTRUST_S` more each `#AA` is followed by it too. A module
     answers in order, so a reply too many before the one with the address means that a late one has come
     between, and both are discarded.
 
