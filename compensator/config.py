@@ -29,27 +29,27 @@ class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A table that refuses unknown keys."""
 
 
-class Machine(_Table):
+class Machine(_Table, frozen=True, kw_only=True):
     """`[machine]`: the name that stands in every message and file."""
 
     name: Name
 
 
-class ModelChoice(_Table):
+class ModelChoice(_Table, frozen=True, kw_only=True):
     """`[model]`: a model file (relative to the configuration) or `quill`."""
 
     file: str
     alternative: str | None = None
 
 
-class Sampling(_Table):
+class Sampling(_Table, frozen=True, kw_only=True):
     """`[sampling]`: how often devices are asked, and how many readings make a sample."""
 
     poll_interval_s: Positive = 1.0
     min_good_fraction: Annotated[float, Meta(gt=0, le=1)] = 0.5
 
 
-class Channel(_Table):
+class Channel(_Table, frozen=True, kw_only=True):
     """`[[channel]]`: one measured quantity, and what is plausible for it.
 
     The guards are optional for auxiliary channels and required for T_Q, AT and Y.
@@ -63,20 +63,20 @@ class Channel(_Table):
     stuck_after_min: Positive | None = None
 
 
-class Guards(_Table):
+class Guards(_Table, frozen=True, kw_only=True):
     """`[guards]`: plausibility between channels."""
 
     t_q_below_at_max_k: Positive
 
 
-class Validity(_Table):
+class Validity(_Table, frozen=True, kw_only=True):
     """`[limits.validity]`: temperatures on which the machine was calibrated, °C."""
 
     t_q_degc: tuple[float, float]
     at_degc: tuple[float, float]
 
 
-class Limits(_Table):
+class Limits(_Table, frozen=True, kw_only=True):
     """`[limits]`: what the offset may do."""
 
     offset_max_um: Positive
@@ -84,13 +84,13 @@ class Limits(_Table):
     validity: Validity
 
 
-class Loss(_Table):
+class Loss(_Table, frozen=True, kw_only=True):
     """`[loss]`: how long the model's own prediction replaces a lost temperature."""
 
     predict_for_min: Positive
 
 
-class Zero(_Table):
+class Zero(_Table, frozen=True, kw_only=True):
     """`[zero]`: when and how the references are set.
 
     `rest_rate_um_per_min`: a machine that grows slower than this counts as at rest when it is zeroed.
@@ -100,7 +100,7 @@ class Zero(_Table):
     at_start: bool = True
 
 
-class Zenoh(_Table):
+class Zenoh(_Table, frozen=True, kw_only=True):
     """`[zenoh]`: where the offset goes. Nothing is listened on unless it stands here."""
 
     prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$")]
@@ -109,13 +109,13 @@ class Zenoh(_Table):
     connect: list[str] = []
 
 
-class Recording(_Table):
+class Recording(_Table, frozen=True, kw_only=True):
     """`[recording]`: folder of the MCAP files, relative to the configuration."""
 
     folder: str
 
 
-class Config(_Table):
+class Config(_Table, frozen=True, kw_only=True):
     """A whole configuration file."""
 
     machine: Machine

@@ -75,4 +75,4 @@ def explain(code: str) -> tuple[str, str] | None:
     >>> explain("ok")[1]
     'Nothing.'
     """
-    return WORDS.get(code.split(":")[0])
+    return WORDS.get(code.split(":", maxsplit=1)[0])

@@ -114,7 +114,9 @@ class SensorGuards:
             # Which of the two is wrong cannot be told: neither is used.
             verdicts["t_q_degc"] = verdicts["at_degc"] = "t_q_below_at"
         return {
-            name: sample if verdicts[name] == sample.quality else msgspec.structs.replace(sample, quality=verdicts[name])
+            name: sample
+            if verdicts[name] == sample.quality
+            else msgspec.structs.replace(sample, quality=verdicts[name])
             for name, sample in channels.items()
         }
 

@@ -69,7 +69,9 @@ class OffsetLimiter:
             wanted = self.offset_um + math.copysign(step_max, wanted - self.offset_um)
             reasons.append("rate_limited")
         self.offset_um = wanted
-        return Limited(wanted, self._rate_towards(target_um + target_rate_um_per_min * self._period_min), tuple(reasons))
+        return Limited(
+            wanted, self._rate_towards(target_um + target_rate_um_per_min * self._period_min), tuple(reasons)
+        )
 
     def hold(self) -> Limited:
         """Stay where it is."""

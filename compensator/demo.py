@@ -1,0 +1,440 @@
+"""The whole loop on simulated hardware: a machine's day through real protocols, the service, disk and Zenoh.
+
+The simulated machine, its sensors and its devices come from `sim_hardware` and share nothing with the
+service. Time is handed in, so that the day takes seconds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import zenoh
+
+from compensator.clock import NS, VirtualClock
+from compensator.config import Zenoh
+from compensator.messages import Offset, number
+from compensator.report.page import Figure, Line, Page, write_page
+from compensator.service.compensation import Outcome
+from compensator.service.composition import run_service
+from compensator.service.publisher import session_config
+from compensator.simulation import Scores, scores
+from sim_hardware.physics import Duty, PublishedQuill, QuillMachine, World, usual_sensors
+from sim_hardware.wire import (
+    CapaNcdt,
+    DconLine,
+    IcpDas,
+    ModbusRtuLine,
+    ModbusTcpServer,
+    Rack,
+    Register,
+    RegisterMap,
+)
+
+Vector = npt.NDArray[np.float64]
+
+#: 2026-01-05 06:00 UTC, a Monday's early shift.
+START_NS = 1_767_592_800 * NS
+POLL_INTERVAL_S = 10.0
+PROBE_RANGE_UM = 500.0
+
+MACHINES = {"conduction": QuillMachine, "published": PublishedQuill}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Day:
+    """What came of one simulated run.
+
+    Parameters
+    ----------
+    outcomes : list of Outcome
+        One for each sample.
+    received : list of Offset
+        What a separate Zenoh subscriber got.
+    truth : dict of str to numpy.ndarray
+        The simulated machine's own history.
+    seconds : float
+        How long it took, s.
+    """
+
+    outcomes: list[Outcome]
+    received: list[Offset]
+    truth: Mapping[str, Vector]
+    seconds: float
+
+
+def run_demo(out: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], str]:
+    """Run the demo and write its results.
+
+    Parameters
+    ----------
+    out : pathlib.Path
+        Folder; a configuration, recordings and `report.html` of each machine come there.
+    hours : float
+        Length of the simulated run, h.
+    seed : int
+        Seed of the simulated day.
+
+    Returns
+    -------
+    (dict, str)
+        Figures, and the table as text.
+    """
+    results = {}
+    figures = []
+    for name in MACHINES:
+        day = run_day(out / name, machine=name, hours=hours, seed=seed)
+        results[name] = _figures(day)
+        figures += _pictures(name, day)
+    page = out / "report.html"
+    table = _table(results)
+    write_page(
+        page,
+        Page(title="A simulated day, compensated", verdict=_verdict(results), table=table, figures=figures),
+    )
+    text = "\n".join(
+        "  ".join(f"{cell:>{width}}" for cell, width in zip(row, _widths(table), strict=True))
+        for row in table
+    )
+    return {"machines": results, "report": str(page)}, f"{text}\n\n{_verdict(results)}\npage: {page}"
+
+
+# ---------------------------------------------------------------------------- one simulated day
+
+
+def run_day(folder: Path, *, machine: str, hours: float, seed: int) -> Day:
+    """Run one simulated machine through its devices, the service, disk and Zenoh.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Where the configuration and the recordings go.
+    machine : str
+        `conduction` or `published`.
+    hours : float
+        Length, h.
+    seed : int
+        Seed of duty and sensors.
+    """
+    duty = Duty.working_day(seed, hours=hours + 0.1)
+    world = World(MACHINES[machine](), duty, usual_sensors(duty.extra_names), seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    with hardware(world) as (lines, capa):
+        port = _free_port()
+        config = folder / "config.toml"
+        config.write_text(configuration(f"sim-{machine}", lines, port), encoding="utf-8")
+
+        async def advance(t_s: float) -> None:
+            world.advance_to(t_s)
+            capa.push(1)
+
+        outcomes: list[Outcome] = []
+        received: list[Offset] = []
+        clock = VirtualClock(START_NS, advance)
+        asyncio.run(_serve(config, clock, round(hours * 60), outcomes, received, port))
+    return Day(
+        outcomes=outcomes, received=received, truth=world.history(), seconds=time.perf_counter() - began
+    )
+
+
+async def _serve(
+    config: Path,
+    clock: VirtualClock,
+    samples: int,
+    outcomes: list[Outcome],
+    received: list[Offset],
+    port: int,
+) -> None:
+    """Run the service with a subscriber in a Zenoh session of its own."""
+    subscriber: Any = None
+    ready = asyncio.Event()
+
+    async def listen() -> None:
+        nonlocal subscriber
+        await ready.wait()
+        settings = Zenoh(prefix="shop/sim", mode="client", connect=[f"tcp/127.0.0.1:{port}"])
+        subscriber = await asyncio.to_thread(zenoh.open, session_config(settings))
+        subscriber.declare_subscriber(
+            "shop/sim/thermal/y/offset",
+            lambda s: received.append(msgspec.json.decode(s.payload.to_bytes(), type=Offset)),
+        )
+
+    task = asyncio.create_task(listen())
+    try:
+        await run_service(
+            str(config),
+            clock=clock,
+            samples=samples,
+            on_ready=lambda _: ready.set(),
+            on_sample=outcomes.append,
+        )
+        await task
+    finally:
+        if subscriber is not None:
+            await asyncio.to_thread(subscriber.close)
+
+
+@contextmanager
+def hardware(world: World) -> Iterator[tuple[dict[str, Any], CapaNcdt]]:
+    """Put the simulated machine's sensors on simulated devices, one for each protocol.
+
+    Yields
+    ------
+    (dict, CapaNcdt)
+        Addresses of the lines by protocol, and the displacement controller, whose stream the clock drives.
+    """
+    source = world.source
+    with Rack() as rack:
+        rtu = rack.add(ModbusRtuLine({1: IcpDas("m-7018r", couples="K", sources={0: source("t_q_degc")})}))
+        tcp = rack.add(ModbusTcpServer({1: IcpDas("et-7018z", couples="T", sources={0: source("at_degc")})}))
+        plc = rack.add(ModbusTcpServer({1: RegisterMap({
+            0: Register(source=source("spindle_rpm")),
+            1: Register(source=source("coolant_degc"), per_unit=100.0),
+        })}))  # fmt: skip
+        dcon = rack.add(DconLine({2: IcpDas("m-7018r", couples="K", sources={0: source("base_degc")})}))
+        capa = rack.add(CapaNcdt({1: lambda: PROBE_RANGE_UM / 2 + source("y_um")()}, PROBE_RANGE_UM))
+        yield {
+            "rtu": rtu.port, "tcp": tcp.port, "plc": plc.port, "dcon": dcon.port,
+            "data": capa.data_port, "command": capa.command_port,
+        }, capa  # fmt: skip
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def configuration(machine: str, lines: Mapping[str, Any], zenoh_port: int) -> str:
+    """Write the configuration of the simulated machine, as an engineer would write it."""
+    return f"""# Configuration of a simulated machine.
+[machine]
+name = "{machine}"
+
+[model]
+file = "quill"
+
+[sampling]
+poll_interval_s = {POLL_INTERVAL_S}
+
+[limits]
+offset_max_um = 200.0
+offset_rate_max_um_per_min = 8.0
+[limits.validity]
+t_q_degc = [10.0, 60.0]
+at_degc = [12.0, 32.0]
+
+[loss]
+predict_for_min = 30.0
+
+[zero]
+rest_rate_um_per_min = 0.2
+
+[guards]
+t_q_below_at_max_k = 2.0
+
+[zenoh]
+prefix = "shop/sim"
+mode = "peer"
+listen = ["tcp/127.0.0.1:{zenoh_port}"]
+
+[recording]
+folder = "recordings"
+
+[[line]]
+name = "rs485"
+protocol = "modbus-rtu"
+port = "{lines["rtu"]}"
+[[line]]
+name = "cabinet"
+protocol = "modbus-tcp"
+host = "127.0.0.1"
+tcp_port = {lines["tcp"]}
+[[line]]
+name = "plc"
+protocol = "modbus-tcp"
+host = "127.0.0.1"
+tcp_port = {lines["plc"]}
+[[line]]
+name = "base-line"
+protocol = "dcon"
+port = "{lines["dcon"]}"
+[[line]]
+name = "probe-line"
+protocol = "capancdt"
+host = "127.0.0.1"
+data_port = {lines["data"]}
+command_port = {lines["command"]}
+
+[[device]]
+name = "spindle-couples"
+line = "rs485"
+model = "icpdas-m7018r"
+address = 1
+format = "hex"
+inputs = [{{ input = 0, couple = "K" }}]
+[[device]]
+name = "cabinet-couples"
+line = "cabinet"
+model = "icpdas-et7018z"
+address = 1
+format = "hex"
+inputs = [{{ input = 0, couple = "T" }}]
+[[device]]
+name = "control"
+line = "plc"
+model = "modbus-map"
+address = 1
+inputs = [
+  {{ input = 0, unit = "rpm", function = 4, address = 0, type = "int16" }},
+  {{ input = 1, unit = "degc", function = 4, address = 1, type = "int16", scale = 0.01 }},
+]
+[[device]]
+name = "base-couples"
+line = "base-line"
+model = "dcon"
+address = 2
+inputs = [{{ input = 0, couple = "K" }}]
+[[device]]
+name = "probe"
+line = "probe-line"
+model = "capancdt-6200"
+inputs = [{{ input = 0 }}]
+
+[[channel]]
+name = "t_q_degc"
+device = "spindle-couples"
+input = 0
+range = [0.0, 80.0]
+rate_max_per_min = 5.0
+stuck_after_min = 120.0
+[[channel]]
+name = "at_degc"
+device = "cabinet-couples"
+input = 0
+range = [5.0, 45.0]
+rate_max_per_min = 2.0
+stuck_after_min = 240.0
+[[channel]]
+name = "y_um"
+device = "probe"
+input = 0
+range = [10.0, 490.0]
+rate_max_per_min = 30.0
+stuck_after_min = 60.0
+[[channel]]
+name = "base_degc"
+device = "base-couples"
+input = 0
+[[channel]]
+name = "spindle_rpm"
+device = "control"
+input = 0
+[[channel]]
+name = "coolant_degc"
+device = "control"
+input = 1
+"""
+
+
+# ---------------------------------------------------------------------------- figures
+
+
+def _errors(day: Day) -> dict[str, Vector]:
+    """Return true deformation and what is left of it with the offset held and with its rate followed, µm."""
+    t = day.truth["t_s"]
+    y = day.truth["y_um"]
+    offsets = [(o.offset.time_utc_ns - START_NS) / NS for o in day.outcomes]
+    start = int(np.searchsorted(t, offsets[0]))
+    t, y = t[start:], y[start:] - y[start]
+    index = np.clip(np.searchsorted(offsets, t, side="right") - 1, 0, None)
+    value = np.array([number(o.offset.y_offset_um) for o in day.outcomes])[index]
+    rate = np.array([number(o.offset.y_offset_rate_um_per_min) for o in day.outcomes])[index]
+    return {
+        "t_h": t / 3600.0, "without": y, "held": y + value,
+        "followed": y + value + rate * (t - np.array(offsets)[index]) / 60.0,
+    }  # fmt: skip
+
+
+def _figures(day: Day) -> dict[str, Any]:
+    errors = _errors(day)
+    estimate = [outcome.estimate for outcome in day.outcomes]
+    fit = scores(
+        np.array([number(e.y_um) for e in estimate]), np.array([number(e.y_pred_um) for e in estimate])
+    )
+    still = errors["followed"]
+    part: dict[str, Any] = {
+        name: {
+            "rms_um": float(np.sqrt(np.mean(errors[name] ** 2))),
+            "peak_to_peak_um": float(np.ptp(errors[name])),
+        }
+        for name in ("without", "held", "followed")
+    }
+    part |= {
+        "samples": len(day.outcomes), "received": len(day.received), "seconds": round(day.seconds, 1),
+        "fit_pct": fit.fit_pct, "removed_pct": 100.0 * (1.0 - float(np.std(still)) / float(np.std(errors["without"]))),
+        "states": {s: sum(o.offset.state == s for o in day.outcomes) for s in {o.offset.state for o in day.outcomes}},
+    }  # fmt: skip
+    return part
+
+
+def _table(results: Mapping[str, Any]) -> list[list[str]]:
+    rows = [["simulated machine", "", "rms µm", "peak-to-peak µm", "fit %", "samples", "seconds"]]
+    for machine, figures in results.items():
+        for key, words in (
+            ("without", "no compensation"),
+            ("held", "offset held 60 s"),
+            ("followed", "rate followed"),
+        ):
+            first = key == "without"
+            rows.append([
+                machine if first else "", words, f"{figures[key]['rms_um']:.2f}",
+                f"{figures[key]['peak_to_peak_um']:.2f}", f"{figures['fit_pct']:.1f}" if key == "followed" else "",
+                str(figures["samples"]) if first else "", f"{figures['seconds']:.1f}" if first else "",
+            ])  # fmt: skip
+    return rows
+
+
+def _widths(table: list[list[str]]) -> list[int]:
+    return [max(len(row[i]) for row in table) for i in range(len(table[0]))]
+
+
+def _verdict(results: Mapping[str, Any]) -> str:
+    parts = [
+        f"{name}: {figures['without']['peak_to_peak_um']:.0f} µm of thermal error become "
+        f"{figures['followed']['peak_to_peak_um']:.1f} µm"
+        for name, figures in results.items()
+    ]
+    return "Peak to peak over the day, with the published model. " + "; ".join(parts) + "."
+
+
+def _pictures(name: str, day: Day) -> list[Figure]:
+    errors = _errors(day)
+    hours = [(o.estimate.time_utc_ns - START_NS) / NS / 3600 for o in day.outcomes]
+    heat = [number(o.estimate.heat_w) for o in day.outcomes]
+    return [
+        Figure(
+            title=f"{name}: thermal error with and without compensation", x_label="time, h", y_label="error in Y, µm",
+            lines=(Line("without", errors["t_h"], errors["without"]), Line("with", errors["t_h"], errors["followed"])),
+        ),
+        Figure(
+            title=f"{name}: heat", x_label="time, h", y_label="heat, W",
+            lines=(
+                Line("true", day.truth["t_s"] / 3600.0, day.truth["heat_w"]),
+                Line("estimated from T_Q and AT", np.array(hours), np.array(heat)),
+            ),
+        ),
+    ]  # fmt: skip
+
+
+__all__ = ["Day", "Scores", "configuration", "hardware", "run_day", "run_demo"]

@@ -1,0 +1,75 @@
+"""A recording as a table: one row for each sample, with everything that was measured, estimated and published."""
+
+from __future__ import annotations
+
+import csv
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from compensator.errors import DataError
+from compensator.messages import EstimateMessage, Offset, Sample
+from compensator.recording import decode, read_messages
+
+_ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um")
+_OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
+
+
+def export(recording: Path, out: Path) -> int:
+    """Write a recording as CSV.
+
+    Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
+    offset, its state and reasons. `heat_w` is the estimate; a measured heat stands in `heat_measured_w`.
+
+    Returns
+    -------
+    int
+        Number of samples.
+
+    Raises
+    ------
+    DataError
+        If it is no recording, or has no samples.
+    """
+    rows: dict[int, dict[str, Any]] = {}
+    for record in read_messages(recording, ("sample", "estimate", "offset")):
+        message = decode(record, recording)
+        assert isinstance(message, (Sample, EstimateMessage, Offset))
+        rows.setdefault(message.seq, {}).update(_cells(message))
+    if not rows:
+        raise DataError(f"{recording}: no samples in it")
+    start = min(row["_ns"] for row in rows.values())
+    for row in rows.values():
+        row["t_s"] = (row.pop("_ns") - start) / 1e9
+    names = list(dict.fromkeys(name for row in rows.values() for name in row))
+    names.sort(
+        key=lambda name: ("time_utc", "t_s", "seq").index(name) if name in ("time_utc", "t_s", "seq") else 3
+    )
+    with out.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, names, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows.values())
+    return len(rows)
+
+
+def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:
+    cells: dict[str, Any] = {
+        "_ns": message.time_utc_ns,
+        "time_utc": datetime.fromtimestamp(message.time_utc_ns / 1e9, UTC).isoformat(),
+        "seq": message.seq,
+    }
+    if isinstance(message, Sample):
+        for name, channel in message.channels.items():
+            # A mean that the guards refused is no value for a table; the quality says why it is missing.
+            cells["heat_measured_w" if name == "heat_w" else name] = (
+                channel.mean if channel.quality == "good" else None
+            )
+            cells[f"{name}_quality"] = channel.quality
+        return cells
+    fields = msgspec.structs.asdict(message)
+    cells |= {name: fields[name] for name in (_ESTIMATE if isinstance(message, EstimateMessage) else _OFFSET)}
+    if isinstance(message, Offset):
+        cells["reasons"] = " ".join(message.reasons)
+    return cells

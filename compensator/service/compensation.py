@@ -1,0 +1,307 @@
+"""From a sample to an offset: guards, zero, engine, loss of a sensor, limits, state.
+
+This is the whole decision of the service, and it knows no socket, file or clock: a recorded sample gives the
+same estimate and the same offset again, bit for bit. What it publishes never jumps: every change goes
+through the limiter, whatever caused it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import msgspec
+
+from compensator.config import Config
+from compensator.errors import ServiceError
+from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, State, number
+from compensator.model.engine import Engine, Estimate
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.guards import SensorGuards
+from compensator.service.limits import Limited, OffsetLimiter
+
+NAN = float("nan")
+
+#: A published offset may be used for this many samples.
+VALID_SAMPLES = 2.5
+#: Number of rates whose mean tells whether the machine is at rest.
+REST_SAMPLES = 5
+
+ZeroMode = Literal["auto", "rest", "warm"]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one sample led to.
+
+    Parameters
+    ----------
+    sample : Sample
+        The sample with the guards' verdicts.
+    estimate : EstimateMessage
+        What the model makes of it.
+    offset : Offset
+        What is to be published.
+    notes : tuple of (str, str)
+        Events: kind and text.
+    """
+
+    sample: Sample
+    estimate: EstimateMessage
+    offset: Offset
+    notes: tuple[tuple[str, str], ...]
+
+
+@dataclass(slots=True)
+class _Values:
+    """Usable values of one sample; NaN where a channel is not usable."""
+
+    t_q: float
+    at: float
+    y: float
+    others: dict[str, float]
+
+
+@dataclass(slots=True)
+class _Zero:
+    """References beyond those of the engine."""
+
+    y_ref: float = NAN
+    y_base: float = 0.0
+    wanted: bool = False
+    mode: ZeroMode = "auto"
+
+
+@dataclass(slots=True)
+class _Memory:
+    """What is remembered from sample to sample."""
+
+    estimate: Estimate | None = None
+    missing_min: float = 0.0
+    rates: list[float] = field(default_factory=list)
+    operator_hold: bool = False
+    internal_error: bool = False
+
+
+class Compensation:
+    """Compensation of one machine.
+
+    Parameters
+    ----------
+    config : Config
+        Limits, guards, loss, zero.
+    model : ThermalModel
+        What predicts the deformation.
+    """
+
+    def __init__(self, config: Config, model: ThermalModel) -> None:
+        self._config = config
+        self.model = model
+        self._period_min = model.period_s / 60.0
+        self._engine = Engine(model)
+        names = {channel.name for channel in config.channel}
+        missing = [name for name in self._engine.channels if name not in names]
+        if missing:
+            raise ServiceError(
+                f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured"
+            )
+        self._guards = SensorGuards(config.channel, config.guards, self._period_min)
+        self._limiter = OffsetLimiter(config.limits, self._period_min)
+        self._zero = _Zero(wanted=config.zero.at_start)
+        self._memory = _Memory()
+        self._validity = self._bounds()
+
+    def _bounds(self) -> dict[str, tuple[float, float]]:
+        """Return the range of validity: the configuration's, narrowed by the model's own."""
+        limits = self._config.limits.validity
+        bounds = {"t_q_degc": limits.t_q_degc, "at_degc": limits.at_degc}
+        for key, (low, high) in self.model.validity.items():
+            configured = bounds.get(key, (-math.inf, math.inf))
+            bounds[key] = (max(low, configured[0]), min(high, configured[1]))
+        return bounds
+
+    # ------------------------------------------------------------------ commands
+
+    def zero(self, mode: ZeroMode = "auto") -> None:
+        """Ask for a zero at the next sample that has both temperatures.
+
+        Parameters
+        ----------
+        mode : {"auto", "rest", "warm"}
+            `rest`: the machine is in thermal equilibrium; temperatures and deformation count from here.
+            `warm`: it is not; only the deformation counts from here, what the machine has stored goes on.
+            `auto`: `rest` where the predicted growth is below the configured rate, else `warm`.
+        """
+        self._zero.wanted, self._zero.mode = True, mode
+
+    def hold(self) -> None:
+        """Freeze the offset until `resume`."""
+        self._memory.operator_hold = True
+
+    def resume(self) -> None:
+        """Follow the model again, at the permitted rate."""
+        self._memory.operator_hold = False
+        self._memory.internal_error = False
+
+    def fail(self) -> None:
+        """Hold the offset because the service met an error of its own."""
+        self._memory.internal_error = True
+
+    # ------------------------------------------------------------------ one sample
+
+    def process(self, raw: Sample) -> Outcome:
+        """Take one sample.
+
+        Parameters
+        ----------
+        raw : Sample
+            What the devices gave.
+
+        Returns
+        -------
+        Outcome
+            Everything to be recorded and published, in that order.
+        """
+        heat = self._memory.estimate.heat_w if self._memory.estimate else NAN
+        sample = msgspec.structs.replace(raw, channels=self._guards.judge(raw.channels, heat))
+        values = _values(sample.channels)
+        notes: list[tuple[str, str]] = []
+        self._set_zero(values, notes)
+        estimate = None
+        if self._engine.has_reference:
+            estimate = self._engine.step(values.t_q, values.at, values.others)
+            self._memory.estimate = estimate
+            self._memory.rates = [*self._memory.rates[-REST_SAMPLES + 1 :], estimate.y_rate_um_per_min]
+        y_pred = estimate.y_um - self._zero.y_base if estimate else NAN
+        if math.isnan(self._zero.y_ref) and estimate is not None:
+            # The probe was missing at the zero: its reference makes the residual start at zero.
+            self._zero.y_ref = values.y - y_pred
+        state, reasons, limited = self._decide(values, estimate, y_pred)
+        return Outcome(
+            sample=sample,
+            estimate=self._estimate_message(sample, values, estimate, y_pred),
+            offset=self._offset_message(sample, estimate, state, reasons, limited),
+            notes=tuple(notes),
+        )
+
+    def _set_zero(self, values: _Values, notes: list[tuple[str, str]]) -> None:
+        zero = self._zero
+        if not zero.wanted or math.isnan(values.t_q) or math.isnan(values.at):
+            return
+        warm = self._engine.has_reference and self._is_warm(zero.mode)
+        if warm:
+            # The state is that of the last sample; its growth until this one belongs to what comes.
+            zero.y_base = self._memory.estimate.y_um if self._memory.estimate else 0.0
+        else:
+            self._engine.set_reference(values.t_q, values.at)
+            self._memory.estimate, self._memory.rates = None, []
+            zero.y_base = 0.0
+        zero.y_ref, zero.wanted = values.y, False
+        notes.append((
+            "zero",
+            f"zero on a {'warm machine' if warm else 'machine at rest'}: "
+            f"T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C, Y {values.y:.3f} µm",
+        ))  # fmt: skip
+
+    def _is_warm(self, mode: ZeroMode) -> bool:
+        rates = self._memory.rates
+        if mode != "auto" or not rates:
+            return mode == "warm"
+        return abs(math.fsum(rates) / len(rates)) > self._config.zero.rest_rate_um_per_min
+
+    # ------------------------------------------------------------------ decision
+
+    def _decide(
+        self, values: _Values, estimate: Estimate | None, y_pred: float
+    ) -> tuple[State, list[str], Limited | None]:
+        reasons = [
+            code
+            for code, value in (("t_q_missing", values.t_q), ("at_missing", values.at))
+            if math.isnan(value)
+        ]
+        lost = bool(reasons)
+        self._memory.missing_min = self._memory.missing_min + self._period_min if lost else 0.0
+        expired = lost and self._memory.missing_min > self._config.loss.predict_for_min
+        if estimate is None:
+            state: State = "fault" if expired else "starting"
+            return state, [*reasons, "no_zero"], None
+        reasons += [
+            f"channel_missing:{name}"
+            for name in self._engine.channels
+            if math.isnan(values.others.get(name, NAN))
+        ]
+        blocking = self._blocking(values, estimate, expired)
+        if blocking:
+            return "hold", reasons + blocking, self._limiter.hold()
+        if lost:
+            reasons.append("predicting")
+        limited = self._limiter.follow(-y_pred, -estimate.y_rate_um_per_min)
+        reasons += limited.reasons
+        return ("degraded" if reasons else "ok"), reasons, limited
+
+    def _blocking(self, values: _Values, estimate: Estimate, expired: bool) -> list[str]:
+        """Return why the offset must stay where it is."""
+        outside = [
+            f"outside_validity:{name}"
+            for name, value in (("t_q_degc", values.t_q), ("at_degc", values.at), ("heat_w", estimate.heat_w))
+            if name in self._validity and not math.isnan(value)
+            and not self._validity[name][0] <= value <= self._validity[name][1]
+        ]  # fmt: skip
+        flags = (
+            ("prediction_expired", expired),
+            ("operator_hold", self._memory.operator_hold),
+            ("internal_error", self._memory.internal_error),
+        )
+        return outside + [code for code, present in flags if present]
+
+    # ------------------------------------------------------------------ messages
+
+    def _estimate_message(
+        self, sample: Sample, values: _Values, estimate: Estimate | None, y_pred: float
+    ) -> EstimateMessage:
+        y = values.y - self._zero.y_ref
+        reference = self._engine.reference
+        return EstimateMessage(
+            schema=SCHEMA, machine=sample.machine, seq=sample.seq, time_utc_ns=sample.time_utc_ns,
+            t_q_ref_degc=reference.t_q_degc, at_ref_degc=reference.at_degc, y_ref_um=self._zero.y_ref,
+            heat_w=estimate.heat_w if estimate else NAN,
+            heat_std_w=estimate.heat_std_w if estimate else NAN,
+            y_dtf_um=estimate.y_dtf_um if estimate else NAN,
+            y_tdtf_um=estimate.y_tdtf_um if estimate else NAN,
+            y_effects_um=list(estimate.y_effects_um) if estimate else [],
+            y_base_um=self._zero.y_base,
+            y_pred_um=y_pred,
+            y_std_um=estimate.y_std_um if estimate else NAN,
+            y_rate_um_per_min=estimate.y_rate_um_per_min if estimate else NAN,
+            y_um=y, residual_um=y - y_pred,
+        )  # fmt: skip
+
+    def _offset_message(
+        self,
+        sample: Sample,
+        estimate: Estimate | None,
+        state: State,
+        reasons: list[str],
+        limited: Limited | None,
+    ) -> Offset:
+        return Offset(
+            schema=SCHEMA, machine=sample.machine, seq=sample.seq, time_utc_ns=sample.time_utc_ns,
+            valid_for_s=VALID_SAMPLES * self.model.period_s,
+            y_offset_um=limited.offset_um if limited else NAN,
+            y_offset_rate_um_per_min=limited.rate_um_per_min if limited else NAN,
+            y_offset_std_um=estimate.y_std_um if estimate else NAN,
+            state=state, reasons=reasons, model_sha256=self.model.sha256,
+        )  # fmt: skip
+
+
+def _values(channels: dict[str, ChannelSample]) -> _Values:
+    usable = {
+        name: number(channel.mean) if channel.quality == "good" else NAN for name, channel in channels.items()
+    }
+    return _Values(
+        t_q=usable.pop("t_q_degc", NAN),
+        at=usable.pop("at_degc", NAN),
+        y=usable.pop("y_um", NAN),
+        others=usable,
+    )

@@ -1,0 +1,117 @@
+"""Puts the service together; the only room that knows the drivers' catalogue."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import drivers
+from compensator.clock import Clock, SystemClock
+from compensator.config import LoadedConfig, load_config
+from compensator.errors import ConfigError
+from compensator.model.model_file import parse_model, read_model_bytes
+from compensator.model.thermal_model import ThermalModel
+from compensator.recording import last_sequence
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.daemon import Daemon
+from compensator.service.publisher import Publisher
+from compensator.service.recorder import Recorder
+from drivers.errors import DriverConfigError, DriverError
+from drivers.reading import Reading
+
+
+def load(path: str) -> tuple[LoadedConfig, ThermalModel, bytes, drivers.Fleet]:
+    """Read configuration and model and make the devices; nothing is opened.
+
+    Raises
+    ------
+    ConfigError, ModelError
+        One line that names what is wrong.
+    """
+    loaded = load_config(path)
+    config = loaded.config
+    data = read_model_bytes(loaded.model_name())
+    model = parse_model(data, source=config.model.file)
+    if config.model.alternative:
+        model = model.with_alternative(config.model.alternative)
+    polls = model.period_s / config.sampling.poll_interval_s
+    if abs(polls - round(polls)) > 1e-9 or polls < 1:
+        raise ConfigError(
+            f"{path}: sampling.poll_interval_s = {config.sampling.poll_interval_s:g}, "
+            f"expected a whole part of the model's {model.period_s:g} s"
+        )
+    try:
+        fleet = drivers.build(config.line, config.device, source=str(path))
+    except DriverConfigError as error:
+        raise ConfigError(str(error)) from error
+    for channel in config.channel:
+        units = fleet.devices[channel.device].units
+        if channel.input not in units:
+            raise ConfigError(
+                f"{path}: channel {channel.name!r}: input {channel.input} of device {channel.device!r} is not "
+                f"configured, expected one of: {', '.join(map(str, sorted(units)))}"
+            )
+        _check_unit(path, channel.name, units[channel.input])
+    return loaded, model, data, fleet
+
+
+def _check_unit(path: str, name: str, unit: str) -> None:
+    for role, expected in (("t_q_degc", "degc"), ("at_degc", "degc"), ("y_um", "um")):
+        if name == role and unit != expected:
+            raise ConfigError(f"{path}: channel {name!r}: its input gives {unit}, expected {expected}")
+
+
+async def read_once(fleet: drivers.Fleet) -> dict[str, dict[int, Reading] | DriverError]:
+    """Read every device once, side by side."""
+    results = await asyncio.gather(
+        *(device.read() for device in fleet.devices.values()), return_exceptions=True
+    )
+    answers: dict[str, dict[int, Reading] | DriverError] = {}
+    for name, result in zip(fleet.devices, results, strict=True):
+        if isinstance(result, DriverError):
+            answers[name] = result
+        elif isinstance(result, BaseException):
+            raise result
+        else:
+            answers[name] = dict(result)
+    await fleet.close()
+    return answers
+
+
+async def run_service(
+    path: str, *, clock: Clock | None = None, samples: int | None = None,
+    on_ready: Callable[[Daemon], None] | None = None, on_sample: Callable[[Outcome], None] | None = None,
+) -> Daemon:  # fmt: skip
+    """Run the service of a configuration until it is stopped.
+
+    Parameters
+    ----------
+    path : str
+        Configuration file.
+    clock : Clock, optional
+        The machine's own where none is given.
+    samples : int, optional
+        Stop after so many.
+    on_ready : callable, optional
+        Called with the daemon once everything is open.
+    on_sample : callable, optional
+        Called after each sample.
+    """
+    loaded, model, model_bytes, fleet = load(path)
+    config = loaded.config
+    folder = loaded.resolve(config.recording.folder)
+    recorder = Recorder(folder, config.machine.name, {"config.toml": loaded.data, "model.toml": model_bytes})
+    publisher = Publisher(config.zenoh, lambda name, payload: daemon.command(name, payload))
+    daemon = Daemon(
+        config=config, compensation=Compensation(config, model), devices=fleet.devices, recorder=recorder,
+        publish=publisher.publish, clock=clock or SystemClock(),
+        first_sequence=last_sequence(folder, config.machine.name) + 1,
+    )  # fmt: skip
+    try:
+        with publisher:
+            if on_ready is not None:
+                on_ready(daemon)
+            await daemon.run(samples=samples, on_sample=on_sample)
+    finally:
+        await fleet.close()
+    return daemon

@@ -1,0 +1,328 @@
+"""The service: polls devices, makes samples, lets the compensation decide, records, publishes.
+
+The order within a sample is fixed: everything is on disk before the offset goes out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from compensator import __version__
+from compensator.clock import Clock
+from compensator.config import Config
+from compensator.messages import SCHEMA, Event, Sample, Status, encode
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.grid import Grid
+from compensator.service.publisher import COMMANDS
+from compensator.service.sampling import ChannelCollector
+from drivers.errors import DriverError
+from drivers.reading import Device, Reading
+
+#: Part of the poll interval that a sample waits for devices at most.
+WAIT_PART = 0.5
+
+
+@dataclass(slots=True)
+class _DeviceState:
+    """A device with the poll that is under way and its last error."""
+
+    device: Device
+    task: asyncio.Task[Mapping[int, Reading]] | None = None
+    error: str = ""
+    answered: bool = True
+
+
+@dataclass(slots=True)
+class Latency:
+    """Seconds from the last byte read to the offset published, for each sample."""
+
+    seconds: list[float] = field(default_factory=list)
+
+    def add(self, value: float, keep: int = 10_000) -> None:
+        """Keep the newest values."""
+        self.seconds.append(value)
+        if len(self.seconds) > keep:
+            del self.seconds[: keep // 2]
+
+
+class Daemon:
+    """The service of one machine.
+
+    Parameters
+    ----------
+    config : Config
+        Settings.
+    compensation : Compensation
+        What decides.
+    devices : mapping of str to Device
+        Open or not; a device opens itself when it is read.
+    recorder : Recorder
+        Where every sample goes first.
+    publish : callable
+        Takes a message's name and its JSON; never waits.
+    clock : Clock
+        Handed in.
+    first_sequence : int
+        Sequence number of the first sample.
+    """
+
+    def __init__(
+        self, *, config: Config, compensation: Compensation, devices: Mapping[str, Device],
+        recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, first_sequence: int,
+    ) -> None:  # fmt: skip
+        self._config = config
+        self._compensation = compensation
+        self._devices = {name: _DeviceState(device) for name, device in devices.items()}
+        self._recorder = recorder
+        self._publish = publish
+        self._clock = clock
+        self._sequence = first_sequence
+        fraction = config.sampling.min_good_fraction
+        self._collectors = {channel.name: ChannelCollector(fraction) for channel in config.channel}
+        self._events: list[Event] = []
+        self._commands: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue(maxsize=100)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._stop = False
+        self._recording_failed = False
+        self._started_utc_ns = clock.utc_ns()
+        self._last_state = ""
+        self.latency = Latency()
+
+    # ------------------------------------------------------------------ running
+
+    async def run(
+        self, *, samples: int | None = None, on_sample: Callable[[Outcome], None] | None = None
+    ) -> None:
+        """Run until `stop` or for a number of samples.
+
+        Parameters
+        ----------
+        samples : int, optional
+            Stop after so many.
+        on_sample : callable, optional
+            Called with the outcome after each sample was published.
+        """
+        self._loop = asyncio.get_running_loop()
+        period_s = self._compensation.model.period_s
+        polls = max(1, round(period_s / self._config.sampling.poll_interval_s))
+        grid = Grid(self._clock, period_s, polls)
+        self._note("start", f"compensator {__version__} with model {self._compensation.model.name}")
+        done = 0
+        try:
+            while not self._stop and (samples is None or done < samples):
+                await self._clock.sleep(grid.seconds_to_next_poll())
+                if self._stop:
+                    break
+                await self._poll(period_s / polls)
+                if grid.polled():
+                    outcome = self._sample(grid.label_ns)
+                    self._tell_clock_step(grid.next_sample())
+                    done += 1
+                    if on_sample is not None:
+                        on_sample(outcome)
+        finally:
+            await self._close()
+
+    def stop(self) -> None:
+        """End the run after the poll under way; the recording is finished."""
+        self._stop = True
+
+    async def _close(self) -> None:
+        self._note("stop", "the service ends")
+        self._record([], self._clock.utc_ns())
+        try:
+            self._recorder.close()
+        except OSError as error:
+            self._publish_event("recording", f"the recording could not be finished: {error}")
+        for state in self._devices.values():
+            if state.task is not None:
+                state.task.cancel()
+        tasks = [state.task for state in self._devices.values() if state.task is not None]
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    # ------------------------------------------------------------------ polling
+
+    async def _poll(self, interval_s: float) -> None:
+        """Ask every device once; wait for those that answered last time, and not long for them."""
+        for state in self._devices.values():
+            if state.task is None:
+                state.task = asyncio.create_task(self._read(state.device))
+        awaited = [
+            state.task for state in self._devices.values() if state.task is not None and state.answered
+        ]
+        await self._clock.settle(awaited, WAIT_PART * interval_s)
+        results = {name: self._collect(state) for name, state in self._devices.items()}
+        for channel in self._config.channel:
+            readings, error = results[channel.device]
+            self._collectors[channel.name].add(readings.get(channel.input) if readings else None, error)
+
+    async def _read(self, device: Device) -> Mapping[int, Reading]:
+        return await device.read()
+
+    def _collect(self, state: _DeviceState) -> tuple[Mapping[int, Reading] | None, str | None]:
+        """Take the result of a device's poll; one that is still under way counts as missing."""
+        if state.task is None or not state.task.done():
+            state.answered = False
+            return None, "device_timeout"
+        task, state.task = state.task, None
+        state.answered = True
+        error = task.exception()
+        if error is None:
+            self._tell_device(state, "")
+            return task.result(), None
+        if not isinstance(error, DriverError):
+            raise error
+        state.answered = error.code != "device_timeout"
+        self._tell_device(state, str(error))
+        return None, error.code
+
+    def _tell_device(self, state: _DeviceState, error: str) -> None:
+        """Note once when a device goes, and once when it comes back."""
+        if bool(error) != bool(state.error):
+            name = state.device.name
+            self._note("device", error or f"{name}: answers again", {"device": name, "ok": not error})
+        state.error = error
+
+    # ------------------------------------------------------------------ one sample
+
+    def _sample(self, label_ns: int) -> Outcome:
+        began = time.perf_counter()
+        self._obey()
+        raw = Sample(
+            schema=SCHEMA, machine=self._config.machine.name, seq=self._sequence, time_utc_ns=label_ns,
+            period_s=self._compensation.model.period_s,
+            channels={name: collector.close() for name, collector in self._collectors.items()},
+        )  # fmt: skip
+        outcome = self._compensation.process(raw)
+        for kind, text in outcome.notes:
+            self._note(kind, text)
+        outcome = self._with_recording_state(outcome)
+        self._tell_state(outcome)
+        records = [
+            ("sample", encode(outcome.sample)),
+            ("estimate", encode(outcome.estimate)),
+            ("offset", encode(outcome.offset)),
+        ]
+        if not self._record(records, label_ns):
+            outcome = self._with_recording_state(outcome)
+            records[2] = ("offset", encode(outcome.offset))
+        self._publish("offset", records[2][1])
+        self.latency.add(time.perf_counter() - began)
+        self._publish("sample", records[0][1])
+        self._publish("estimate", records[1][1])
+        self._publish("status", encode(self._status(outcome)))
+        self._sequence += 1
+        return outcome
+
+    def _record(self, records: list[tuple[str, bytes]], time_utc_ns: int) -> bool:
+        """Bring records and waiting events to disk; tell whether it worked."""
+        events = [("event", encode(event)) for event in self._events]
+        try:
+            self._recorder.write([*events, *records], time_utc_ns)
+        except OSError as error:
+            if not self._recording_failed:
+                self._recording_failed = True
+                self._note("recording", f"the disk does not take the recording: {error}")
+            return False
+        if self._recording_failed:
+            self._recording_failed = False
+            self._note("recording", "the disk takes the recording again")
+        self._events = self._events[len(events) :]
+        return True
+
+    def _with_recording_state(self, outcome: Outcome) -> Outcome:
+        """Say in the offset that the disk does not take the recording."""
+        offset = outcome.offset
+        if not self._recording_failed or "recording_failed" in offset.reasons:
+            return outcome
+        state = "degraded" if offset.state == "ok" else offset.state
+        changed = msgspec.structs.replace(offset, state=state, reasons=[*offset.reasons, "recording_failed"])
+        return Outcome(outcome.sample, outcome.estimate, changed, outcome.notes)
+
+    def _status(self, outcome: Outcome) -> Status:
+        model = self._compensation.model
+        return Status(
+            schema=SCHEMA, machine=self._config.machine.name, seq=outcome.offset.seq,
+            time_utc_ns=outcome.offset.time_utc_ns, state=outcome.offset.state, reasons=outcome.offset.reasons,
+            version=__version__, model=model.name, model_kind=model.kind, model_sha256=model.sha256,
+            started_utc_ns=self._started_utc_ns,
+            recording=self._recorder.path.name if self._recorder.path else "",
+            devices={name: state.error or "ok" for name, state in self._devices.items()},
+        )  # fmt: skip
+
+    # ------------------------------------------------------------------ events and commands
+
+    def _note(self, kind: str, text: str, data: dict[str, Any] | None = None) -> None:
+        """Keep an event for the recording and publish it."""
+        event = Event(
+            schema=SCHEMA, machine=self._config.machine.name, seq=self._sequence,
+            time_utc_ns=self._clock.utc_ns(), kind=kind, text=text, data=data or {},
+        )  # fmt: skip
+        # Bounded, so that a disk that is gone for long costs no memory; the newest are kept.
+        self._events = [*self._events[-999:], event]
+        self._publish("event", encode(event))
+
+    def _publish_event(self, kind: str, text: str) -> None:
+        self._note(kind, text)
+
+    def _tell_state(self, outcome: Outcome) -> None:
+        offset = outcome.offset
+        now = " ".join([offset.state, *offset.reasons])
+        if now != self._last_state:
+            self._note("state", now, {"state": offset.state, "reasons": offset.reasons})
+            self._last_state = now
+
+    def _tell_clock_step(self, seconds: float) -> None:
+        if seconds:
+            self._note("clock", f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
+
+    def command(self, name: str, payload: bytes) -> dict[str, Any]:
+        """Take a command from another thread; it acts at the next sample.
+
+        Parameters
+        ----------
+        name : str
+            `zero`, `hold` or `resume`.
+        payload : bytes
+            Empty or a JSON object; `zero` takes `mode`: `auto`, `rest` or `warm`.
+
+        Returns
+        -------
+        dict
+            `ok` and `text`.
+        """
+        try:
+            arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            return {"ok": False, "text": f"{name}: the payload is no JSON object"}
+        mode = arguments.get("mode", "auto")
+        if name not in COMMANDS or (name == "zero" and mode not in ("auto", "rest", "warm")):
+            return {
+                "ok": False,
+                "text": f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume",
+            }
+        if self._loop is None or self._commands.full():
+            return {"ok": False, "text": "the service cannot take a command now"}
+        self._loop.call_soon_threadsafe(self._enqueue, name, arguments)
+        return {"ok": True, "text": f"{name}: acts at the next sample"}
+
+    def _enqueue(self, name: str, arguments: dict[str, Any]) -> None:
+        if not self._commands.full():
+            self._commands.put_nowait((name, arguments))
+
+    def _obey(self) -> None:
+        while not self._commands.empty():
+            name, arguments = self._commands.get_nowait()
+            self._note("command", name, arguments)
+            if name == "zero":
+                self._compensation.zero(arguments.get("mode", "auto"))
+            elif name == "hold":
+                self._compensation.hold()
+            else:
+                self._compensation.resume()

@@ -1,0 +1,122 @@
+"""Runs a model over measured data, free of any measured deformation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.errors import DataError
+from compensator.model.engine import Engine
+from compensator.model.thermal_model import ThermalModel
+from compensator.tables import Record
+
+Vector = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scores:
+    """How well a prediction follows a measurement.
+
+    Parameters
+    ----------
+    fit_pct : float
+        100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖), %.
+    rms_um, peak_to_peak_um : float
+        Of the error, µm.
+    """
+
+    fit_pct: float
+    rms_um: float
+    peak_to_peak_um: float
+
+
+def simulate(model: ThermalModel, record: Record) -> dict[str, Vector]:
+    """Run a model over a record.
+
+    The first sample with both temperatures is the reference; the deformation, where it was measured, counts
+    from its own value there.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        What to run.
+    record : Record
+        Needs `t_q_degc` and `at_degc`.
+
+    Returns
+    -------
+    dict of str to numpy.ndarray, shape (n,)
+        `t_s`, `heat_w`, `y_pred_um`, the share of each path, `y_std_um`, and `y_um`, `residual_um` where measured.
+
+    Raises
+    ------
+    DataError
+        If no sample has both temperatures.
+    """
+    t_q, at = record.columns["t_q_degc"], record.columns["at_degc"]
+    complete = np.flatnonzero(~(np.isnan(t_q) | np.isnan(at)))
+    if complete.size == 0:
+        raise DataError("no row has both t_q_degc and at_degc")
+    first = int(complete[0])
+    engine = Engine(model)
+    engine.set_reference(float(t_q[first]), float(at[first]))
+    names = [name for name in engine.channels if name in record.columns]
+    estimates = engine.run(t_q[first:], at[first:], {name: record.columns[name][first:] for name in names})
+    lead = np.full(first, math.nan)
+
+    def column(name: str) -> Vector:
+        return np.concatenate((lead, [getattr(estimate, name) for estimate in estimates]))
+
+    result = {"t_s": record.t_s} | {
+        new: column(old)
+        for new, old in (("heat_w", "heat_w"), ("y_pred_um", "y_um"), ("y_dtf_um", "y_dtf_um"),
+                         ("y_tdtf_um", "y_tdtf_um"), ("y_std_um", "y_std_um"))
+    }  # fmt: skip
+    if "y_um" in record.columns:
+        result |= _residual(record.columns["y_um"], result["y_pred_um"])
+    return result
+
+
+def _residual(y: Vector, y_pred: Vector) -> dict[str, Vector]:
+    known = np.flatnonzero(~(np.isnan(y) | np.isnan(y_pred)))
+    if known.size == 0:
+        return {"y_um": y, "residual_um": np.full(y.size, math.nan)}
+    start = int(known[0])
+    changed = y - y[start] + y_pred[start]
+    return {"y_um": changed, "residual_um": changed - y_pred}
+
+
+def scores(y: Vector, y_pred: Vector) -> Scores:
+    """Score a prediction on the samples where both are known.
+
+    Examples
+    --------
+    >>> scores(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 2.0])).fit_pct
+    100.0
+    """
+    known = ~(np.isnan(y) | np.isnan(y_pred))
+    y, error = y[known], (y - y_pred)[known]
+    if y.size == 0:
+        return Scores(fit_pct=math.nan, rms_um=math.nan, peak_to_peak_um=math.nan)
+    spread = float(np.linalg.norm(y - y.mean()))
+    return Scores(
+        fit_pct=100.0 * (1.0 - float(np.linalg.norm(error)) / spread) if spread > 0 else math.nan,
+        rms_um=float(np.sqrt(np.mean(error**2))),
+        peak_to_peak_um=float(np.ptp(error)),
+    )
+
+
+def csv_rows(columns: dict[str, Vector], names: tuple[str, ...]) -> Iterator[list[str]]:
+    """Yield a header and rows; a missing value is an empty cell, a column that is absent is left out."""
+    present = [name for name in names if name in columns]
+    yield present
+    for i in range(columns["t_s"].size):
+        yield [_shown(columns[name][i]) for name in present]
+
+
+def _shown(value: float) -> str:
+    return "" if math.isnan(value) else repr(round(float(value), 9))

@@ -1,0 +1,230 @@
+"""DATA of the commands: CSV tables and our own recordings, brought to the model's sample period."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.errors import DataError
+from compensator.messages import Sample, number
+from compensator.recording import decode, read_messages
+
+Vector = npt.NDArray[np.float64]
+
+ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
+#: A gap of up to this many model samples stays inside a record; the engine bridges it.
+SHORT_GAP_SAMPLES = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A measured run at the model's sample period.
+
+    Parameters
+    ----------
+    t_s : numpy.ndarray, shape (n,)
+        Time of each sample from the start of the data, s, evenly spaced.
+    columns : dict of str to numpy.ndarray, shape (n,)
+        Channels by name; NaN where missing.
+    """
+
+    t_s: Vector
+    columns: dict[str, Vector]
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """What a DATA argument holds.
+
+    Parameters
+    ----------
+    records : tuple of Record
+        In order of time; a long gap starts a new one.
+    remarks : tuple of str
+        What had to be put right: gaps, rows out of order.
+    """
+
+    records: tuple[Record, ...]
+    remarks: tuple[str, ...]
+
+
+def load_data(path: Path, period_s: float, roles: Mapping[str, str] | None = None) -> Data:
+    """Read a table or a recording.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        CSV, or MCAP of ours.
+    period_s : float
+        Sample period of the model, s.
+    roles : mapping of str to str, optional
+        Column name for each role that has another name in the table.
+
+    Raises
+    ------
+    DataError
+        One line that names file, row or column, value and what was expected.
+    """
+    t_s, columns = _read_mcap(path) if path.suffix == ".mcap" else _read_csv(path)
+    columns = _with_roles(path, columns, roles or {})
+    return _gridded(path, t_s, columns, period_s)
+
+
+def _with_roles(path: Path, columns: dict[str, Vector], roles: Mapping[str, str]) -> dict[str, Vector]:
+    for role, name in roles.items():
+        if role not in ROLES:
+            raise DataError(f"{path}: --column {role}={name}: expected a role of {', '.join(ROLES)}")
+        if name not in columns:
+            raise DataError(
+                f"{path}: --column {role}={name}: no such column, expected one of: {', '.join(columns)}"
+            )
+    renamed = {roles_name: columns[name] for roles_name, name in roles.items()}
+    return {**{n: v for n, v in columns.items() if n not in roles.values()}, **renamed}
+
+
+def _read_csv(path: Path) -> tuple[Vector, dict[str, Vector]]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}; expected a table or a recording") from error
+    try:
+        rows = list(csv.reader(text.splitlines()))
+    except csv.Error as error:
+        raise DataError(f"{path}: not a CSV table: {error}") from error
+    if len(rows) < 2:
+        raise DataError(f"{path}: {len(rows)} row(s), expected a header and data")
+    header = [name.strip() for name in rows[0]]
+    if len(set(header)) != len(header):
+        raise DataError(f"{path}: the header names a column twice")
+    if "t_s" not in header and "time_utc" not in header:
+        raise DataError(f"{path}: no column t_s or time_utc; the header has: {', '.join(header)[:100]}")
+    cells: dict[str, list[float]] = {name: [] for name in header}
+    text_columns: set[str] = set()
+    for line, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        if len(row) != len(header):
+            raise DataError(f"{path}: row {line}: {len(row)} cells, expected {len(header)}")
+        for name, cell in zip(header, row, strict=True):
+            cells[name].append(_cell(path, line, name, cell.strip(), text_columns))
+    time = np.array(cells.pop("t_s" if "t_s" in cells else "time_utc"))
+    cells.pop("time_utc", None)
+    if np.isnan(time).any():
+        raise DataError(f"{path}: row {int(np.argmax(np.isnan(time))) + 2}: time is missing")
+    return time - time[0] if time.size else time, {
+        name: np.array(values) for name, values in cells.items() if name not in text_columns
+    }
+
+
+def _cell(path: Path, line: int, name: str, cell: str, text_columns: set[str]) -> float:
+    if cell == "":
+        return math.nan
+    try:
+        if name == "time_utc":
+            return datetime.fromisoformat(cell).timestamp()
+        value = float(cell)
+    except ValueError as error:
+        if name in (*ROLES, "t_s", "time_utc"):
+            raise DataError(f"{path}: row {line}: {name} = {cell[:40]!r}, expected a number") from error
+        text_columns.add(name)
+        return math.nan
+    if math.isinf(value):
+        raise DataError(f"{path}: row {line}: {name} = {cell}, expected a finite number")
+    return value
+
+
+def _read_mcap(path: Path) -> tuple[Vector, dict[str, Vector]]:
+    times: list[int] = []
+    rows: list[dict[str, float]] = []
+    for record in read_messages(path, ("sample",)):
+        sample = decode(record, path)
+        assert isinstance(sample, Sample)
+        times.append(sample.time_utc_ns)
+        rows.append({
+            name: number(channel.mean) if channel.quality == "good" else math.nan
+            for name, channel in sample.channels.items()
+        })  # fmt: skip
+    if not rows:
+        raise DataError(f"{path}: no samples in it")
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = {name: np.array([row.get(name, math.nan) for row in rows]) for name in names}
+    return (np.array(times) - times[0]) / 1e9, columns
+
+
+def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: float) -> Data:
+    """Average to the period, report and sort what is out of order, split at long gaps."""
+    remarks = []
+    order = np.argsort(t_s, kind="stable")
+    disordered = int(np.sum(np.diff(t_s) < 0))
+    if disordered:
+        row = int(np.argmax(np.diff(t_s) < 0)) + 3
+        remarks.append(f"{path}: row {row}: {disordered} row(s) out of order; sorted by time")
+    t_s = t_s[order] - t_s.min()
+    slot = (
+        np.round(t_s / period_s).astype(int)
+        if _spacing(t_s) >= period_s
+        else np.floor(t_s / period_s + 1e-9).astype(int)
+    )
+    n = int(slot[-1]) + 1
+    gridded = {name: _mean_by_slot(slot, values[order], n) for name, values in columns.items()}
+    present = np.zeros(n, dtype=bool)
+    present[slot] = True
+    records = []
+    start = 0
+    for first, last in _gaps(present):
+        length = last - first
+        remarks.append(f"{path}: gap of {length} sample(s) from t_s = {first * period_s:g}"
+                       + ("; the record is split there" if length > SHORT_GAP_SAMPLES else "; bridged"))  # fmt: skip
+        if length > SHORT_GAP_SAMPLES:
+            records.append((start, first))
+            start = last
+    records.append((start, n))
+    return Data(
+        records=tuple(
+            Record(t_s=np.arange(a, b) * period_s, columns={name: v[a:b] for name, v in gridded.items()})
+            for a, b in records
+        ),
+        remarks=tuple(remarks),
+    )
+
+
+def _spacing(t_s: Vector) -> float:
+    steps = np.diff(t_s)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) * (1 + 1e-9) if steps.size else math.inf
+
+
+def _mean_by_slot(slot: npt.NDArray[np.int_], values: Vector, n: int) -> Vector:
+    good = ~np.isnan(values)
+    total = np.bincount(slot[good], weights=values[good], minlength=n)
+    count = np.bincount(slot[good], minlength=n)
+    return np.divide(total, count, out=np.full(n, np.nan), where=count > 0)
+
+
+def _gaps(present: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edges = np.diff(np.concatenate(([1], present.astype(int), [1])))
+    return list(zip(np.flatnonzero(edges == -1).tolist(), np.flatnonzero(edges == 1).tolist(), strict=True))
+
+
+def require(path: Path, record: Record, names: Sequence[str]) -> None:
+    """Refuse a record that lacks a column.
+
+    Raises
+    ------
+    DataError
+        Naming file and column.
+    """
+    for name in names:
+        if name not in record.columns:
+            raise DataError(
+                f"{path}: no column {name}; it has: {', '.join(record.columns)}. Name it with --column {name}=NAME"
+            )
