@@ -1,0 +1,153 @@
+"""From configuration tables to devices: every model that can be configured, and the fleet they make."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from drivers.errors import DriverConfigError
+from drivers.families import adam, capancdt, dcon, icpdas, modbus_map, moxa
+from drivers.families.base import DeviceSettings, Family, Line
+from drivers.lines.capancdt_link import CapancdtLink
+from drivers.lines.dcon_line import DconLine
+from drivers.lines.modbus_line import ModbusLine
+from drivers.lines.settings import CapancdtLine, LineSettings, SerialLine, TcpLine, line_settings
+from drivers.reading import Device
+from drivers.settings import Where, one_of, settings
+
+MODELS: Mapping[str, Family] = {
+    **icpdas.MODELS,
+    **adam.MODELS,
+    **moxa.MODELS,
+    **modbus_map.MODELS,
+    **dcon.MODELS,
+    **capancdt.MODELS,
+}
+
+
+class Fleet:
+    """All devices of a configuration.
+
+    Parameters
+    ----------
+    devices : Mapping
+        Devices by name, in the order of the configuration.
+    """
+
+    def __init__(self, devices: Mapping[str, Device]) -> None:
+        self.devices: dict[str, Device] = dict(devices)
+
+    async def close(self) -> None:
+        """Close every device and with it every line. May be called twice."""
+        for device in self.devices.values():
+            await device.close()
+
+
+def build(
+    lines: Sequence[Mapping[str, object]], devices: Sequence[Mapping[str, object]], *, source: str
+) -> Fleet:
+    """Make the devices of a configuration, without opening anything.
+
+    Parameters
+    ----------
+    lines : sequence of Mapping
+        The `[[line]]` tables.
+    devices : sequence of Mapping
+        The `[[device]]` tables.
+    source : str
+        Name of the file, with which each message begins.
+
+    Raises
+    ------
+    DriverConfigError
+        One line that names table, key, value and what was expected.
+    """
+    known = _lines(lines, source)
+    made: dict[str, Line] = {}
+    fleet: dict[str, Device] = {}
+    taken: dict[tuple[str, object], str] = {}
+    for index, table in enumerate(devices):
+        where = _where(table, index, "devices", source)
+        family = _family(table, where)
+        about = settings(table, family.kind, where)
+        if about.name in fleet:
+            raise where.wrong("name", about.name, "another one than the devices before have")
+        line_about = _line_of(about, family, known, where)
+        # A controller with a line of its own has no address: a second one on its line collides as well.
+        address = getattr(about, "address", "its own line")
+        other = taken.setdefault((about.line, address), about.name)
+        if other != about.name:
+            raise where.error(
+                f"address {address} on line {about.line!r} is that of {other!r} and of {about.name!r}"
+            )
+        line = (
+            made.setdefault(about.line, _open_line(line_about))
+            if about.line not in made
+            else made[about.line]
+        )
+        fleet[about.name] = family.make(about, line, where)
+    return Fleet(fleet)
+
+
+def _lines(tables: Sequence[Mapping[str, object]], source: str) -> dict[str, LineSettings]:
+    """Convert the lines; each has its own name and its own port."""
+    lines: dict[str, LineSettings] = {}
+    taken: dict[str, str] = {}
+    for index, table in enumerate(tables):
+        where = _where(table, index, "lines", source)
+        about = line_settings(table, where)
+        if about.name in lines:
+            raise where.wrong("name", about.name, "another one than the lines before have")
+        for end in about.ends():
+            if end in taken:
+                raise where.error(
+                    f"{end} is on line {taken[end]!r} and on line {about.name!r}, expected one line"
+                )
+            taken[end] = about.name
+        lines[about.name] = about
+    return lines
+
+
+def _where(table: object, index: int, tables: str, source: str) -> Where:
+    """Name a table by its place and, where it has one, its name."""
+    name = table.get("name") if isinstance(table, Mapping) else None
+    return Where(source=source, table=f"{tables}[{index}]" + (f' "{name}"' if isinstance(name, str) else ""))
+
+
+def _family(table: object, where: Where) -> Family:
+    """Find the family of a device table."""
+    if not isinstance(table, Mapping):
+        raise where.error(f"is {table!r}, expected a table")
+    if "model" not in table:
+        raise where.error(f"key 'model' is missing, expected {one_of(tuple(MODELS))}")
+    model = table["model"]
+    if not isinstance(model, str) or model not in MODELS:
+        raise where.wrong("model", model, one_of(tuple(MODELS)))
+    return MODELS[model]
+
+
+def _line_of(
+    about: DeviceSettings, family: Family, known: Mapping[str, LineSettings], where: Where
+) -> LineSettings:
+    """Find the line of a device, with a protocol that its model speaks."""
+    if about.line not in known:
+        raise where.wrong("line", about.line, f"the name of a line ({', '.join(known) or 'there is none'})")
+    line = known[about.line]
+    if line.protocol not in family.protocols:
+        expected = f"a line with protocol {' or '.join(family.protocols)} for {about.model}"
+        raise where.error(
+            f"key 'line' is {about.line!r} with protocol {line.protocol!r}, expected {expected}"
+        )
+    return line
+
+
+def _open_line(about: LineSettings) -> Line:
+    """Make a line; it opens with its first request."""
+    if isinstance(about, CapancdtLine):
+        return CapancdtLink(about)
+    if isinstance(about, SerialLine) and about.protocol == "dcon":
+        return DconLine(about)
+    assert isinstance(about, SerialLine | TcpLine)
+    return ModbusLine(about)
+
+
+__all__ = ["MODELS", "DriverConfigError", "Fleet", "build"]

@@ -1,0 +1,298 @@
+"""What the families share: the settings of a module, its inputs, and the poll of a Modbus module."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+
+from drivers.errors import DeviceRefused
+from drivers.lines.capancdt_link import CapancdtLink
+from drivers.lines.dcon_line import DconLine
+from drivers.lines.modbus_line import Member, ModbusLine, ModbusRefused
+from drivers.protocols.analogue import AnalogueInput, Probe, probe_settings
+from drivers.protocols.couples import Span
+from drivers.protocols.modbus import READ_COILS, Request, fence_for
+from drivers.reading import Device, Reading
+from drivers.settings import Name, Where, one_of, settings
+
+LOG = logging.getLogger(__name__)
+
+MODBUS = ("modbus-tcp", "modbus-rtu", "modbus-rtu-over-tcp")
+MODBUS_TCP = ("modbus-tcp",)
+
+# Exceptions by which a device says that it does not have what it was asked for.
+_NOT_THERE = {1, 2, 3}
+
+
+class DeviceSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Keys that every `[[device]]` table has.
+
+    Parameters
+    ----------
+    name, line, model : str
+        Name of the device, name of its line, and its model.
+    inputs : list of dict
+        One table for each input that is read.
+    """
+
+    name: Name
+    line: Name
+    model: Name
+    inputs: list[dict[str, object]]
+
+
+class ModbusSettings(DeviceSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Keys of a Modbus module.
+
+    Parameters
+    ----------
+    address : int
+        Unit id, 1..247.
+    verify : bool
+        Whether, after connecting, the module's own settings are compared with these.
+    """
+
+    address: Annotated[int, msgspec.Meta(ge=1, le=247)]
+    verify: bool = True
+
+
+class ThermocoupleInput(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One thermocouple input.
+
+    Parameters
+    ----------
+    input : int
+        Number on the module, from 0.
+    couple : str, optional
+        Type letter; the module's `couple` where it is missing.
+    """
+
+    input: Annotated[int, msgspec.Meta(ge=0)]
+    couple: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """A model that can be configured.
+
+    Parameters
+    ----------
+    protocols : tuple of str
+        Of the lines it can hang on.
+    kind : type
+        Class of its settings.
+    make : callable
+        Makes the device from settings, line and place in the configuration; opens nothing.
+    """
+
+    protocols: tuple[str, ...]
+    kind: type[DeviceSettings]
+    make: Callable[[Any, Any, Where], Device]
+
+
+Line = ModbusLine | DconLine | CapancdtLink
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """Something a module says of itself that must agree with the configuration.
+
+    Parameters
+    ----------
+    request : Request
+        Registers or coils to read.
+    expected : Mapping
+        Expected value by place in the answer.
+    what : str
+        What the register holds, in words.
+    mask : int
+        Bits of the register that count.
+    words : callable
+        Puts a value in words.
+    """
+
+    request: Request
+    expected: Mapping[int, int]
+    what: str
+    mask: int = 0xFFFF
+    words: Callable[[int], str] = "0x{:02X}".format
+
+
+class ModbusDevice:
+    """A Modbus module that is polled with a fixed set of requests.
+
+    Parameters
+    ----------
+    about : ModbusSettings
+        Its settings.
+    line : ModbusLine
+        The line it hangs on.
+    units : Mapping
+        Unit of each input.
+    polls : sequence of Request
+        What is read each time; the first one also serves to tell late answers apart.
+    checks : sequence of Check
+        What is compared after connecting.
+    """
+
+    def __init__(
+        self,
+        about: ModbusSettings,
+        line: ModbusLine,
+        *,
+        units: Mapping[int, str],
+        polls: Sequence[Request],
+        checks: Sequence[Check] = (),
+    ) -> None:
+        self._name = about.name
+        self._units = dict(units)
+        self._polls = tuple(polls)
+        self._checks = tuple(checks) if about.verify else ()
+        self._to_check: list[Check] = []
+        self._checked: tuple[int, int] | None = None
+        everything = (*self._polls, *(check.request for check in self._checks))
+        self._member: Member = line.join(about.name, about.address, fence_for(everything))
+
+    @property
+    def name(self) -> str:
+        """Name of the device in the configuration."""
+        return self._name
+
+    @property
+    def units(self) -> Mapping[int, str]:
+        """Unit of each configured input."""
+        return self._units
+
+    async def read(self) -> Mapping[int, Reading]:
+        """Read every configured input once.
+
+        Raises
+        ------
+        DriverError
+            Naming the device, within about twice the line's `timeout_s` from when the device gets the line.
+        """
+        return await self._member.serve(self._poll)
+
+    async def close(self) -> None:
+        """Leave the line; the last device on it closes it."""
+        await self._member.close()
+
+    def readings(self, answers: Sequence[Sequence[int]]) -> dict[int, Reading]:
+        """Turn the answers to the polls into readings."""
+        raise NotImplementedError
+
+    async def _poll(self) -> dict[int, Reading]:
+        await self._verify()
+        return self.readings([await self._take(request) for request in self._polls])
+
+    async def _take(self, request: Request) -> list[int]:
+        if request.function == READ_COILS:
+            return [int(bit) for bit in await self._member.bits(request)]
+        return await self._member.registers(request)
+
+    async def _verify(self) -> None:
+        """Compare what the module says with the configuration, once after each connecting or silence."""
+        if self._checked != self._member.generation:
+            self._to_check = list(self._checks)
+            self._checked = self._member.generation
+        while self._to_check:
+            check = self._to_check[0]
+            try:
+                self._compare(check, await self._take(check.request))
+            except ModbusRefused as error:
+                if error.exception_code not in _NOT_THERE:
+                    raise
+                LOG.info("%s: %s cannot be verified: %s", self._name, check.what, error.message)
+            self._to_check.pop(0)
+
+    def _compare(self, check: Check, answer: Sequence[int]) -> None:
+        """Raise where the module is set otherwise than configured."""
+        for place, expected in check.expected.items():
+            found = answer[place] & check.mask
+            if found != expected:
+                kind = "coil" if check.request.function == READ_COILS else "register"
+                raise DeviceRefused(
+                    self._name,
+                    f"{check.what} in {kind} {check.request.address + place} is {check.words(found)}, "
+                    f"the configuration expects {check.words(expected)}",
+                )
+
+
+def thermocouples(
+    about: DeviceSettings,
+    table: Mapping[str, Span],
+    count: int,
+    where: Where,
+    couple: str | None = None,
+) -> dict[int, str]:
+    """Convert the thermocouple inputs of a module.
+
+    Parameters
+    ----------
+    about : DeviceSettings
+        The module's settings.
+    table : Mapping
+        The maker's ranges by couple letter.
+    count : int
+        Inputs of the module.
+    couple : str, optional
+        Couple of inputs that name none.
+
+    Returns
+    -------
+    dict
+        Couple letter by input.
+
+    Raises
+    ------
+    DriverConfigError
+        An input or a couple the module does not have, or an input twice.
+    """
+    couples: dict[int, str] = {}
+    if couple is not None and couple not in table:
+        raise where.wrong("couple", couple, one_of(table))
+    for place, spot in input_tables(about, where):
+        given = settings(place, ThermocoupleInput, spot)
+        check_input(given.input, couples, count, about.model, spot)
+        letter = given.couple if given.couple is not None else couple
+        if letter is None:
+            raise spot.error(f"key 'couple' is missing, expected {one_of(table)}")
+        if letter not in table:
+            raise spot.wrong("couple", letter, one_of(table))
+        couples[given.input] = letter
+    return couples
+
+
+def analogue_inputs(about: DeviceSettings, count: int, where: Where) -> dict[int, Probe | None]:
+    """Convert the voltage inputs of a module; None stands for a plain voltage.
+
+    Raises
+    ------
+    DriverConfigError
+        An input the module does not have, an input twice, or a wrong probe.
+    """
+    probes: dict[int, Probe | None] = {}
+    for place, spot in input_tables(about, where):
+        given = settings(place, AnalogueInput, spot)
+        check_input(given.input, probes, count, about.model, spot)
+        probes[given.input] = probe_settings(given.probe, spot.inside("probe"))
+    return probes
+
+
+def check_input(number: int, taken: Mapping[int, object], count: int, model: str, where: Where) -> None:
+    """Raise where a module has no such input, or it stands twice."""
+    if number >= count:
+        raise where.wrong("input", number, f"0..{count - 1} on {model}")
+    if number in taken:
+        raise where.error(f"input {number} stands twice")
+
+
+def input_tables(about: DeviceSettings, where: Where) -> list[tuple[dict[str, object], Where]]:
+    """List the input tables with their places; there must be one at least."""
+    if not about.inputs:
+        raise where.wrong("inputs", about.inputs, "at least one input")
+    return [(table, where.inside(f"inputs[{index}]")) for index, table in enumerate(about.inputs)]

@@ -1,0 +1,1 @@
+"""Transport: the lines that devices hang on."""

@@ -1,0 +1,255 @@
+"""The two TCP ports of a capaNCDT controller, kept open by a background task.
+
+The task asks the ranges at the command port, then reads the stream of the data port, and begins again after
+any loss. Who reads waits for new blocks, for a bounded time. Only sums are kept of what came, so memory
+does not grow when nobody reads.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, DriverError
+from drivers.lines.settings import CapancdtLine
+from drivers.protocols.capancdt import FULL_SCALE, BadReplyError, Block, Blocks, Channel, channel_info
+
+# Between tries to connect, s: soon at first, as after a cable came loose.
+RETRY_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
+_MOST_BLOCKS = 2048
+_READ_BYTES = 65536
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sums:
+    """What is kept of one channel in one block.
+
+    Parameters
+    ----------
+    time_s : float
+        When the block came, on the loop's clock.
+    count, total, minimum, maximum : int
+        Of the values as sent.
+    under, over : int
+        How many of them are at or beyond an end of the converter.
+    """
+
+    time_s: float
+    count: int
+    total: int
+    minimum: int
+    maximum: int
+    under: int
+    over: int
+
+
+def sums(values: Sequence[int], time_s: float) -> Sums:
+    """Sum a channel's values."""
+    return Sums(
+        time_s=time_s,
+        count=len(values),
+        total=sum(values),
+        minimum=min(values),
+        maximum=max(values),
+        under=sum(value <= 0 for value in values),
+        over=sum(value >= FULL_SCALE for value in values),
+    )
+
+
+class CapancdtLink:
+    """Connections to one controller.
+
+    Parameters
+    ----------
+    about : CapancdtLine
+        Settings; nothing is opened before the first `take`.
+    """
+
+    def __init__(self, about: CapancdtLine) -> None:
+        self.about = about
+        self.timeout_s = about.timeout_s
+        self.lost_frames = 0
+        self._channels: tuple[int, ...] = ()
+        self._name = about.name
+        self._infos: dict[int, Channel] = {}
+        self._kept: dict[int, deque[Sums]] = {}
+        self._next_counter: int | None = None
+        self._standing = 0
+        self._changed = asyncio.Event()
+        self._failure: DriverError | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._closed = False
+
+    def join(self, name: str, channels: Sequence[int]) -> None:
+        """Name the device, for messages, and its channels, from 0."""
+        self._name = name
+        self._channels = tuple(channels)
+        self._kept = {channel: deque(maxlen=_MOST_BLOCKS) for channel in channels}
+
+    async def take(self) -> Mapping[int, tuple[Channel, list[Sums]]]:
+        """Take what came since the last call; wait for new blocks if there are none.
+
+        Raises
+        ------
+        DriverError
+            Nothing new within the time limit, and why.
+        """
+        if self._closed:
+            raise DeviceDisconnected(self._name, "is closed")
+        wait_s = self.timeout_s
+        if self._task is None or self._task.done():
+            # The first call also waits for the connections and the ranges.
+            wait_s = 2.0 * self.timeout_s
+            self._task = asyncio.create_task(self._keep(), name=f"capancdt {self._name}")
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(wait_s):
+                while not self._complete() and self._failure is None:
+                    self._changed.clear()
+                    await self._changed.wait()
+        if not self._complete():
+            raise self._why_nothing(wait_s)
+        taken = {channel: (self._infos[channel], list(kept)) for channel, kept in self._kept.items()}
+        self._forget()
+        return taken
+
+    async def close(self) -> None:
+        """Close both ports and end the task."""
+        self._closed = True
+        self._failure = DeviceDisconnected(self._name, "is closed")
+        self._changed.set()
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+
+    def _complete(self) -> bool:
+        """Tell whether every channel has something new."""
+        return all(self._kept[channel] and channel in self._infos for channel in self._channels)
+
+    def _forget(self) -> None:
+        for kept in self._kept.values():
+            kept.clear()
+        self._standing = 0
+
+    def _why_nothing(self, wait_s: float) -> DriverError:
+        """Say why there is nothing new. A new error each time, as a raised one grows a traceback."""
+        if self._failure is not None:
+            return type(self._failure)(self._name, self._failure.message)
+        if self._standing:
+            text = f"{self._standing} blocks with the counter standing still at {self._next_counter}"
+            self._standing = 0
+            return DeviceGarbled(self._name, text)
+        missing = [channel for channel in self._channels if not self._kept[channel]]
+        if self._infos and len(missing) < len(self._channels):
+            numbers = ", ".join(str(channel + 1) for channel in missing)
+            return DeviceRefused(self._name, f"channel {numbers} is not in the stream of the data port")
+        if not self._infos:
+            return DeviceTimeout(self._name, f"no connection to {self.about.host} within {wait_s} s")
+        where = f"{self.about.host}:{self.about.data_port}"
+        return DeviceTimeout(
+            self._name,
+            f"no new measurement from {where} within {wait_s} s "
+            "(is another client connected to the data port?)",
+        )
+
+    async def _keep(self) -> None:
+        """Connect and receive, again and again."""
+        tries = 0
+        while True:
+            try:
+                self._infos = await self._ask_channels()
+                tries = 0
+                await self._receive()
+            except DriverError as error:
+                self._failure = error
+            except TimeoutError:
+                host = self.about.host
+                self._failure = DeviceTimeout(
+                    self._name, f"no connection to {host} within {self.timeout_s} s"
+                )
+            except OSError as error:
+                self._failure = DeviceDisconnected(self._name, f"{self.about.host}: {error}")
+            self._infos = {}
+            self._forget()
+            self._changed.set()
+            await asyncio.sleep(RETRY_S[min(tries, len(RETRY_S) - 1)])
+            tries += 1
+
+    async def _ask_channels(self) -> dict[int, Channel]:
+        """Ask range and unit of each channel at the command port."""
+        about = self.about
+        async with asyncio.timeout(self.timeout_s):
+            reader, writer = await asyncio.open_connection(about.host, about.command_port)
+        try:
+            infos = {}
+            for channel in self._channels:
+                infos[channel] = await self._ask_channel(reader, writer, channel)
+            return infos
+        finally:
+            await _shut(writer)
+
+    async def _ask_channel(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, channel: int
+    ) -> Channel:
+        """Ask one channel; the controller counts from 1, echoes the command, and greets with a banner."""
+        command = f"$CHI{channel + 1}"
+        writer.write(f"{command}\r".encode("ascii"))
+        heard = ""
+        try:
+            async with asyncio.timeout(self.timeout_s):
+                while True:
+                    heard = (await reader.readuntil(b"\n")).decode("latin-1")
+                    start = heard.rfind(f"{command}:")
+                    if start >= 0 and heard.rstrip().endswith("OK"):
+                        return channel_info(heard[start:])
+                    if "WRONG" in heard or "UNKNOWN" in heard or "ERROR" in heard.upper():
+                        raise DeviceRefused(self._name, f"{command} answered with {heard.strip()!r}")
+        except TimeoutError:
+            raise DeviceTimeout(self._name, f"no reply to {command} within {self.timeout_s} s") from None
+        except asyncio.IncompleteReadError:
+            raise DeviceDisconnected(self._name, f"command port closed the connection at {command}") from None
+        except (BadReplyError, asyncio.LimitOverrunError) as error:
+            raise DeviceGarbled(self._name, f"{command}: {error}") from None
+
+    async def _receive(self) -> None:
+        """Read the stream until it ends."""
+        about = self.about
+        async with asyncio.timeout(self.timeout_s):
+            reader, writer = await asyncio.open_connection(about.host, about.data_port)
+        self._failure, self._next_counter, blocks = None, None, Blocks()
+        loop = asyncio.get_running_loop()
+        try:
+            while data := await reader.read(_READ_BYTES):
+                for block in blocks.feed(data):
+                    self._sort(block, loop.time())
+                self._changed.set()
+        finally:
+            await _shut(writer)
+        raise DeviceDisconnected(self._name, f"{about.host}:{about.data_port} closed the connection")
+
+    def _sort(self, block: Block, time_s: float) -> None:
+        """Keep a block, unless its counter says that it brings nothing new."""
+        if self._next_counter is not None and block.counter != self._next_counter:
+            gap = (block.counter - self._next_counter) & 0xFFFFFFFF
+            behind = 0x100000000 - gap
+            if behind <= block.frames:
+                self._standing += 1
+                return
+            # A counter that runs backwards is a controller that was restarted: how many are lost is not
+            # known.
+            self.lost_frames += gap if gap < 0x80000000 else 0
+        self._next_counter = (block.counter + block.frames) & 0xFFFFFFFF
+        for channel, kept in self._kept.items():
+            if values := block.of(channel):
+                kept.append(sums(values, time_s))
+
+
+async def _shut(writer: asyncio.StreamWriter) -> None:
+    """Close a connection at once; whatever is unsent is not wanted."""
+    writer.transport.abort()
+    with contextlib.suppress(OSError):
+        await writer.wait_closed()

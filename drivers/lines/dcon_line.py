@@ -1,0 +1,244 @@
+"""A DCON line: one serial port, shared by its modules, one command at a time.
+
+Data replies carry no address, so a late one could pass for another module's. What keeps them apart:
+
+- Before each command everything received is dropped, and only one command is under way.
+- After a missing or broken data reply the module is *unsettled*. The line first waits until it is quiet,
+  and the module is asked its name (`$AAM`) until it answers: names carry the address, and a module answers
+  in order, so after its name no data reply of it is left.
+- For `LOOSE_S` after a missing data reply the *other* modules' data are confirmed: each is asked its name
+  right after its data. Had the late reply slipped in, there would be two data replies before the name; then
+  both are thrown away.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, DriverError
+from drivers.lines.patience import Patience
+from drivers.lines.serial_port import PortLostError, SerialPort
+from drivers.lines.settings import SerialLine
+from drivers.protocols.dcon import BadTextError, Reply, command, reply
+
+ResultT = TypeVar("ResultT")
+
+QUIET_S = 0.02
+# Longer than any module or converter holds a reply back, s.
+LOOSE_S = 10.0
+
+
+class DconMember:
+    """One module's place on a line.
+
+    Parameters
+    ----------
+    line : DconLine
+        The line it hangs on.
+    name : str
+        Of the device, for messages.
+    address : int
+        0..255.
+    with_checksum : bool
+        Whether commands and replies carry one.
+    """
+
+    def __init__(self, line: DconLine, name: str, address: int, *, with_checksum: bool) -> None:
+        self.line = line
+        self.name = name
+        self.address = address
+        self.with_checksum = with_checksum
+        self.patience = Patience(line.timeout_s)
+        self.unsettled = False
+        self.settlings = 0
+        self.closed = False
+
+    async def ask(self, text: str) -> str:
+        """Send a `$AA…` or `@AA…` command; return the reply after its address. Only within `serve`."""
+        return await self.line.ask(self, f"{text[0]}{self.address:02X}{text[1:]}", "!")
+
+    async def data(self, text: str) -> str:
+        """Send a command whose reply is data; return them. Only within `serve`."""
+        return await self.line.data(self, f"{text[0]}{self.address:02X}{text[1:]}")
+
+    async def serve(self, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
+        """Run a job of commands with the line to itself; see `DconLine.serve`."""
+        return await self.line.serve(self, job)
+
+    @property
+    def generation(self) -> tuple[int, int]:
+        """Openings and settlings so far; after others the module may be another one."""
+        return self.line.generation, self.settlings
+
+    async def close(self) -> None:
+        """Leave the line; the last one closes it."""
+        self.closed = True
+        self.line.left()
+
+
+class DconLine:
+    """One serial port and the modules on it.
+
+    Parameters
+    ----------
+    about : SerialLine
+        Settings; nothing is opened before the first command.
+    """
+
+    def __init__(self, about: SerialLine) -> None:
+        self.about = about
+        self.timeout_s = about.timeout_s
+        self.generation = 0
+        self._members: list[DconMember] = []
+        self._lock = asyncio.Lock()
+        self._port: SerialPort | None = None
+        # When a data reply that is still missing may come no more, by address.
+        self._loose_until_s: dict[int, float] = {}
+
+    def join(self, name: str, address: int, *, with_checksum: bool) -> DconMember:
+        """Give a module its place."""
+        member = DconMember(self, name, address, with_checksum=with_checksum)
+        self._members.append(member)
+        return member
+
+    def left(self) -> None:
+        """Close the port when nobody is left."""
+        if all(member.closed for member in self._members):
+            self.close()
+
+    def close(self) -> None:
+        """Close the port; a waiting command fails at once."""
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    async def serve(self, member: DconMember, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
+        """Run a job of commands of one module, with the line to itself.
+
+        The time limit, twice the line's, runs from when the module gets the line.
+
+        Raises
+        ------
+        DriverError
+            Naming the device.
+        """
+        loop = asyncio.get_running_loop()
+        if (hold_s := member.patience.hold_s(loop.time())) > 0.0:
+            text = f"silent {member.patience.failures} times, next try in {hold_s:.1f} s"
+            raise DeviceTimeout(member.name, text)
+        async with self._lock:
+            try:
+                async with asyncio.timeout(2.0 * self.timeout_s):
+                    self._open(member)
+                    await self._settle(member)
+                    result = await job()
+            except TimeoutError:
+                member.patience.failed(loop.time())
+                raise DeviceTimeout(member.name, f"not done within {2.0 * self.timeout_s} s") from None
+            except (DeviceTimeout, DeviceGarbled):
+                member.patience.failed(loop.time())
+                raise
+            except DriverError:
+                member.patience.succeeded()
+                raise
+        member.patience.succeeded()
+        return result
+
+    def _open(self, member: DconMember) -> None:
+        """Open the port if it is not open."""
+        if member.closed:
+            raise DeviceDisconnected(member.name, "is closed")
+        if self._port is not None and not self._port.lost:
+            return
+        try:
+            self._port = SerialPort(self.about)
+        except PortLostError as error:
+            raise DeviceDisconnected(member.name, f"cannot open {self.about.port}: {error}") from None
+        self.generation += 1
+
+    async def _settle(self, member: DconMember) -> None:
+        """Make sure that no late reply of this module is left on the line."""
+        if not member.unsettled:
+            return
+        loop = asyncio.get_running_loop()
+        give_up_s = loop.time() + self.timeout_s / 2.0
+        while self._port is not None and loop.time() < give_up_s:
+            quiet_s = loop.time() - self._port.heard_at_s
+            if quiet_s >= QUIET_S:
+                break
+            await asyncio.sleep(QUIET_S - quiet_s)
+        await self.ask(member, f"${member.address:02X}M", "!")
+        member.unsettled = False
+        member.settlings += 1
+        self._loose_until_s.pop(member.address, None)
+
+    async def data(self, member: DconMember, text: str) -> str:
+        """Ask for data, and confirm whose they are while another module's may still come."""
+        now_s = asyncio.get_running_loop().time()
+        member.unsettled = True
+        try:
+            body = await self.ask(member, text, ">")
+        except DeviceRefused:
+            member.unsettled = False
+            raise
+        except BaseException:
+            self._loose_until_s[member.address] = now_s + LOOSE_S
+            raise
+        if any(until_s > now_s for until_s in self._loose_until_s.values()):
+            await self.ask(member, f"${member.address:02X}M", "!", nothing_before=True)
+        else:
+            self._loose_until_s.clear()
+        member.unsettled = False
+        return body
+
+    async def ask(self, member: DconMember, text: str, lead: str, *, nothing_before: bool = False) -> str:
+        """Send one command and wait for the reply that answers it.
+
+        Replies that answer something else are passed over, or are an error with `nothing_before`.
+        """
+        port = self._port
+        if port is None:
+            raise DeviceDisconnected(member.name, "is closed")
+        heard: list[bytes] = []
+        try:
+            if not nothing_before:
+                port.forget()
+            port.write(command(text, with_checksum=member.with_checksum))
+            async with asyncio.timeout(self.timeout_s):
+                while True:
+                    heard.append(await port.line())
+                    found = self._answer(member, heard[-1], lead)
+                    if found is not None:
+                        return found
+                    if nothing_before:
+                        raise DeviceGarbled(member.name, "thrown away: more than one data reply on the line")
+        except PortLostError as error:
+            raise DeviceDisconnected(member.name, f"{self.about.port}: {error}") from None
+        except TimeoutError:
+            if heard or port.rest:
+                what = b" ".join((*heard, port.rest))[:60]
+                raise DeviceGarbled(member.name, f"no valid reply to {text!r} in {what!r}") from None
+            where = f"address {member.address:02X} on {self.about.port}"
+            raise DeviceTimeout(
+                member.name, f"no reply to {text!r} from {where} within {self.timeout_s} s"
+            ) from None
+
+    def _answer(self, member: DconMember, line: bytes, lead: str) -> str | None:
+        """Return the body when a line answers the command, None when it answers something else."""
+        try:
+            found: Reply = reply(line, with_checksum=member.with_checksum)
+        except BadTextError as error:
+            if lead == "!":  # may be the torn end of something late; the reply itself cannot be mistaken
+                return None
+            raise DeviceGarbled(member.name, str(error)) from None
+        if found.lead == "?" and found.address() == member.address:
+            raise DeviceRefused(
+                member.name, f"address {member.address:02X} refuses the command (?{found.body})"
+            )
+        if found.lead != lead:
+            return None
+        if lead == ">":
+            return found.body
+        return found.body[2:] if found.address() == member.address else None

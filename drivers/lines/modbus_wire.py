@@ -1,0 +1,213 @@
+"""One Modbus connection: a pymodbus client whose input is checked before pymodbus decodes it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import termios
+
+from pymodbus import FramerType, ModbusException
+from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
+from pymodbus.client.base import ModbusBaseClient
+from pymodbus.exceptions import ConnectionException
+from pymodbus.pdu import ModbusPDU
+
+from drivers.lines.settings import SerialLine, TcpLine
+from drivers.protocols.modbus import (
+    READ_COILS,
+    READ_DISCRETE,
+    READ_HOLDING,
+    READ_INPUT,
+    Request,
+    WrongAnswerError,
+    describe_rtu,
+    find_rtu,
+    find_tcp,
+)
+
+# pymodbus reports every missed answer itself, as an error with a dump of frames; here each becomes one
+# DriverError. A level that somebody set on purpose stays.
+if logging.getLogger("pymodbus").level == logging.NOTSET:
+    logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+
+# Longest RTU frame, with room for a late one before it.
+_MOST_HEARD = 1024
+
+
+class RefusalError(Exception):
+    """An exception reply; `code` is the device's."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+class LostError(Exception):
+    """The connection cannot be made or is gone; the text says why."""
+
+
+class ModbusWire:
+    """One connection, used by one request at a time.
+
+    Parameters
+    ----------
+    about : SerialLine or TcpLine
+        Settings of the line.
+    """
+
+    def __init__(self, about: SerialLine | TcpLine) -> None:
+        self._numbered = about.protocol == "modbus-tcp"
+        self._request: Request | None = None
+        self._unit = 0
+        self._transaction = 0
+        self._wrong: WrongAnswerError | None = None
+        self._heard = bytearray()
+        self.heard_at_s = 0.0
+        self._why = ""
+        self._client = self._make(about)
+        create = self._client.ctx.call_create
+
+        # pymodbus swallows why a connection failed, and lets some of pyserial's exceptions through.
+        async def explained() -> object:
+            try:
+                return await create()
+            except (OSError, ValueError, termios.error) as error:
+                self._why = str(error) or type(error).__name__
+                raise OSError(self._why) from error
+
+        self._client.ctx.call_create = explained
+        # Whether a silent device costs the connection is decided by the line.
+        self._client.set_max_no_responses(1 << 30)
+
+    def _make(self, about: SerialLine | TcpLine) -> ModbusBaseClient:
+        """Make the client that fits the line; it never retries or reconnects of its own accord."""
+        if isinstance(about, SerialLine):
+            return AsyncModbusSerialClient(
+                about.port,
+                framer=FramerType.RTU,
+                baudrate=about.baudrate,
+                parity=about.parity,
+                stopbits=about.stopbits,
+                timeout=about.timeout_s,
+                retries=0,
+                reconnect_delay=0,
+                trace_packet=self._trace_packet,
+                trace_connect=self._trace_connect,
+            )
+        return AsyncModbusTcpClient(
+            about.host,
+            port=about.tcp_port,
+            framer=FramerType.SOCKET if self._numbered else FramerType.RTU,
+            timeout=about.timeout_s,
+            retries=0,
+            reconnect_delay=0,
+            trace_packet=self._trace_packet,
+            trace_connect=self._trace_connect,
+        )
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection stands, as far as is known."""
+        return self._client.connected
+
+    async def connect(self) -> None:
+        """Connect once, within the line's time limit.
+
+        Raises
+        ------
+        LostError
+            The port or host is not there, or refuses.
+        TimeoutError
+            Nothing answered.
+        """
+        self._why = ""
+        if not await self._client.connect():
+            if self._why:
+                raise LostError(self._why)
+            raise TimeoutError
+        # A serial transport reports itself one turn of the loop later.
+        await asyncio.sleep(0)
+
+    def close(self) -> None:
+        """Close the connection. A request that waits on it fails at once."""
+        self._client.close()
+        self._fail(ConnectionException("closed"))
+
+    async def ask(self, unit: int, request: Request) -> ModbusPDU:
+        """Send one request and wait for its answer.
+
+        Raises
+        ------
+        RefusalError
+            The device sent an exception reply.
+        WrongAnswerError
+            Something came, and it is not the answer.
+        TimeoutError
+            Nothing came.
+        LostError
+            The connection broke.
+        """
+        self._request, self._unit, self._wrong = request, unit, None
+        self._heard.clear()
+        try:
+            answer = await self._send(unit, request)
+        except ConnectionException as error:
+            raise LostError(self._why or "connection lost") from error
+        except ModbusException as error:
+            raise self._silence(unit, request) from error
+        finally:
+            self._request = None
+        if answer.isError():
+            raise RefusalError(answer.exception_code)
+        return answer
+
+    async def _send(self, unit: int, request: Request) -> ModbusPDU:
+        """Call the client's method for the function."""
+        client, address, count = self._client, request.address, request.count
+        if request.function == READ_HOLDING:
+            return await client.read_holding_registers(address, count=count, device_id=unit)
+        if request.function == READ_INPUT:
+            return await client.read_input_registers(address, count=count, device_id=unit)
+        if request.function == READ_COILS:
+            return await client.read_coils(address, count=count, device_id=unit)
+        if request.function == READ_DISCRETE:
+            return await client.read_discrete_inputs(address, count=count, device_id=unit)
+        raise ValueError(f"function {request.function} does not read")
+
+    def _silence(self, unit: int, request: Request) -> WrongAnswerError | TimeoutError:
+        """Tell a silent device from one whose answer was useless."""
+        if self._wrong is not None:
+            return self._wrong
+        if not self._numbered and (why := describe_rtu(bytes(self._heard), unit, request)):
+            return WrongAnswerError(why)
+        return TimeoutError()
+
+    def _trace_packet(self, sending: bool, data: bytes) -> bytes:
+        """Choose what pymodbus gets to decode: the one frame that answers the request, or nothing yet."""
+        if sending:
+            self._transaction = int.from_bytes(data[:2], "big")
+            return data
+        self.heard_at_s = asyncio.get_running_loop().time()
+        if self._request is None or self._wrong is not None:
+            return b""
+        if self._numbered:
+            try:
+                return find_tcp(data, self._transaction, self._unit, self._request) or b""
+            except WrongAnswerError as error:
+                self._wrong = error
+                self._fail(ModbusException(str(error)))
+                return b""
+        # pymodbus hands over all it has since the request, unless it has given up on it.
+        self._heard[:] = data[-_MOST_HEARD:]
+        return find_rtu(data, self._unit, self._request) or b""
+
+    def _trace_connect(self, connected: bool) -> None:
+        """Fail the waiting request when the connection breaks; pymodbus alone would wait its time out."""
+        if not connected:
+            self._fail(ConnectionException("connection lost"))
+
+    def _fail(self, error: ModbusException) -> None:
+        """End the wait of the request under way, if there is one."""
+        waiting = self._client.ctx.response_future
+        if self._request is not None and not waiting.done():
+            waiting.set_exception(error)

@@ -1,0 +1,1 @@
+"""Protocols: frames and texts as pure functions, without any input or output."""

@@ -1,0 +1,178 @@
+"""Micro-Epsilon capaNCDT 6200: blocks of the data port, replies of the command port.
+
+A block is a header of 32 bytes and M frames, everything little-endian:
+
+| field | bytes |
+| --- | --- |
+| `MEAS` | 4 |
+| order number, serial number | 4 + 4 |
+| channels present, two bits each from the lowest, 01 = present | 8 |
+| status, unused | 4 |
+| frames M, bytes for each frame (4 × channels) | 2 + 2 |
+| counter of the first frame | 4 |
+| M frames of one int32 for each present channel | |
+
+`µm = value / 0xFFFFFF × measuring range`. Source: capaNCDT 6200 operating instructions, Ethernet interface.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass
+
+PREAMBLE = b"MEAS"
+FULL_SCALE = 0xFFFFFF
+MOST_CHANNELS = 32
+# A block never holds this many frames; a length beyond it is taken for a preamble found in measurements.
+MOST_FRAMES = 4096
+_HEADER = struct.Struct("<4siiQIHHI")
+_ODD_BITS = 0xAAAAAAAAAAAAAAAA
+
+
+class BadReplyError(ValueError):
+    """A reply of the command port that cannot be used; the text says why."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Block:
+    """One block of frames.
+
+    Parameters
+    ----------
+    counter : int
+        Of the first frame, 32 bits.
+    channels : tuple of int
+        Numbers of the channels present, from 0.
+    values : tuple of int
+        Frame after frame, one value for each channel.
+    """
+
+    counter: int
+    channels: tuple[int, ...]
+    values: tuple[int, ...]
+
+    @property
+    def frames(self) -> int:
+        """Frames in the block."""
+        return len(self.values) // len(self.channels)
+
+    def of(self, channel: int) -> tuple[int, ...]:
+        """Return the values of one channel; empty when it is absent."""
+        if channel not in self.channels:
+            return ()
+        return self.values[self.channels.index(channel) :: len(self.channels)]
+
+
+class Blocks:
+    """Cut a stream of bytes into blocks; they may come split, joined, or in the midst of something else.
+
+    Attributes
+    ----------
+    skipped : int
+        Bytes passed over because they belong to no block.
+    """
+
+    def __init__(self) -> None:
+        self._rest = bytearray()
+        self.skipped = 0
+
+    def feed(self, data: bytes) -> list[Block]:
+        """Take received bytes; return the blocks that are now complete."""
+        self._rest += data
+        blocks: list[Block] = []
+        while True:
+            start = self._rest.find(PREAMBLE)
+            if start < 0:
+                # The tail may be the beginning of a preamble.
+                self._skip(max(0, len(self._rest) - len(PREAMBLE) + 1))
+                return blocks
+            self._skip(start)
+            if len(self._rest) < _HEADER.size:
+                return blocks
+            _, _, _, present, _, frames, width, counter = _HEADER.unpack_from(self._rest)
+            channels = tuple(n for n in range(MOST_CHANNELS) if present >> 2 * n & 1)
+            plausible = not present & _ODD_BITS and channels and 4 * len(channels) == width
+            if not plausible or not 1 <= frames <= MOST_FRAMES:
+                self._skip(len(PREAMBLE))
+                continue
+            size = _HEADER.size + frames * width
+            if len(self._rest) < size:
+                # Another block begins where this one should still last: it was torn, begin there.
+                if (torn := self._next_header()) > 0:
+                    self._skip(torn)
+                    continue
+                return blocks
+            values = struct.unpack_from(f"<{frames * len(channels)}i", self._rest, _HEADER.size)
+            blocks.append(Block(counter=counter, channels=channels, values=values))
+            del self._rest[:size]
+
+    def _next_header(self) -> int:
+        """Find a sound header after the first one; 0 when there is none."""
+        start = self._rest.find(PREAMBLE, len(PREAMBLE))
+        while start > 0 and len(self._rest) - start >= _HEADER.size:
+            first, second = bytes(self._rest[4:24]), bytes(self._rest[start + 4 : start + 24])
+            if first == second:  # same controller, same channels
+                return start
+            start = self._rest.find(PREAMBLE, start + 1)
+        return 0
+
+    def _skip(self, count: int) -> None:
+        self.skipped += count
+        del self._rest[:count]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Channel:
+    """What the controller says of a channel.
+
+    Parameters
+    ----------
+    range_um : float
+        Measuring range, µm.
+    sensor : str
+        Name of the sensor or demodulator.
+    """
+
+    range_um: float
+    sensor: str
+
+
+_UNITS_UM = {"nm": 1e-3, "um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6, "in": 25400.0}
+
+
+def channel_info(reply: str) -> Channel:
+    r"""Read the reply to `$CHIm`.
+
+    Raises
+    ------
+    BadReplyError
+        It carries no range, or a unit that is no length.
+
+    Examples
+    --------
+    >>> channel_info("$CHI1:ANO2303024,NAMDL6222,SNO1001,OFS0,RNG2000,UNTumOK").range_um
+    2000.0
+    """
+    fields = dict(re.findall(r"(ANO|NAM|SNO|OFS|RNG|UNT)([^,\r\n]*)", reply.strip().removesuffix("OK")))
+    unit = fields.get("UNT", "").strip()
+    if unit not in _UNITS_UM:
+        raise BadReplyError(f"unit {unit!r} of {reply.strip()!r} is no length")
+    try:
+        range_um = float(fields["RNG"]) * _UNITS_UM[unit]
+    except (KeyError, ValueError):
+        raise BadReplyError(f"no range in {reply.strip()!r}") from None
+    if not 0.0 < range_um < 1e7:
+        raise BadReplyError(f"range {range_um:g} µm in {reply.strip()!r}")
+    return Channel(range_um=range_um, sensor=fields.get("NAM", ""))
+
+
+def micrometres(value: float, range_um: float) -> float:
+    """Scale a value of the stream.
+
+    Examples
+    --------
+    >>> round(micrometres(0x7FFFFF, 2000.0), 2)
+    999.99
+    """
+    return value / FULL_SCALE * range_um
