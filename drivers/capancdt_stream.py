@@ -16,7 +16,7 @@ from drivers.reading import Quality, Reading
 
 PREAMBLE = b"MEAS"
 HEADER = struct.Struct("<4siiQIHHI")
-"""Preamble, order and serial number, channels, status, frames, bytes per frame, counter of the first frame."""
+"""Preamble, order and serial number, channels, status, frames, bytes per frame, counter."""
 FULL_SCALE = 0xFFFFFF
 MOST_FRAMES = 4096
 MOST_CHANNELS = 8

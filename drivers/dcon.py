@@ -1,4 +1,4 @@
-"""Thermocouple modules that speak DCON (ADAM ASCII): ICP DAS I-7018, 7018R, 7019R, Advantech ADAM-4018+, 4118.
+"""Thermocouple modules that speak DCON (ADAM ASCII): ICP DAS I-7018(R), 7019R, Advantech ADAM-4018+, 4118.
 
 Sources: ICP DAS I-7018 and Advantech ADAM-4000 user's manuals.
 """
@@ -32,7 +32,7 @@ from drivers.reading import Quality, Reading
 
 CHANNELS = 8
 READ_TIMEOUTS = 2.0
-"""Longest read, in time limits of the line: one answer of this module, and one that another is waiting for."""
+"""Longest read, in time limits of the line: its own answers and one of another module."""
 _CONFIGURATION = re.compile(r"!..([0-9A-F]{2})[0-9A-F]{2}([0-9A-F]{2})")
 _CHANNEL_TYPE = re.compile(r"!..C([0-9A-F])R([0-9A-F]{2})")
 _DIAGNOSIS = re.compile(r"!..([0-9A-F]{2})")
@@ -194,11 +194,12 @@ class DconDevice:
 
     def _check_type(self, number: int, code: int) -> None:
         couple = self._couples[number]
-        if code != TYPE_CODES[couple]:
+        wanted = TYPE_CODES[couple]
+        if code != wanted:
             found = next((name for name, each in TYPE_CODES.items() if each == code), "no couple")
             raise DeviceRefused(
                 self.name,
-                f"input {number} has type code {code:02X} ({found}), expected {TYPE_CODES[couple]:02X} ({couple})",
+                f"input {number} has type code {code:02X} ({found}), expected {wanted:02X} ({couple})",
             )
 
     async def _tell_open(self, readings: dict[int, Reading]) -> dict[int, Reading]:
