@@ -18,15 +18,15 @@ from compensator.errors import ServiceError
 from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, State, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.guards import SensorGuards
+from compensator.service.guards import HEATED_W, SensorGuards
 from compensator.service.limits import Limited, OffsetLimiter
 
 NAN = float("nan")
 
 #: A published offset may be used for this many samples.
 VALID_SAMPLES = 2.5
-#: Number of rates whose mean tells whether the machine is at rest.
-REST_SAMPLES = 5
+#: Number of samples over which rate and heat are averaged before they decide anything.
+MEAN_SAMPLES = 5
 
 ZeroMode = Literal["auto", "rest", "warm"]
 
@@ -80,6 +80,7 @@ class _Memory:
     estimate: Estimate | None = None
     missing_min: float = 0.0
     rates: list[float] = field(default_factory=list)
+    heats: list[float] = field(default_factory=list)
     operator_hold: bool = False
     internal_error: bool = False
 
@@ -172,7 +173,8 @@ class Compensation:
         if self._engine.has_reference:
             estimate = self._engine.step(values.t_q, values.at, values.others)
             self._memory.estimate = estimate
-            self._memory.rates = [*self._memory.rates[-REST_SAMPLES + 1 :], estimate.y_rate_um_per_min]
+            self._memory.rates = [*self._memory.rates[-MEAN_SAMPLES + 1 :], estimate.y_rate_um_per_min]
+            self._memory.heats = [*self._memory.heats[-MEAN_SAMPLES + 1 :], estimate.heat_w]
         y_pred = estimate.y_um - self._zero.y_base if estimate else NAN
         if math.isnan(self._zero.y_ref) and estimate is not None:
             # The probe was missing at the zero: its reference makes the residual start at zero.
@@ -195,7 +197,7 @@ class Compensation:
             zero.y_base = self._memory.estimate.y_um if self._memory.estimate else 0.0
         else:
             self._engine.set_reference(values.t_q, values.at)
-            self._memory.estimate, self._memory.rates = None, []
+            self._memory.estimate, self._memory.rates, self._memory.heats = None, [], []
             zero.y_base = 0.0
         zero.y_ref, zero.wanted = values.y, False
         notes.append((
@@ -205,10 +207,11 @@ class Compensation:
         ))  # fmt: skip
 
     def _is_warm(self, mode: ZeroMode) -> bool:
-        rates = self._memory.rates
-        if mode != "auto" or not rates:
+        if mode != "auto" or not self._memory.rates:
             return mode == "warm"
-        return abs(math.fsum(rates) / len(rates)) > self._config.zero.rest_rate_um_per_min
+        # A machine on a long plateau hardly grows, but it is heated: its heat must not become the zero.
+        heated = abs(_mean(self._memory.heats)) > HEATED_W
+        return heated or abs(_mean(self._memory.rates)) > self._config.zero.rest_rate_um_per_min
 
     # ------------------------------------------------------------------ decision
 
@@ -231,20 +234,22 @@ class Compensation:
             for name in self._engine.channels
             if math.isnan(values.others.get(name, NAN))
         ]
-        blocking = self._blocking(values, estimate, expired)
+        blocking = self._blocking(values, expired)
         if blocking:
             return "hold", reasons + blocking, self._limiter.hold()
         if lost:
             reasons.append("predicting")
-        limited = self._limiter.follow(-y_pred, -estimate.y_rate_um_per_min)
+        limited = self._limiter.follow(0.0 - y_pred, -estimate.y_rate_um_per_min)
         reasons += limited.reasons
         return ("degraded" if reasons else "ok"), reasons, limited
 
-    def _blocking(self, values: _Values, estimate: Estimate, expired: bool) -> list[str]:
+    def _blocking(self, values: _Values, expired: bool) -> list[str]:
         """Return why the offset must stay where it is."""
+        # A single estimate of the heat overshoots when a source is switched; its mean over some samples does not.
+        heat = _mean(self._memory.heats)
         outside = [
             f"outside_validity:{name}"
-            for name, value in (("t_q_degc", values.t_q), ("at_degc", values.at), ("heat_w", estimate.heat_w))
+            for name, value in (("t_q_degc", values.t_q), ("at_degc", values.at), ("heat_w", heat))
             if name in self._validity and not math.isnan(value)
             and not self._validity[name][0] <= value <= self._validity[name][1]
         ]  # fmt: skip
@@ -293,6 +298,10 @@ class Compensation:
             y_offset_std_um=estimate.y_std_um if estimate else NAN,
             state=state, reasons=reasons, model_sha256=self.model.sha256,
         )  # fmt: skip
+
+
+def _mean(values: list[float]) -> float:
+    return math.fsum(values) / len(values) if values else NAN
 
 
 def _values(channels: dict[str, ChannelSample]) -> _Values:

@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 GRID_S = 10.0
 HOUR_S = 3600.0
+#: A working day begins with this long a rest, s.
+IDLE_S = 1800.0
 
 CHANNELS = ("heat_w", "ambient_degc", "coolant_degc", "coolant_flow_lpm", "spindle_rpm", "fan_rpm")
 
@@ -85,6 +87,9 @@ class Duty:
         n = int(np.ceil(hours * HOUR_S / GRID_S)) + 1
         heat_w = levels(random, n, np.array([0.0, 0.0, 30.0, 45.0, 60.0, 75.0, 90.0]), (20.0, 150.0))
         rpm = levels(random, n, np.array([0.0, 0.0, 1500.0, 3000.0, 4500.0, 6000.0, 8000.0]), (6.0, 90.0))
+        # The shift starts on a cold machine: a service that zeroes itself at its start must find it at rest.
+        idle = int(IDLE_S / GRID_S)
+        heat_w[:idle] = rpm[:idle] = 0.0
         flow_lpm = flow_while(random, rpm > 0.0)
         air_degc = shop_air(random, n, doors_per_day=8.0)
         return cls(
