@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 from collections.abc import Mapping
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from drivers.capancdt_stream import BlockReader, ChannelSums, StreamSums
-from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout
+from drivers.capancdt_stream import BlockReader, ChannelSums, StreamSums, range_um
+from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceTimeout
 from drivers.family import DeviceSettings, Family, LineSettings
 from drivers.reading import Reading
 
@@ -25,7 +24,6 @@ LONGEST_ANSWER = 4096
 DEAD_TIMEOUTS = 3.0
 DEAD_S = 1.0
 """Without a byte for this long, and for three time limits, the connection is taken for dead, s."""
-_UM_PER_UNIT = {"um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1000.0}
 
 
 class CapaNcdtInput(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -42,10 +40,6 @@ class CapaNcdtSettings(DeviceSettings, frozen=True, kw_only=True, forbid_unknown
     inputs: Annotated[list[CapaNcdtInput], Meta(min_length=1, max_length=INPUTS)]
 
 
-class _Closable(Protocol):
-    async def close(self) -> None: ...
-
-
 class CapaNcdtLine:
     """Hold where the controller is; its device keeps the connections.
 
@@ -57,14 +51,14 @@ class CapaNcdtLine:
 
     def __init__(self, settings: LineSettings) -> None:
         self._settings = settings
-        self._devices: list[_Closable] = []
+        self._devices: list[CapaNcdt] = []
 
     @property
     def settings(self) -> LineSettings:
         """Its table of the configuration."""
         return self._settings
 
-    def attach(self, device: _Closable) -> None:
+    def attach(self, device: CapaNcdt) -> None:
         """Have a device closed together with the line."""
         self._devices.append(device)
 
@@ -134,10 +128,7 @@ class CapaNcdt:
         if self._closed:
             raise DeviceDisconnected(self.name, "has been closed")
         async with self._turn:
-            if self._loss:
-                loss, self._loss = self._loss, ""
-                await self._drop()
-                raise DeviceDisconnected(self.name, loss)
+            await self._check_loss()
             if self._writer is None:
                 await self._connect()
             await self._wait()
@@ -156,10 +147,7 @@ class CapaNcdt:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(limit_s):
                 await self._news.wait()
-        if self._loss:
-            loss, self._loss = self._loss, ""
-            await self._drop()
-            raise DeviceDisconnected(self.name, loss)
+        await self._check_loss()
         if self._news.is_set():
             return
         silent_s = asyncio.get_running_loop().time() - self._heard_s
@@ -169,6 +157,12 @@ class CapaNcdt:
         if strange:
             raise DeviceGarbled(self.name, f"{strange} bytes in {limit_s:g} s are no measurement")
         raise DeviceTimeout(self.name, f"no measurement within {limit_s:g} s, silent for {silent_s:.1f} s")
+
+    async def _check_loss(self) -> None:
+        if self._loss:
+            loss, self._loss = self._loss, ""
+            await self._drop()
+            raise DeviceDisconnected(self.name, loss)
 
     async def _connect(self) -> None:
         line = self._line
@@ -248,30 +242,6 @@ class CapaNcdt:
             writer.transport.abort()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
-
-
-def range_um(device: str, channel: int, answer: str) -> float:
-    """Return the measuring range of a channel from the answer to `$CHIm`, µm.
-
-    Raises
-    ------
-    DeviceRefused
-        If the answer is an error.
-    DeviceGarbled
-        If it has no range and unit.
-
-    Examples
-    --------
-    >>> range_um("spindle", 1, ":ANO2303024,NAMDL6222,SNO1001,OFS0,RNG2000,UNTumOK")
-    2000.0
-    """
-    if not answer.endswith("OK"):
-        raise DeviceRefused(device, f"channel {channel}: {answer[:80]!r}")
-    span = re.search(r",RNG([0-9]{1,9}(?:\.[0-9]{1,9})?)(?:,|OK)", answer, re.ASCII)
-    unit = re.search(r",UNT([^,]*?)(?:,|OK)", answer)
-    if span is None or unit is None or unit[1] not in _UM_PER_UNIT or not float(span[1]) > 0.0:
-        raise DeviceGarbled(device, f"channel {channel}: no range in µm or mm in {answer[:80]!r}")
-    return float(span[1]) * _UM_PER_UNIT[unit[1]]
 
 
 def _make(settings: CapaNcdtSettings, line: CapaNcdtLine) -> CapaNcdt:

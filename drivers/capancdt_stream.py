@@ -5,6 +5,7 @@ Source: Micro-Epsilon capaNCDT 6200 operating instructions, "Ethernet Interface"
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from drivers.errors import DeviceGarbled, DeviceRefused
 from drivers.reading import Quality, Reading
 
 PREAMBLE = b"MEAS"
@@ -20,6 +22,7 @@ HEADER = struct.Struct("<4siiQIHHI")
 FULL_SCALE = 0xFFFFFF
 MOST_FRAMES = 4096
 MOST_CHANNELS = 8
+_UM_PER_UNIT = {"um": 1.0, "µm": 1.0, "μm": 1.0, "mm": 1000.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,3 +207,27 @@ class StreamSums:
         if stale:
             return [Reading.bad(Quality.STALE, "counter of measurements stands still") for _ in order]
         return [self._channels[number].take() for number in order]
+
+
+def range_um(device: str, channel: int, answer: str) -> float:
+    """Return the measuring range of a channel from the answer to `$CHIm`, µm.
+
+    Raises
+    ------
+    DeviceRefused
+        If the answer is an error.
+    DeviceGarbled
+        If it has no range and unit.
+
+    Examples
+    --------
+    >>> range_um("spindle", 1, ":ANO2303024,NAMDL6222,SNO1001,OFS0,RNG2000,UNTumOK")
+    2000.0
+    """
+    if not answer.endswith("OK"):
+        raise DeviceRefused(device, f"channel {channel}: {answer[:80]!r}")
+    span = re.search(r",RNG([0-9]{1,9}(?:\.[0-9]{1,9})?)(?:,|OK)", answer, re.ASCII)
+    unit = re.search(r",UNT([^,]*?)(?:,|OK)", answer)
+    if span is None or unit is None or unit[1] not in _UM_PER_UNIT or not float(span[1]) > 0.0:
+        raise DeviceGarbled(device, f"channel {channel}: no range in µm or mm in {answer[:80]!r}")
+    return float(span[1]) * _UM_PER_UNIT[unit[1]]

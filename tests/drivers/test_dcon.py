@@ -177,7 +177,7 @@ async def test_open_over_under(rack):
 async def test_set_otherwise_than_configured(rack):
     sim = rack.add(
         SimLine(
-            {1: module(), 2: module(), 3: Adam("adam-4118", couples=["K"] * 7 + ["T"])},
+            {1: module(), 2: module(), 3: Adam("adam-4118", couples=["K"] * 7 + ["T"], sources={})},
             settings={1: SimSettings(data_format="percent")},
         )
     )
