@@ -41,13 +41,7 @@ class CapaNcdtSettings(DeviceSettings, frozen=True, kw_only=True, forbid_unknown
 
 
 class CapaNcdtLine:
-    """Hold where the controller is; its device keeps the connections.
-
-    Parameters
-    ----------
-    settings : LineSettings
-        Its table of the configuration; `host` is needed.
-    """
+    """Hold where the controller is (`host` is needed); its device keeps the connections."""
 
     def __init__(self, settings: LineSettings) -> None:
         self._settings = settings
@@ -69,15 +63,7 @@ class CapaNcdtLine:
 
 
 class CapaNcdt:
-    """Collect the stream in the background, and give mean and extremes of what came since the last read.
-
-    Parameters
-    ----------
-    settings : CapaNcdtSettings
-        Its table of the configuration.
-    line : CapaNcdtLine
-        Where the controller is.
-    """
+    """Collect the stream in the background, and give mean and extremes of what came since the last read."""
 
     def __init__(self, settings: CapaNcdtSettings, line: CapaNcdtLine) -> None:
         self._settings = settings
@@ -139,7 +125,8 @@ class CapaNcdt:
     async def close(self) -> None:
         """Close the connections. May be called twice."""
         self._closed = True
-        await self._drop()
+        async with self._turn:
+            await self._drop()
 
     async def _wait(self) -> None:
         limit_s = self._line.timeout_s

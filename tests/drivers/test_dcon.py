@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -256,3 +258,13 @@ async def test_no_port_and_closed_line(tmp_path):
     async with devices(str(tmp_path / "none"), {}) as (device,):
         assert isinstance(await failure(device), DeviceDisconnected)
     assert isinstance(await failure(device), DeviceDisconnected)
+
+
+async def test_close_leaves_no_thread_and_no_descriptor(rack):
+    sim = rack.add(SimLine({1: module()}))
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    async with devices(sim.port, {}) as (device,):
+        await device.read()
+        assert len(list(Path("/proc/self/fd").iterdir())) > before
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("dcon-")]
