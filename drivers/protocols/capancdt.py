@@ -172,7 +172,7 @@ def micrometres(value: float, range_um: float) -> float:
 
     Examples
     --------
-    >>> round(micrometres(0x7FFFFF, 2000.0), 2)
-    999.99
+    >>> round(micrometres(0x7FFFFF, 2000.0), 4)
+    999.9999
     """
     return value / FULL_SCALE * range_um
