@@ -8,7 +8,7 @@ from collections.abc import Callable
 import drivers
 from compensator.clock import Clock, SystemClock
 from compensator.config import LoadedConfig, load_config
-from compensator.errors import ConfigError
+from compensator.errors import ConfigError, ModelError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording import last_sequence
@@ -25,15 +25,18 @@ def load(path: str) -> tuple[LoadedConfig, ThermalModel, bytes, drivers.Fleet]:
 
     Raises
     ------
-    ConfigError, ModelError
+    ConfigError
         One line that names what is wrong.
     """
     loaded = load_config(path)
     config = loaded.config
-    data = read_model_bytes(loaded.model_name())
-    model = parse_model(data, source=config.model.file)
-    if config.model.alternative:
-        model = model.with_alternative(config.model.alternative)
+    try:
+        data = read_model_bytes(loaded.model_name())
+        model = parse_model(data, source=config.model.file)
+        if config.model.alternative:
+            model = model.with_alternative(config.model.alternative)
+    except ModelError as error:
+        raise ConfigError(f"{path}: model: {error}") from error
     polls = model.period_s / config.sampling.poll_interval_s
     if abs(polls - round(polls)) > 1e-9 or polls < 1:
         raise ConfigError(

@@ -77,7 +77,9 @@ class FakeDevice:
 class Bench:
     """A daemon on a simulated machine, with everything it published."""
 
-    def __init__(self, tmp_path: Any, conf: Config | None = None, *, seed: int = 1, noise: bool = True) -> None:
+    def __init__(
+        self, tmp_path: Any, conf: Config | None = None, *, seed: int = 1, noise: bool = True
+    ) -> None:
         self.config = conf or config()
         duty = Duty.working_day(seed, hours=48)
         sensors = usual_sensors(duty.extra_names) if noise else None
@@ -111,4 +113,3 @@ class Bench:
 
         await self.daemon.run(samples=samples, on_sample=step)
         return self.outcomes
-
