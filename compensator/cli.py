@@ -58,12 +58,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=__version__)
     parser.set_defaults(debug=False)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    demo = _command(
-        commands, "demo", _demo, "the whole loop on simulated hardware", "compensator demo --out demo-out"
-    )
-    demo.add_argument(
-        "--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder for the results"
-    )
+    demo = _command(commands, "demo", _demo, "the whole loop on simulated hardware", "compensator demo --out demo-out")
+    demo.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder for the results")
     demo.add_argument("--hours", type=float, default=24.0, help="length of the simulated run, h (default 24)")
     demo.add_argument("--seed", type=int, default=1, help="seed of the simulated day (default 1)")
     run = _command(commands, "run", _run, "the service", "compensator run --config machine.toml")
@@ -93,9 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.add_argument("recording", type=Path, metavar="FILE.mcap")
     export.add_argument("--out", type=Path, required=True, metavar="CSV")
-    explain = _command(
-        commands, "explain", _explain, "a state or reason in words", "compensator explain degraded"
-    )
+    explain = _command(commands, "explain", _explain, "a state or reason in words", "compensator explain degraded")
     explain.add_argument("code")
     return parser
 
@@ -226,7 +220,8 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if "y_um" in columns:
         score = scores(columns["y_um"], columns["y_pred_um"])
         result |= {"fit_pct": score.fit_pct, "rms_um": score.rms_um, "peak_to_peak_um": score.peak_to_peak_um}
-        text += f"\nfit {score.fit_pct:.2f} %, residual {score.rms_um:.3f} µm rms, {score.peak_to_peak_um:.2f} µm peak to peak"
+        text += f"\nfit {score.fit_pct:.2f} %, residual {score.rms_um:.3f} µm rms"
+        text += f", {score.peak_to_peak_um:.2f} µm peak to peak"
     _print(arguments, result, text)
     return 0
 

@@ -61,9 +61,7 @@ class VirtualClock:
         Awaited with the seconds since the start whenever the time has moved: the simulated machine moves there.
     """
 
-    def __init__(
-        self, start_utc_ns: int, on_advance: Callable[[float], Awaitable[None]] | None = None
-    ) -> None:
+    def __init__(self, start_utc_ns: int, on_advance: Callable[[float], Awaitable[None]] | None = None) -> None:
         self._start_ns = start_utc_ns
         self._elapsed_ns = 0
         self._step_ns = 0

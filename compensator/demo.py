@@ -102,8 +102,7 @@ def run_demo(out: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], str
         Page(title="A simulated day, compensated", verdict=_verdict(results), table=table, figures=figures),
     )
     text = "\n".join(
-        "  ".join(f"{cell:>{width}}" for cell, width in zip(row, _widths(table), strict=True))
-        for row in table
+        "  ".join(f"{cell:>{width}}" for cell, width in zip(row, _widths(table), strict=True)) for row in table
     )
     return {"machines": results, "report": str(page)}, f"{text}\n\n{_verdict(results)}\npage: {page}"
 
@@ -142,9 +141,7 @@ def run_day(folder: Path, *, machine: str, hours: float, seed: int) -> Day:
         received: list[Offset] = []
         clock = VirtualClock(START_NS, advance)
         asyncio.run(_serve(config, clock, round(hours * 60), outcomes, received, port))
-    return Day(
-        outcomes=outcomes, received=received, truth=world.history(), seconds=time.perf_counter() - began
-    )
+    return Day(outcomes=outcomes, received=received, truth=world.history(), seconds=time.perf_counter() - began)
 
 
 async def _serve(
@@ -369,9 +366,7 @@ def _errors(day: Day) -> dict[str, Vector]:
 def _figures(day: Day) -> dict[str, Any]:
     errors = _errors(day)
     estimate = [outcome.estimate for outcome in day.outcomes]
-    fit = scores(
-        np.array([number(e.y_um) for e in estimate]), np.array([number(e.y_pred_um) for e in estimate])
-    )
+    fit = scores(np.array([number(e.y_um) for e in estimate]), np.array([number(e.y_pred_um) for e in estimate]))
     still = errors["followed"]
     part: dict[str, Any] = {
         name: {

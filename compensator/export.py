@@ -44,9 +44,7 @@ def export(recording: Path, out: Path) -> int:
     for row in rows.values():
         row["t_s"] = (row.pop("_ns") - start) / 1e9
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
-    names.sort(
-        key=lambda name: ("time_utc", "t_s", "seq").index(name) if name in ("time_utc", "t_s", "seq") else 3
-    )
+    names.sort(key=lambda name: ("time_utc", "t_s", "seq").index(name) if name in ("time_utc", "t_s", "seq") else 3)
     with out.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, restval="", lineterminator="\n")
         writer.writeheader()
@@ -63,9 +61,7 @@ def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:
     if isinstance(message, Sample):
         for name, channel in message.channels.items():
             # A mean that the guards refused is no value for a table; the quality says why it is missing.
-            cells["heat_measured_w" if name == "heat_w" else name] = (
-                channel.mean if channel.quality == "good" else None
-            )
+            cells["heat_measured_w" if name == "heat_w" else name] = channel.mean if channel.quality == "good" else None
             cells[f"{name}_quality"] = channel.quality
         return cells
     fields = msgspec.structs.asdict(message)

@@ -15,10 +15,11 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "The service compensates with less than everything; the reasons say what is missing or limited.",
         "Look at the reasons.",
     ),
-    "hold": ("The last good offset stands and does not follow the machine.", "Look at the reasons; find the cause before the next precise cut."),
+    "hold": ("The last good offset stands and does not follow the machine.",
+        "Look at the reasons; find the cause before the next precise cut."),
     "fault": ("There is no offset to rely on.", "Do not rely on compensation; look at the reasons and the events."),
     "no_zero": ("No zero has been set yet.", "Bring T_Q and AT back, or send the command zero."),
-    "t_q_missing": ("T_Q cannot be used in this sample.", "See the quality of t_q_degc: check couple, module and line."),
+    "t_q_missing": ("T_Q cannot be used in this sample.", "See the quality of t_q_degc: check couple and module."),
     "at_missing": ("AT cannot be used in this sample.", "See the quality of at_degc: check couple, module and line."),
     "channel_missing": (
         "A channel that an effect of the model uses is missing; its last good value stands in.",
@@ -36,7 +37,9 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "T_Q, AT or the heat lies outside the range on which the model was made.",
         "Calibrate on a wider range, or bring the machine back into it.",
     ),
-    "offset_limited": ("The offset has reached its largest permitted value.", "Check sensors and model before raising limits.offset_max_um."),
+    "offset_limited": (
+        "The offset has reached its largest permitted value.",
+        "Check sensors and model before raising limits.offset_max_um."),
     "rate_limited": (
         "The offset moves at its largest permitted rate and has not arrived yet.",
         "Wait; if it stays so, check sensors and limits.offset_rate_max_um_per_min.",
@@ -61,7 +64,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "device_error": ("The device could not be read.", "See the events for its message."),
     "device_config": ("The configuration of the device cannot be used.", "Run `compensator check`."),
     "out_of_range": ("The value lies outside the plausible range of the channel.", "Check sensor and range."),
-    "too_fast": ("The value changed faster than the sensor's place can.", "Check for a loose sensor or a disturbed line."),
+    "too_fast": ("The value changed faster than the sensor's place can.", "Check for a loose sensor or a noisy line."),
     "stuck": ("The value has not moved at all for longer than it may.", "Check that sensor and module still measure."),
     "t_q_below_at": ("T_Q lies below AT although the machine is heated.", "Check for exchanged or fallen-off sensors."),
 }  # fmt: skip

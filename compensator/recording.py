@@ -64,9 +64,7 @@ def read_messages(path: Path, topics: tuple[str, ...] | None = None) -> Iterator
             wanted = [f"/{topic}" for topic in topics] if topics else None
             try:
                 for _, channel, message in reader.iter_messages(topics=wanted, log_time_order=False):
-                    yield Recorded(
-                        channel.topic.lstrip("/"), message.data, message.sequence, message.log_time
-                    )
+                    yield Recorded(channel.topic.lstrip("/"), message.data, message.sequence, message.log_time)
             except TORN:
                 return
     except OSError as error:

@@ -82,9 +82,7 @@ def _with_roles(path: Path, columns: dict[str, Vector], roles: Mapping[str, str]
         if role not in ROLES:
             raise DataError(f"{path}: --column {role}={name}: expected a role of {', '.join(ROLES)}")
         if name not in columns:
-            raise DataError(
-                f"{path}: --column {role}={name}: no such column, expected one of: {', '.join(columns)}"
-            )
+            raise DataError(f"{path}: --column {role}={name}: no such column, expected one of: {', '.join(columns)}")
     renamed = {roles_name: columns[name] for roles_name, name in roles.items()}
     return {**{n: v for n, v in columns.items() if n not in roles.values()}, **renamed}
 
@@ -190,7 +188,9 @@ def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: floa
     records.append((start, n))
     return Data(
         records=tuple(
-            Record(t_s=np.arange(a, b) * period_s, columns={name: v[a:b] for name, v in gridded.items()})
+            Record(
+                t_s=np.arange(a, b, dtype=np.float64) * period_s, columns={name: v[a:b] for name, v in gridded.items()}
+            )
             for a, b in records
         ),
         remarks=tuple(remarks),
@@ -207,7 +207,9 @@ def _mean_by_slot(slot: npt.NDArray[np.int_], values: Vector, n: int) -> Vector:
     good = ~np.isnan(values)
     total = np.bincount(slot[good], weights=values[good], minlength=n)
     count = np.bincount(slot[good], minlength=n)
-    return np.divide(total, count, out=np.full(n, np.nan), where=count > 0)
+    mean = np.full(n, np.nan)
+    mean[count > 0] = total[count > 0] / count[count > 0]
+    return mean
 
 
 def _gaps(present: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -93,9 +93,7 @@ class _Inputs:
 
     @property
     def complete(self) -> bool:
-        return not (
-            math.isnan(self.t_q_k) or math.isnan(self.at_k) or any(map(math.isnan, self.channels.values()))
-        )
+        return not (math.isnan(self.t_q_k) or math.isnan(self.at_k) or any(map(math.isnan, self.channels.values())))
 
 
 @dataclass(slots=True)
@@ -264,12 +262,9 @@ class Engine:
         """
         t_q = np.asarray(t_q_degc, dtype=float).tolist()
         at = np.asarray(at_degc, dtype=float).tolist()
-        columns = {
-            name: np.asarray(values, dtype=float).tolist() for name, values in (channels or {}).items()
-        }
+        columns = {name: np.asarray(values, dtype=float).tolist() for name, values in (channels or {}).items()}
         return [
-            self.step(t_q[i], at[i], {name: values[i] for name, values in columns.items()})
-            for i in range(len(t_q))
+            self.step(t_q[i], at[i], {name: values[i] for name, values in columns.items()}) for i in range(len(t_q))
         ]
 
     # ------------------------------------------------------------------ inside
@@ -280,9 +275,7 @@ class Engine:
         dtf, tdtf = observer.shares_um()
         shares = self._step_effects(inputs, dtf, tdtf) if self._effects else ()
         y = dtf + tdtf
-        for (
-            share
-        ) in shares:  # not sum(): newer Pythons compensate it, and the bits would depend on the version
+        for share in shares:  # not sum(): newer Pythons compensate it, and the bits would depend on the version
             y += share
         dtf_ahead, tdtf_ahead = observer.shares_ahead_um()
         rate = (dtf_ahead + tdtf_ahead - dtf - tdtf) / self._period_min
@@ -371,7 +364,5 @@ def _make_effect(model: ThermalModel, index: int) -> Effect:
     maker = kinds().get(entry.kind)
     if maker is None:
         known = ", ".join(sorted(kinds())) or "none yet"
-        raise ModelError(
-            f"model {model.name}: effect {index + 1} has kind {entry.kind!r}, expected one of: {known}"
-        )
+        raise ModelError(f"model {model.name}: effect {index + 1} has kind {entry.kind!r}, expected one of: {known}")
     return maker.from_table(entry.table, model.period_s)

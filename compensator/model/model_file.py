@@ -106,9 +106,7 @@ class _Table:
         self.where, self.table = where, table
         unknown = [key for key in table if known is not None and key not in known]
         if unknown:
-            raise ModelError(
-                f"{where}: unknown key {unknown[0]!r}, expected one of: {', '.join(known or ())}"
-            )
+            raise ModelError(f"{where}: unknown key {unknown[0]!r}, expected one of: {', '.join(known or ())}")
 
     def number(self, key: str, *, low: float = -math.inf, high: float = math.inf) -> float:
         """Return a finite number between two bounds (inclusive)."""
@@ -165,7 +163,7 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
         estimator=_estimator(table.get("estimator"), kind),
         inputs=top.text("inputs", ("changes", "absolute"), "changes"),  # type: ignore[arg-type]
         validity=_validity(table.get("validity", {})),
-        y_std_um=_Table("uncertainty", table.get("uncertainty", {"y_std_um": 0.0}), ("y_std_um",)).number("y_std_um", low=0.0),
+        y_std_um=_uncertainty(table.get("uncertainty", {"y_std_um": 0.0})),
         effects=_effects(table.get("effect", [])),
         alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
         provenance=dict(_Table("provenance", table.get("provenance", {})).table),
@@ -182,9 +180,7 @@ def _path(where: str, value: object, period_s: float, extra: Sequence[str] = ())
     top, bottom = table.numbers(upper), table.numbers(lower)
     try:
         if form == "continuous":
-            return Path.from_continuous(
-                TransferFunction(numerator=top, denominator=bottom, unit=unit), period_s
-            )
+            return Path.from_continuous(TransferFunction(numerator=top, denominator=bottom, unit=unit), period_s)
         sampled = SampledTransferFunction(b=top, a=bottom, period_s=period_s)
     except CompensatorError as error:
         raise ModelError(f"{where}: {error}") from error
@@ -212,6 +208,10 @@ def _estimator(value: object, kind: str) -> Estimator:
     )
 
 
+def _uncertainty(value: object) -> float:
+    return _Table("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0)
+
+
 def _validity(value: object) -> dict[str, tuple[float, float]]:
     table = _Table("validity", value)
     ranges: dict[str, tuple[float, float]] = {}
@@ -229,9 +229,7 @@ def _effects(value: object) -> tuple[EffectTable, ...]:
     result = []
     for i, entry in enumerate(value, start=1):
         table = _Table(f"effect {i}", entry)
-        result.append(
-            EffectTable(kind=table.text("kind"), table={k: v for k, v in table.table.items() if k != "kind"})
-        )
+        result.append(EffectTable(kind=table.text("kind"), table={k: v for k, v in table.table.items() if k != "kind"}))
     return tuple(result)
 
 

@@ -64,7 +64,8 @@ class ObserverState:
 def _corrected(p: Matrix, gain: Matrix, column: Matrix, s: float) -> Matrix:
     """Return P − K L' − L K' + K S K' with L = P H', which is right for any gain K."""
     cross = np.multiply.outer(gain, column)
-    return p - (cross + cross.T) + s * np.multiply.outer(gain, gain)
+    corrected: Matrix = p - (cross + cross.T) + s * np.multiply.outer(gain, gain)
+    return corrected
 
 
 class Observer:
@@ -92,7 +93,7 @@ class Observer:
         self.reset()
 
     def _lay_out(self, *functions: SampledTransferFunction) -> None:
-        """Number the states and write F as rows (next, first, source, a, B)."""
+        """Give every state its number and write F as rows (next, first, source, a, B)."""
         orders = [f.order for f in functions]
         total = sum(orders)
         self._q, self._a, self.size = total, total + 1, total + 2
@@ -110,9 +111,9 @@ class Observer:
             start += n
         rows += [(self._q, nil, nil, 0.0, 0.0), (self._a, nil, nil, 0.0, 0.0)]
         self._rows = rows
-        nxt, first, source, a_col, b_col = (np.array(column) for column in zip(*rows, strict=True))
-        self._next_row, self._first_row, self._source_row = nxt, first, source
-        self._a_column, self._b_column = a_col[:, None], b_col[:, None]
+        next_row, first_row, source_row, a_column, b_column = (np.array(column) for column in zip(*rows, strict=True))
+        self._next_row, self._first_row, self._source_row = next_row, first_row, source_row
+        self._a_column, self._b_column = a_column[:, None], b_column[:, None]
 
     def reset(self) -> None:
         """Return to rest: every state zero and known."""
@@ -167,9 +168,7 @@ class Observer:
 
     # ------------------------------------------------------------------ covariance
 
-    def _recurse(
-        self, r_at: float | None, r_tq: float | None, complete: bool
-    ) -> tuple[list[float], list[float]]:
+    def _recurse(self, r_at: float | None, r_tq: float | None, complete: bool) -> tuple[list[float], list[float]]:
         """Move the covariance on by one sample and return the gains for AT and T_Q (None: missing)."""
         before = self._P
         p = self._moved_covariance(before) if self._started else before
@@ -194,11 +193,10 @@ class Observer:
 
     def _f_times(self, matrix: Matrix) -> Matrix:
         rows = np.vstack((matrix, np.zeros((1, self.size))))
-        return (
-            rows[self._next_row]
-            - self._a_column * rows[self._first_row]
-            + self._b_column * rows[self._source_row]
+        product: Matrix = (
+            rows[self._next_row] - self._a_column * rows[self._first_row] + self._b_column * rows[self._source_row]
         )
+        return product
 
     def _moved_covariance(self, p: Matrix) -> Matrix:
         moved = self._f_times(self._f_times(p).T)

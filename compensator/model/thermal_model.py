@@ -179,7 +179,8 @@ class ThermalModel:
             known = ", ".join(self.alternatives) or "none"
             raise ModelError(f"model {self.name}: no alternative {name!r}; it has: {known}")
         replaced, path = self.alternatives[name]
-        return dataclasses.replace(self, **{replaced.lower(): path})
+        changes: dict[str, Any] = {replaced.lower(): path}
+        return dataclasses.replace(self, **changes)
 
     @property
     def drive_unit(self) -> str:
@@ -196,9 +197,7 @@ def check_runnable(model: ThermalModel) -> None:
         For an unstable path, or a TTF whose inverse is improper, unstable or rings.
     """
     if not (math.isfinite(model.period_s) and model.period_s > 0):
-        raise ModelError(
-            f"model {model.name}: sample_period_s = {model.period_s!r}, expected a number above 0"
-        )
+        raise ModelError(f"model {model.name}: sample_period_s = {model.period_s!r}, expected a number above 0")
     if (model.ttf is None) != (model.kind == "direct"):
         raise ModelError(f"model {model.name}: kind {model.kind!r} and its paths do not fit: TTF "
                          f"{'missing' if model.ttf is None else 'present'}")  # fmt: skip
@@ -216,13 +215,12 @@ def _check_path(model: ThermalModel, name: str, path: Path) -> None:
         raise ModelError(f"model {model.name}: path {name} has unit {path.unit!r}, expected {expected!r}")
     if path.sampled.period_s != model.period_s:
         raise ModelError(
-            f"model {model.name}: path {name} is sampled at {path.sampled.period_s:g} s, the model at {model.period_s:g} s"
+            f"model {model.name}: path {name} is sampled at {path.sampled.period_s:g} s, "
+            f"the model at {model.period_s:g} s"
         )
     if not path.sampled.is_stable():
         worst = max(path.sampled.poles(), key=abs)
-        raise ModelError(
-            f"model {model.name}: path {name} is unstable: pole at z = {worst:.6g}, expected |z| < 1"
-        )
+        raise ModelError(f"model {model.name}: path {name} is unstable: pole at z = {worst:.6g}, expected |z| < 1")
 
 
 def _check_inverse(model_name: str, ttf: SampledTransferFunction) -> None:
@@ -237,6 +235,4 @@ def _check_inverse(model_name: str, ttf: SampledTransferFunction) -> None:
         raise ModelError(where + f"zero at z = {worst:.6g} makes the inverse unstable, expected |z| < 1")
     ringing = min(zeros, key=lambda z: float(np.real(z)))
     if ringing.real < RINGING_LIMIT:
-        raise ModelError(
-            where + f"zero at z = {ringing:.6g} makes the inverse ring, expected Re z > {RINGING_LIMIT}"
-        )
+        raise ModelError(where + f"zero at z = {ringing:.6g} makes the inverse ring, expected Re z > {RINGING_LIMIT}")

@@ -82,9 +82,7 @@ class SampledTransferFunction:
 
     def __post_init__(self) -> None:
         if not self.b or not self.a or self.a[0] != 1.0:
-            raise ModelError(
-                "a sampled transfer function needs a numerator and a denominator that starts with 1"
-            )
+            raise ModelError("a sampled transfer function needs a numerator and a denominator that starts with 1")
         if not all(math.isfinite(c) for c in (*self.b, *self.a)):
             raise ModelError("a sampled transfer function has a coefficient that is not finite")
 

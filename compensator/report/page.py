@@ -12,6 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -63,9 +64,11 @@ class Page:
 _STYLE = """
 :root { --paper: #ffffff; --ink: #1c1c1c; --grid: #d0d0d0; --line-0: #d55e00; --line-1: #0072b2; --line-2: #009e73; }
 @media (prefers-color-scheme: dark) {
-  :root { --paper: #16181c; --ink: #e8e8e8; --grid: #44484f; --line-0: #f0903c; --line-1: #6cb8ee; --line-2: #3fc79a; } }
+  :root { --paper: #16181c; --ink: #e8e8e8; --grid: #44484f; --line-0: #f0903c; --line-1: #6cb8ee; --line-2: #3fc79a; }
+}
 @media print {
-  :root { --paper: #ffffff; --ink: #000000; --grid: #d0d0d0; --line-0: #d55e00; --line-1: #0072b2; --line-2: #009e73; } }
+  :root { --paper: #ffffff; --ink: #000000; --grid: #d0d0d0; --line-0: #d55e00; --line-1: #0072b2; --line-2: #009e73; }
+}
 body { background: var(--paper); color: var(--ink); font: 16px/1.5 system-ui, sans-serif; margin: 0 auto;
   max-width: 60rem; padding: 1rem; }
 h1 { font-size: 1.5rem; } .verdict { font-size: 1.2rem; font-weight: 600; }
@@ -104,7 +107,7 @@ def write_page(path: Path, page: Page) -> None:
 
 
 def _svg(figure: Figure) -> str:
-    style = {
+    style: dict[Any, Any] = {
         "svg.fonttype": "none", "svg.hashsalt": figure.title, "font.family": "sans-serif", "font.size": 10,
         "text.color": "#010101", "axes.labelcolor": "#010101", "axes.edgecolor": "#010101",
         "xtick.color": "#010101", "ytick.color": "#010101", "grid.color": "#020202", "figure.facecolor": "none",

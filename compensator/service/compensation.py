@@ -104,9 +104,7 @@ class Compensation:
         names = {channel.name for channel in config.channel}
         missing = [name for name in self._engine.channels if name not in names]
         if missing:
-            raise ServiceError(
-                f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured"
-            )
+            raise ServiceError(f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured")
         self._guards = SensorGuards(config.channel, config.guards, self._period_min)
         self._limiter = OffsetLimiter(config.limits, self._period_min)
         self._zero = _Zero(wanted=config.zero.at_start)
@@ -219,9 +217,7 @@ class Compensation:
         self, values: _Values, estimate: Estimate | None, y_pred: float
     ) -> tuple[State, list[str], Limited | None]:
         reasons = [
-            code
-            for code, value in (("t_q_missing", values.t_q), ("at_missing", values.at))
-            if math.isnan(value)
+            code for code, value in (("t_q_missing", values.t_q), ("at_missing", values.at)) if math.isnan(value)
         ]
         lost = bool(reasons)
         self._memory.missing_min = self._memory.missing_min + self._period_min if lost else 0.0
@@ -230,9 +226,7 @@ class Compensation:
             state: State = "fault" if expired else "starting"
             return state, [*reasons, "no_zero"], None
         reasons += [
-            f"channel_missing:{name}"
-            for name in self._engine.channels
-            if math.isnan(values.others.get(name, NAN))
+            f"channel_missing:{name}" for name in self._engine.channels if math.isnan(values.others.get(name, NAN))
         ]
         blocking = self._blocking(values, expired)
         if blocking:
@@ -305,9 +299,7 @@ def _mean(values: list[float]) -> float:
 
 
 def _values(channels: dict[str, ChannelSample]) -> _Values:
-    usable = {
-        name: number(channel.mean) if channel.quality == "good" else NAN for name, channel in channels.items()
-    }
+    usable = {name: number(channel.mean) if channel.quality == "good" else NAN for name, channel in channels.items()}
     return _Values(
         t_q=usable.pop("t_q_degc", NAN),
         at=usable.pop("at_degc", NAN),

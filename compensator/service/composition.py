@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import Any
 
 import drivers
 from compensator.clock import Clock, SystemClock
@@ -66,9 +67,7 @@ def _check_unit(path: str, name: str, unit: str) -> None:
 
 async def read_once(fleet: drivers.Fleet) -> dict[str, dict[int, Reading] | DriverError]:
     """Read every device once, side by side."""
-    results = await asyncio.gather(
-        *(device.read() for device in fleet.devices.values()), return_exceptions=True
-    )
+    results = await asyncio.gather(*(device.read() for device in fleet.devices.values()), return_exceptions=True)
     answers: dict[str, dict[int, Reading] | DriverError] = {}
     for name, result in zip(fleet.devices, results, strict=True):
         if isinstance(result, DriverError):
@@ -104,7 +103,11 @@ async def run_service(
     config = loaded.config
     folder = loaded.resolve(config.recording.folder)
     recorder = Recorder(folder, config.machine.name, {"config.toml": loaded.data, "model.toml": model_bytes})
-    publisher = Publisher(config.zenoh, lambda name, payload: daemon.command(name, payload))
+
+    def command(name: str, payload: bytes) -> dict[str, Any]:
+        return daemon.command(name, payload)
+
+    publisher = Publisher(config.zenoh, command)
     daemon = Daemon(
         config=config, compensation=Compensation(config, model), devices=fleet.devices, recorder=recorder,
         publish=publisher.publish, clock=clock or SystemClock(),

@@ -96,9 +96,7 @@ class Daemon:
 
     # ------------------------------------------------------------------ running
 
-    async def run(
-        self, *, samples: int | None = None, on_sample: Callable[[Outcome], None] | None = None
-    ) -> None:
+    async def run(self, *, samples: int | None = None, on_sample: Callable[[Outcome], None] | None = None) -> None:
         """Run until `stop` or for a number of samples.
 
         Parameters
@@ -153,9 +151,7 @@ class Daemon:
         for state in self._devices.values():
             if state.task is None:
                 state.task = asyncio.create_task(self._read(state.device))
-        awaited = [
-            state.task for state in self._devices.values() if state.task is not None and state.answered
-        ]
+        awaited = [state.task for state in self._devices.values() if state.task is not None and state.answered]
         await self._clock.settle(awaited, WAIT_PART * interval_s)
         results = {name: self._collect(state) for name, state in self._devices.items()}
         for channel in self._config.channel:

@@ -120,9 +120,7 @@ class SensorGuards:
             for name, sample in channels.items()
         }
 
-    def _t_q_below_at(
-        self, channels: Mapping[str, ChannelSample], verdicts: Mapping[str, str], heat_w: float
-    ) -> bool:
+    def _t_q_below_at(self, channels: Mapping[str, ChannelSample], verdicts: Mapping[str, str], heat_w: float) -> bool:
         if verdicts.get("t_q_degc") != "good" or verdicts.get("at_degc") != "good":
             return False
         below_k = number(channels["at_degc"].mean) - number(channels["t_q_degc"].mean)

@@ -73,9 +73,7 @@ class Recorder:
                 self._open(time_utc_ns, day)
             assert self._writer is not None and self._file is not None
             for topic, data in records:
-                self._writer.add_message(
-                    self._channels[topic], time_utc_ns, data, time_utc_ns, sequence=self._sequence
-                )
+                self._writer.add_message(self._channels[topic], time_utc_ns, data, time_utc_ns, sequence=self._sequence)
                 self._sequence += 1
             self._flush()
         except OSError:
@@ -87,7 +85,7 @@ class Recorder:
         if self._writer is None or self._file is None:
             return
         try:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
             self._flush()
         finally:
             self._give_up()
@@ -106,14 +104,10 @@ class Recorder:
         }
         self._file = self._create(time_utc_ns)
         # Without chunks a message is in the file as soon as it is flushed; the data CRC covers a finished one.
-        self._writer = Writer(
-            self._file, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True
-        )
+        self._writer = Writer(self._file, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)
         self._writer.start(profile="", library=f"compensator {__version__}")
         for topic in _TOPICS:
-            schema = self._writer.register_schema(
-                MESSAGES[topic].__name__, "jsonschema", shipped_schema(topic)
-            )
+            schema = self._writer.register_schema(MESSAGES[topic].__name__, "jsonschema", shipped_schema(topic))
             self._channels[topic] = self._writer.register_channel(
                 f"/{topic}", "json", schema, {"machine": self._machine}
             )
@@ -142,7 +136,7 @@ class Recorder:
 
     def _flush(self) -> None:
         assert self._writer is not None and self._file is not None
-        self._writer.flush()
+        self._writer.flush()  # type: ignore[no-untyped-call]
         self._file.flush()
         os.fsync(self._file.fileno())
 

@@ -42,9 +42,7 @@ class Duty:
     def __init__(self, duration_s: float, **columns: Array | float) -> None:
         self.duration_s = duration_s
         n = int(np.ceil(duration_s / GRID_S)) + 1
-        self.columns: dict[str, Array] = {
-            k: np.broadcast_to(v, n).astype(np.float64) for k, v in columns.items()
-        }
+        self.columns: dict[str, Array] = {k: np.broadcast_to(v, n).astype(np.float64) for k, v in columns.items()}
         self.extra_names = [name for name in columns if name not in CHANNELS]
         named = [name for name in columns if name in CHANNELS]
         parts = zip(*(self.columns[name].tolist() for name in named), strict=True) if named else ((),) * n

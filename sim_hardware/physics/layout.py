@@ -28,8 +28,7 @@ class Layout:
         self._masses: list[tuple[str, float, float, float]] = []
         quill = d.quill_section_m2 * self._dx_m * d.steel_j_per_m3k
         self.quill = [
-            self._add(f"quill {i}", quill, d.quill_perimeter_m * self._dx_m, self._dx_m)
-            for i in range(d.quill_nodes)
+            self._add(f"quill {i}", quill, d.quill_perimeter_m * self._dx_m, self._dx_m) for i in range(d.quill_nodes)
         ]
         self.nose = self._add("nose", d.nose_j_per_k, d.nose_area_m2, d.nose_length_m)
         self.plate = self._add("plate", d.plate_j_per_k, d.plate_area_m2, 0.0)
@@ -39,9 +38,7 @@ class Layout:
         self.front = self._add("column front", d.front_j_per_k, d.front_area_m2, d.front_lever_m)
         self.rear = self._add("column rear", d.rear_j_per_k, d.rear_area_m2, d.rear_lever_m)
         self.base = self._add("base", d.base_j_per_k, d.base_area_m2, 0.0)
-        self.second = (
-            self._add("second mass", d.second_j_per_k, 0.0, d.second_lever_m) if d.second_j_per_k else None
-        )
+        self.second = self._add("second mass", d.second_j_per_k, 0.0, d.second_lever_m) if d.second_j_per_k else None
         self.names = [name for name, *_ in self._masses]
         self.area_m2: Array = np.array([area for _, _, area, _ in self._masses])
         lever = 1e6 * d.expansion_per_k * np.array([lever for *_, lever in self._masses])
@@ -94,9 +91,7 @@ class Layout:
         d = self._design
         left = d.plate_centre * d.quill_length_m - d.plate_length_m / 2
         right = left + d.plate_length_m
-        covered = [
-            (i, min(right, (i + 1) * self._dx_m) - max(left, i * self._dx_m)) for i in range(d.quill_nodes)
-        ]
+        covered = [(i, min(right, (i + 1) * self._dx_m) - max(left, i * self._dx_m)) for i in range(d.quill_nodes)]
         total = sum(length for _, length in covered if length > 0.0)
         return [(self.quill[i], length / total) for i, length in covered if length > 0.0]
 

@@ -30,9 +30,7 @@ TTF = (0.008079, 0.01629, 0.0002567)
 TTF_POLES = (1.0, 0.09112, 0.001022)
 
 
-def tustin(
-    numerator: Sequence[float], denominator: Sequence[float], step_min: float = 1.0
-) -> tuple[Array, Array]:
+def tustin(numerator: Sequence[float], denominator: Sequence[float], step_min: float = 1.0) -> tuple[Array, Array]:
     r"""Return the polynomials in z⁻¹ for :math:`s = \frac{2}{h} \frac{1 - z^{-1}}{1 + z^{-1}}`.
 
     Examples

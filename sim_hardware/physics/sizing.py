@@ -62,9 +62,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
 
 def fit_pct(measured: Array, simulated: Array) -> float:
     """Return 100·(1 − ‖y − ŷ‖ / ‖y − mean(y)‖), as the paper's tool does."""
-    return float(
-        100.0 * (1.0 - np.linalg.norm(measured - simulated) / np.linalg.norm(measured - measured.mean()))
-    )
+    return float(100.0 * (1.0 - np.linalg.norm(measured - simulated) / np.linalg.norm(measured - measured.mean())))
 
 
 def responses(design: QuillDesign, longest_substep_s: float = 60.0) -> tuple[Array, Array, Array]:

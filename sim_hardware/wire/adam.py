@@ -24,9 +24,7 @@ class _Model:
 
 
 _MODELS = {
-    "adam-4018+": _Model(
-        offered=ADAM_COUPLES, default="K", burn_out=0, name="4018P", name_words=(0x4018, 0x5000)
-    ),
+    "adam-4018+": _Model(offered=ADAM_COUPLES, default="K", burn_out=0, name="4018P", name_words=(0x4018, 0x5000)),
     "adam-4118": _Model(
         offered=ADAM_4118_VOLTS + ADAM_COUPLES,
         default="K",
@@ -34,15 +32,9 @@ _MODELS = {
         name="4118",
         name_words=(0x4118, 0x0000),
     ),
-    "adam-6018": _Model(
-        offered=ADAM_COUPLES, default="K", burn_out=0, name="6018", name_words=(0x6018, 0x0000)
-    ),
-    "adam-4117": _Model(
-        offered=ADAM_VOLTS, default="10V", burn_out=None, name="4117", name_words=(0x4117, 0x0000)
-    ),
-    "adam-6017": _Model(
-        offered=ADAM_VOLTS, default="10V", burn_out=None, name="6017", name_words=(0x6017, 0x0000)
-    ),
+    "adam-6018": _Model(offered=ADAM_COUPLES, default="K", burn_out=0, name="6018", name_words=(0x6018, 0x0000)),
+    "adam-4117": _Model(offered=ADAM_VOLTS, default="10V", burn_out=None, name="4117", name_words=(0x4117, 0x0000)),
+    "adam-6017": _Model(offered=ADAM_VOLTS, default="10V", burn_out=None, name="6017", name_words=(0x6017, 0x0000)),
 }
 
 
@@ -118,9 +110,7 @@ class Adam(MeasuringModule):
             return Sample(value, sample.state)
         if sample.state is State.OPEN:
             value = 0.0
-        value = (
-            span.high if sample.state is State.OVER else span.low if sample.state is State.UNDER else value
-        )
+        value = span.high if sample.state is State.OVER else span.low if sample.state is State.UNDER else value
         return Sample(min(max(value, span.low), span.high), State.GOOD)
 
     def quantised(self, channel: int) -> Sample:
@@ -166,9 +156,7 @@ class Adam(MeasuringModule):
             self.holding[i] = self.inputs[i] = Cell(functools.partial(self._word, i))
             self.holding[200 + i] = self._type(i)
             if burn_out is not None:
-                self.coils[burn_out + i] = self.discrete[burn_out + i] = Cell(
-                    functools.partial(self._open, i)
-                )
+                self.coils[burn_out + i] = self.discrete[burn_out + i] = Cell(functools.partial(self._open, i))
         words = (*about.name_words, 0xA106, 0x0000, 0, 0)
         for i, word in enumerate(words):
             self.holding[210 + i] = Cell(functools.partial(int, word))

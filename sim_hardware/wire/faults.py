@@ -82,9 +82,7 @@ class Faults:
             where = "a device" if input is None else "an input"
             raise ValueError(f"no fault {fault!r} of {where}: {', '.join(sorted(known))}")
         if fault not in self._supported:
-            raise ValueError(
-                f"fault {fault!r} does not exist on this device: {', '.join(sorted(self._supported))}"
-            )
+            raise ValueError(f"fault {fault!r} does not exist on this device: {', '.join(sorted(self._supported))}")
         needed = REQUIRED.get(fault)
         if needed is not None and needed not in parameters:
             raise ValueError(f"fault {fault!r} needs {needed}=")
@@ -130,9 +128,7 @@ class Faults:
         left = _integer(parameters["times"]) - 1
         with self._lock:
             rest = {k: v for k, v in self._device.items() if k != fault}
-            self._device = (
-                {**rest, fault: MappingProxyType({**parameters, "times": left})} if left > 0 else rest
-            )
+            self._device = {**rest, fault: MappingProxyType({**parameters, "times": left})} if left > 0 else rest
         return parameters
 
     def of_input(self, number: int) -> Mapping[str, Parameters]:

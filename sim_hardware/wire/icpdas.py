@@ -43,9 +43,7 @@ _M19 = bytes.fromhex("00701900")
 _MODELS = {
     "m-7018": _Model(channels=8, name_bytes=_M18, couples=True, map="m-7000", detects_open=False),
     "m-7018r": _Model(channels=8, name_bytes=_M18, couples=True, map="m-7000"),
-    "m-7019r": _Model(
-        channels=8, name_bytes=_M19, couples=True, map="m-7000", type_per_channel=True, status_bits=True
-    ),
+    "m-7019r": _Model(channels=8, name_bytes=_M19, couples=True, map="m-7000", type_per_channel=True, status_bits=True),
     "tm-th8": _Model(
         channels=8,
         name_bytes=bytes.fromhex("07550000"),

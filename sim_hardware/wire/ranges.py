@@ -56,9 +56,7 @@ def _couple(code: int, name: str, low: float, high: float, per_unit: float = 10.
 
 def _volts(code: int, name: str, limit: float, per_unit: float, *, milli: bool = False) -> Range:
     scale = 1000.0 if milli else 1.0
-    return Range(
-        code=code, name=name, low=-limit, high=limit, per_source_unit=scale, engineering_per_unit=per_unit
-    )
+    return Range(code=code, name=name, low=-limit, high=limit, per_source_unit=scale, engineering_per_unit=per_unit)
 
 
 def _current(code: int, name: str, low: float) -> Range:

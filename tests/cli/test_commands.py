@@ -77,7 +77,7 @@ def test_check_and_run_on_hardware_with_sigterm(tmp_path: Path) -> None:
     """The service as a process of its own, in real time, ended by SIGTERM with a finished recording."""
     duty = Duty.working_day(1, hours=1)
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
-    with hardware(world) as (lines, capa), socket.socket() as free:
+    with hardware(world) as (lines, _capa), socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
         free.close()
@@ -148,7 +148,7 @@ def test_probe_reads_every_device_once(tmp_path: Path, capsys: pytest.CaptureFix
     duty = Duty.working_day(1, hours=1)
     world = World(PublishedQuill(), duty, None, 1)
     world.advance_to(60.0)
-    with hardware(world) as (lines, capa):
+    with hardware(world) as (lines, _capa):
         # A controller in push mode streams only when the simulated time moves: the probe's first frame.
         config = tmp_path / "machine.toml"
         config.write_text(configuration("vmc-07", lines, 7447), encoding="utf-8")
@@ -160,9 +160,7 @@ def test_probe_reads_every_device_once(tmp_path: Path, capsys: pytest.CaptureFix
     assert code == 1
 
 
-def test_simulate_scores_the_published_model_on_itself(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simulate_scores_the_published_model_on_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_run(tmp_path / "run.csv")
     assert (
         main(
@@ -218,10 +216,7 @@ def test_bad_tables_get_one_line_and_exit_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, expected: str
 ) -> None:
     (tmp_path / "bad.csv").write_text(text)
-    assert (
-        main(["simulate", str(tmp_path / "bad.csv"), "--model", "quill", "--out", str(tmp_path / "o.csv")])
-        == 2
-    )
+    assert main(["simulate", str(tmp_path / "bad.csv"), "--model", "quill", "--out", str(tmp_path / "o.csv")]) == 2
     error = capsys.readouterr().err
     assert expected in error and error.count("\n") == 1 and "Traceback" not in error
 
@@ -269,20 +264,17 @@ def test_two_devices_on_one_address_are_refused(tmp_path: Path, capsys: pytest.C
         "data": 10001,
         "command": 10023,
     }
-    second = '[[device]]\nname = "twin"\nline = "rs485"\nmodel = "icpdas-m7018r"\naddress = 1\ninputs = [{ input = 1, couple = "K" }]\n'
+    second = '[[device]]\nname = "twin"'
+    second += '\nline = "rs485"\nmodel = "icpdas-m7018r"\naddress = 1\ninputs = [{ input = 1, couple = "K" }]\n'
     (tmp_path / "bad.toml").write_text(configuration("vmc-07", lines, 7447) + second)
     assert main(["check", "--config", str(tmp_path / "bad.toml")]) == 2
     error = capsys.readouterr().err
     assert "twin" in error and "spindle-couples" in error and error.count("\n") == 1
 
 
-def test_model_with_an_unstable_inverse_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_model_with_an_unstable_inverse_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (Path(__file__).parents[2] / "compensator/model/quill.toml").read_text(encoding="utf-8")
-    (tmp_path / "m.toml").write_text(
-        text.replace("[0.0002567, 0.01629, 0.008079]", "[-0.0002567, 0.01629, 0.008079]")
-    )
+    (tmp_path / "m.toml").write_text(text.replace("[0.0002567, 0.01629, 0.008079]", "[-0.0002567, 0.01629, 0.008079]"))
     write_run(tmp_path / "run.csv")
     assert (
         main(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -155,7 +156,7 @@ def test_a_gap_is_walked_over_with_interpolated_inputs(missing: str) -> None:
     stds = [e.y_std_um for e in holed[302:320]]
     assert stds[-1] > holed[299].y_std_um
     if missing != "at":  # an error of AT acts through heat and TDTF with opposite signs
-        assert all(b > a for a, b in zip(stds, stds[1:], strict=False))
+        assert all(b > a for a, b in itertools.pairwise(stds))
     assert holed[500].y_std_um < stds[-1]
 
 
@@ -237,9 +238,7 @@ def test_effects_run_hold_a_missing_channel_and_survive_gaps() -> None:
     assert [e.y_effects_um[0] for e in run[45:48]] == pytest.approx([10.0] * 3, abs=0.02)
     whole = Engine(model)
     whole.set_reference(20.0, 20.0)
-    assert y_of(whole.run(t_q, at, {"coolant_degc": coolant}))[50:] == pytest.approx(
-        y_of(run)[50:], abs=1e-12
-    )
+    assert y_of(whole.run(t_q, at, {"coolant_degc": coolant}))[50:] == pytest.approx(y_of(run)[50:], abs=1e-12)
 
 
 def test_unknown_effect_is_named() -> None:

@@ -77,9 +77,7 @@ class FakeDevice:
 class Bench:
     """A daemon on a simulated machine, with everything it published."""
 
-    def __init__(
-        self, tmp_path: Any, conf: Config | None = None, *, seed: int = 1, noise: bool = True
-    ) -> None:
+    def __init__(self, tmp_path: Any, conf: Config | None = None, *, seed: int = 1, noise: bool = True) -> None:
         self.config = conf or config()
         duty = Duty.working_day(seed, hours=48)
         sensors = usual_sensors(duty.extra_names) if noise else None

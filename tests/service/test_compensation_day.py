@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+
 from compensator.clock import NS
 from compensator.messages import MESSAGES, Offset, number, schemas, shipped_schema
 from compensator.recording import decode, last_sequence, read_messages, recordings
@@ -67,7 +69,7 @@ async def test_lost_temperature_predicts_then_holds_then_returns_without_a_jump(
     assert [o.offset.state for o in lost[10:]] == ["hold"] * 15
     assert len({o.offset.y_offset_um for o in lost[9:]}) == 1
     stds = [number(o.offset.y_offset_std_um) for o in lost]
-    assert all(b >= a for a, b in zip(stds, stds[1:], strict=False)) and stds[-1] > stds[0]
+    assert all(b >= a for a, b in itertools.pairwise(stds)) and stds[-1] > stds[0]
     name = ("t_q_degc", "at_degc")[index]
     assert all(o.sample.channels[name].mean is None or math.isnan(o.sample.channels[name].mean) for o in lost)
     assert never_jumps(bench)
@@ -145,9 +147,7 @@ async def test_rate_range_and_stuck_guards(bench: Bench) -> None:
     jump = Reading.good(60.0)
     bench.at_sample[50] = lambda: bench.device.replaced.update({0: jump, 2: Reading.good(999.0)})
     bench.at_sample[52] = bench.device.replaced.clear
-    bench.at_sample[60] = lambda: bench.device.replaced.update(
-        {1: Reading.good(bench.world.truth("at_degc"))}
-    )
+    bench.at_sample[60] = lambda: bench.device.replaced.update({1: Reading.good(bench.world.truth("at_degc"))})
     await bench.run(130)
     assert bench.outcomes[50].sample.channels["t_q_degc"].quality == "too_fast"
     assert bench.outcomes[50].sample.channels["t_q_degc"].device_quality == "good"
@@ -244,9 +244,7 @@ async def test_recording_holds_every_sample_and_what_was_published(bench: Bench)
     assert kinds[0] == "start" and kinds[-1] == "stop" and "zero" in kinds
 
 
-async def test_sample_is_on_disk_before_its_offset_is_published(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_sample_is_on_disk_before_its_offset_is_published(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     order: list[str] = []
     write = bench.recorder.write
     monkeypatch.setattr(bench.recorder, "write", lambda *a: (order.append("disk"), write(*a)))
