@@ -10,7 +10,7 @@ from drivers.families.base import DeviceSettings, Family, Line
 from drivers.lines.capancdt_link import CapancdtLink
 from drivers.lines.dcon_line import DconLine
 from drivers.lines.modbus_line import ModbusLine
-from drivers.lines.settings import CapancdtLine, LineSettings, SerialLine, TcpLine, line_settings
+from drivers.lines.settings import CapancdtLine, LineSettings, SerialLine, line_settings
 from drivers.reading import Device
 from drivers.settings import Where, one_of, settings
 
@@ -42,9 +42,7 @@ class Fleet:
             await device.close()
 
 
-def build(
-    lines: Sequence[Mapping[str, object]], devices: Sequence[Mapping[str, object]], *, source: str
-) -> Fleet:
+def build(lines: Sequence[Mapping[str, object]], devices: Sequence[Mapping[str, object]], *, source: str) -> Fleet:
     """Make the devices of a configuration, without opening anything.
 
     Parameters
@@ -76,15 +74,10 @@ def build(
         address = getattr(about, "address", "its own line")
         other = taken.setdefault((about.line, address), about.name)
         if other != about.name:
-            raise where.error(
-                f"address {address} on line {about.line!r} is that of {other!r} and of {about.name!r}"
-            )
-        line = (
-            made.setdefault(about.line, _open_line(line_about))
-            if about.line not in made
-            else made[about.line]
-        )
-        fleet[about.name] = family.make(about, line, where)
+            raise where.error(f"address {address} on line {about.line!r} is that of {other!r} and of {about.name!r}")
+        if about.line not in made:
+            made[about.line] = _new_line(line_about)
+        fleet[about.name] = family.make(about, made[about.line], where)
     return Fleet(fleet)
 
 
@@ -99,9 +92,7 @@ def _lines(tables: Sequence[Mapping[str, object]], source: str) -> dict[str, Lin
             raise where.wrong("name", about.name, "another one than the lines before have")
         for end in about.ends():
             if end in taken:
-                raise where.error(
-                    f"{end} is on line {taken[end]!r} and on line {about.name!r}, expected one line"
-                )
+                raise where.error(f"{end} is on line {taken[end]!r} and on line {about.name!r}, expected one line")
             taken[end] = about.name
         lines[about.name] = about
     return lines
@@ -125,28 +116,23 @@ def _family(table: object, where: Where) -> Family:
     return MODELS[model]
 
 
-def _line_of(
-    about: DeviceSettings, family: Family, known: Mapping[str, LineSettings], where: Where
-) -> LineSettings:
+def _line_of(about: DeviceSettings, family: Family, known: Mapping[str, LineSettings], where: Where) -> LineSettings:
     """Find the line of a device, with a protocol that its model speaks."""
     if about.line not in known:
         raise where.wrong("line", about.line, f"the name of a line ({', '.join(known) or 'there is none'})")
     line = known[about.line]
     if line.protocol not in family.protocols:
         expected = f"a line with protocol {' or '.join(family.protocols)} for {about.model}"
-        raise where.error(
-            f"key 'line' is {about.line!r} with protocol {line.protocol!r}, expected {expected}"
-        )
+        raise where.error(f"key 'line' is {about.line!r} with protocol {line.protocol!r}, expected {expected}")
     return line
 
 
-def _open_line(about: LineSettings) -> Line:
+def _new_line(about: LineSettings) -> Line:
     """Make a line; it opens with its first request."""
     if isinstance(about, CapancdtLine):
         return CapancdtLink(about)
     if isinstance(about, SerialLine) and about.protocol == "dcon":
         return DconLine(about)
-    assert isinstance(about, SerialLine | TcpLine)
     return ModbusLine(about)
 
 

@@ -145,8 +145,7 @@ class AdamVoltages(ModbusDevice):
         """Scale the words of the configured inputs."""
         range_v, words = self._about.range_v, answers[0]
         return {
-            number: reading_of(advantech_volts(words[number], range_v), probe)
-            for number, probe in self._probes.items()
+            number: reading_of(advantech_volts(words[number], range_v), probe) for number, probe in self._probes.items()
         }
 
 

@@ -74,9 +74,7 @@ class DconModule:
 
     def __init__(self, about: DconSettings, line: DconLine, where: Where) -> None:
         if about.format != "engineering" and about.vendor is None:
-            raise where.error(
-                f"key 'vendor' is missing, format = \"{about.format}\" needs it: icpdas or advantech"
-            )
+            raise where.error(f"key 'vendor' is missing, format = \"{about.format}\" needs it: icpdas or advantech")
         self._table = _TABLES[about.vendor]
         self._couples = thermocouples(about, self._table, about.channels, where, about.couple)
         self._about = about
@@ -171,8 +169,7 @@ class DconModule:
         if found != expected:
             raise DeviceRefused(
                 self.name,
-                f"data format in $AA2 is {words.get(found, 'ohms')}, "
-                f"the configuration expects {words[expected]}",
+                f"data format in $AA2 is {words.get(found, 'ohms')}, the configuration expects {words[expected]}",
             )
 
     def _check_type(self, asked: str, number: int, found: int) -> None:

@@ -137,9 +137,7 @@ def group(inputs: Sequence[MapInput], max_gap: int) -> list[Request]:
             stop = max(end, last.address + last.count)
             near = given.address <= last.address + last.count + max_gap
             if near and stop - last.address <= MOST_REGISTERS:
-                requests[-1] = Request(
-                    function=last.function, address=last.address, count=stop - last.address
-                )
+                requests[-1] = Request(function=last.function, address=last.address, count=stop - last.address)
                 continue
         requests.append(Request(function=given.function, address=given.address, count=end - given.address))
     return requests
@@ -182,9 +180,7 @@ def _bad_values(given: MapInput, where: Where) -> dict[float, Quality]:
                 raw: Any = int(number, 0) if isinstance(number, str) else number
                 found[float(raw)] = _BAD[quality]
             except (TypeError, ValueError):
-                raise where.wrong(
-                    f"bad_values.{key}", number, "a number as it stands in the registers"
-                ) from None
+                raise where.wrong(f"bad_values.{key}", number, "a number as it stands in the registers") from None
     return found
 
 

@@ -61,9 +61,7 @@ class MoxaE1262(ModbusDevice):
         about, words = self._about, answers[0]
         kind, scale = ("float32", 1.0) if about.register == "scaled" else ("int32", 0.1)
         return {
-            number: STANDARD[letter].judged(
-                decode(words[2 * number : 2 * number + 2], kind, about.word_order) * scale
-            )
+            number: STANDARD[letter].judged(decode(words[2 * number : 2 * number + 2], kind, about.word_order) * scale)
             for number, letter in self._couples.items()
         }
 

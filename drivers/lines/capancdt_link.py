@@ -152,8 +152,7 @@ class CapancdtLink:
         where = f"{self.about.host}:{self.about.data_port}"
         return DeviceTimeout(
             self._name,
-            f"no new measurement from {where} within {wait_s} s "
-            "(is another client connected to the data port?)",
+            f"no new measurement from {where} within {wait_s} s (is another client connected to the data port?)",
         )
 
     async def _keep(self) -> None:
@@ -168,9 +167,7 @@ class CapancdtLink:
                 self._failure = error
             except TimeoutError:
                 host = self.about.host
-                self._failure = DeviceTimeout(
-                    self._name, f"no connection to {host} within {self.timeout_s} s"
-                )
+                self._failure = DeviceTimeout(self._name, f"no connection to {host} within {self.timeout_s} s")
             except OSError as error:
                 self._failure = DeviceDisconnected(self._name, f"{self.about.host}: {error}")
             self._infos = {}
@@ -192,9 +189,7 @@ class CapancdtLink:
         finally:
             await _shut(writer)
 
-    async def _ask_channel(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, channel: int
-    ) -> Channel:
+    async def _ask_channel(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, channel: int) -> Channel:
         """Ask one channel; the controller counts from 1, echoes the command, and greets with a banner."""
         command = f"$CHI{channel + 1}"
         writer.write(f"{command}\r".encode("ascii"))

@@ -221,9 +221,7 @@ class DconLine:
                 what = b" ".join((*heard, port.rest))[:60]
                 raise DeviceGarbled(member.name, f"no valid reply to {text!r} in {what!r}") from None
             where = f"address {member.address:02X} on {self.about.port}"
-            raise DeviceTimeout(
-                member.name, f"no reply to {text!r} from {where} within {self.timeout_s} s"
-            ) from None
+            raise DeviceTimeout(member.name, f"no reply to {text!r} from {where} within {self.timeout_s} s") from None
 
     def _answer(self, member: DconMember, line: bytes, lead: str) -> str | None:
         """Return the body when a line answers the command, None when it answers something else."""
@@ -234,9 +232,7 @@ class DconLine:
                 return None
             raise DeviceGarbled(member.name, str(error)) from None
         if found.lead == "?" and found.address() == member.address:
-            raise DeviceRefused(
-                member.name, f"address {member.address:02X} refuses the command (?{found.body})"
-            )
+            raise DeviceRefused(member.name, f"address {member.address:02X} refuses the command (?{found.body})")
         if found.lead != lead:
             return None
         if lead == ">":

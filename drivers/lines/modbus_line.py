@@ -201,9 +201,7 @@ class ModbusLine:
         except TimeoutError:
             self._no_host_since_s = loop.time()
             self._patience.failed(loop.time())
-            raise DeviceTimeout(
-                member.name, f"no connection to {self._where} within {self.timeout_s} s"
-            ) from None
+            raise DeviceTimeout(member.name, f"no connection to {self._where} within {self.timeout_s} s") from None
         if self._wire is not wire:  # closed meanwhile
             wire.close()
             raise DeviceDisconnected(member.name, "is closed")

@@ -30,7 +30,8 @@ from drivers.protocols.modbus import (
 if logging.getLogger("pymodbus").level == logging.NOTSET:
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
-# Longest RTU frame, with room for a late one before it.
+# Far more than any frame with late ones before it, and little enough to search at every arrival.
+_MOST_BUFFERED = 8192
 _MOST_HEARD = 1024
 
 
@@ -67,7 +68,7 @@ class ModbusWire:
         self._client = self._make(about)
         create = self._client.ctx.call_create
 
-        # pymodbus swallows why a connection failed, and lets some of pyserial's exceptions through.
+        # pymodbus swallows why a connection failed, and lets some of pyserial's errors through.
         async def explained() -> object:
             try:
                 return await create()
@@ -76,6 +77,8 @@ class ModbusWire:
                 raise OSError(self._why) from error
 
         self._client.ctx.call_create = explained
+        # Beyond its own limit pymodbus drops what it has before anybody saw it, and garbage looks like silence.
+        self._client.ctx.max_buffer_size = _MOST_BUFFERED
         # Whether a silent device costs the connection is decided by the line.
         self._client.set_max_no_responses(1 << 30)
 

@@ -45,9 +45,7 @@ class Span:
         if value_degc > self.high_degc + _TOLERANCE_DEGC:
             return Reading.bad(Quality.OVER, f"{value_degc:.1f} °C, the range ends at {self.high_degc:g} °C")
         if value_degc < self.low_degc - _TOLERANCE_DEGC:
-            return Reading.bad(
-                Quality.UNDER, f"{value_degc:.1f} °C, the range begins at {self.low_degc:g} °C"
-            )
+            return Reading.bad(Quality.UNDER, f"{value_degc:.1f} °C, the range begins at {self.low_degc:g} °C")
         return Reading.good(value_degc)
 
     def icp_hex(self, raw: int) -> Reading:
@@ -85,13 +83,9 @@ class Span:
         (23.79, 20.82)
         """
         if raw == 0:
-            return Reading.bad(
-                Quality.UNDER, f"at or below {self.low_degc:g} °C, the module reports nothing lower"
-            )
+            return Reading.bad(Quality.UNDER, f"at or below {self.low_degc:g} °C, the module reports nothing lower")
         if raw == 0xFFFF:
-            return Reading.bad(
-                Quality.OVER, f"at or above {self.high_degc:g} °C, the module reports nothing higher"
-            )
+            return Reading.bad(Quality.OVER, f"at or above {self.high_degc:g} °C, the module reports nothing higher")
         return Reading.good(self.low_degc + raw / 65535.0 * (self.high_degc - self.low_degc))
 
 

@@ -188,7 +188,5 @@ def _checked_tcp(frame: bytes, size: int, answering: int, unit: int, request: Re
         raise WrongAnswerError(f"asked function {request.function}, the answer is function {function}")
     due = 9 if function & 0x80 else 9 + request.data_bytes
     if size != due or (not function & 0x80 and len(frame) > 8 and frame[8] != request.data_bytes):
-        raise WrongAnswerError(
-            f"asked {request}, {request.data_bytes} bytes, the answer has {max(0, size - 9)}"
-        )
+        raise WrongAnswerError(f"asked {request}, {request.data_bytes} bytes, the answer has {max(0, size - 9)}")
     return frame if len(frame) == size else None

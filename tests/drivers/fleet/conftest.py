@@ -131,6 +131,7 @@ class TcpEnd:
         self.connections = 0
         self._server: asyncio.Server | None = None
         self.writers: list[asyncio.StreamWriter] = []
+        self._tasks: list[Any] = []
 
     async def start(self) -> None:
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
@@ -138,6 +139,7 @@ class TcpEnd:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1
+        self._tasks.append(asyncio.current_task())
         self.writers.append(writer)
         try:
             while data := await reader.read(4096):
@@ -157,6 +159,7 @@ class TcpEnd:
         if self._server is not None:
             self._server.close()
             self.drop()
+            await asyncio.gather(*self._tasks)
             await self._server.wait_closed()
             self._server = None
 
@@ -267,3 +270,8 @@ def _nothing_leaks() -> Iterator[None]:
 @pytest.fixture
 def slave() -> type[Slave]:
     return Slave
+
+
+@pytest.fixture
+def modbus_bus() -> type[ModbusBus]:
+    return ModbusBus

@@ -56,9 +56,7 @@ async def test_icpdas_et7018z(rig: Any, slave: Any) -> None:
         (lambda unit: unit.registers.update({(3, 559): 0x7019}), "module name in register 559 is 0x7019"),
     ],
 )
-async def test_what_the_module_says_must_agree(
-    rig: Any, slave: Any, change: Callable[[Any], None], text: str
-) -> None:
+async def test_what_the_module_says_must_agree(rig: Any, slave: Any, change: Callable[[Any], None], text: str) -> None:
     unit = slave({(3, 559): 0x7018}, {631: 0})
     unit.block(3, 427, [0x0F] * 10)
     unit.block(4, 0, [0] * 10)

@@ -73,9 +73,7 @@ def test_icpdas_marks() -> None:
     assert ICPDAS["T"].icp_engineering(2345, 0.01).value == pytest.approx(23.45)
 
 
-@pytest.mark.parametrize(
-    ("letter", "word", "degc"), [("T", 16225, 23.79), ("T", 14089, 7.49), ("K", 996, 20.82)]
-)
+@pytest.mark.parametrize(("letter", "word", "degc"), [("T", 16225, 23.79), ("T", 14089, 7.49), ("K", 996, 20.82)])
 def test_advantech_words_of_captures(letter: str, word: int, degc: float) -> None:
     assert ADVANTECH[letter].advantech(word).value == pytest.approx(degc, abs=0.006)
 
@@ -191,9 +189,7 @@ def test_dcon_checksums(text: str, total: str) -> None:
 def test_dcon_printed_replies() -> None:
     body = "+05.123+04.153+07.234-02.356+10.000-05.133+02.345+08.234"
     assert [float(t) for t in split_values(body, 8, "engineering")][3] == -2.356
-    assert (
-        len(split_values("+7.2111+7.2567+7.3125+7.1000+7.4712+7.2555+7.1234+7.5678", 8, "engineering")) == 8
-    )
+    assert len(split_values("+7.2111+7.2567+7.3125+7.1000+7.4712+7.2555+7.1234+7.5678", 8, "engineering")) == 8
     mixed = "+023.50+9999-0000       +0.0276-10.000+9999+024.00"
     texts = split_values(mixed, 8, "engineering")
     qualities = [thermocouple(t, "engineering", STANDARD["K"], None).quality for t in texts]
