@@ -123,7 +123,7 @@ def _svg(figure: Figure) -> str:
         axes.set_xlabel(figure.x_label)
         axes.set_ylabel(figure.y_label)
         axes.grid(visible=True)
-        axes.legend(loc="best")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata={"Date": None})
     svg = buffer.getvalue()

@@ -1,0 +1,1 @@
+"""The service: sampling, guards, compensation, limits, recording, publishing, the loop."""
