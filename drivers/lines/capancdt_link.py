@@ -19,6 +19,9 @@ from drivers.protocols.capancdt import FULL_SCALE, BadReplyError, Block, Blocks,
 
 # Between tries to connect, s: soon at first, as after a cable came loose.
 RETRY_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
+# A stream silent for so many time limits, and so many seconds, is connected anew: the other end may be long gone.
+SILENT_TIMEOUTS = 10.0
+SILENT_S = 2.0
 _MOST_BLOCKS = 2048
 _READ_BYTES = 65536
 
@@ -78,6 +81,7 @@ class CapancdtLink:
         self._kept: dict[int, deque[Sums]] = {}
         self._next_counter: int | None = None
         self._standing = 0
+        self._heard = False
         self._changed = asyncio.Event()
         self._failure: DriverError | None = None
         self._task: asyncio.Task[None] | None = None
@@ -161,15 +165,17 @@ class CapancdtLink:
         while True:
             try:
                 self._infos = await self._ask_channels()
-                tries = 0
                 await self._receive()
             except DriverError as error:
                 self._failure = error
             except TimeoutError:
                 host = self.about.host
                 self._failure = DeviceTimeout(self._name, f"no connection to {host} within {self.timeout_s} s")
-            except OSError as error:
+            except (OSError, ValueError) as error:  # ValueError: a host that is no name
                 self._failure = DeviceDisconnected(self._name, f"{self.about.host}: {error}")
+            # A controller that accepts connections but sends nothing is not to be pestered.
+            tries = 0 if self._heard else tries
+            self._heard = False
             self._infos = {}
             self._forget()
             self._changed.set()
@@ -218,13 +224,23 @@ class CapancdtLink:
         self._failure, self._next_counter, blocks = None, None, Blocks()
         loop = asyncio.get_running_loop()
         try:
-            while data := await reader.read(_READ_BYTES):
+            while data := await self._more(reader):
                 for block in blocks.feed(data):
                     self._sort(block, loop.time())
                 self._changed.set()
         finally:
             await _shut(writer)
         raise DeviceDisconnected(self._name, f"{about.host}:{about.data_port} closed the connection")
+
+    async def _more(self, reader: asyncio.StreamReader) -> bytes:
+        """Wait for bytes of the stream, not forever."""
+        silent_s = max(SILENT_S, SILENT_TIMEOUTS * self.timeout_s)
+        try:
+            async with asyncio.timeout(silent_s):
+                return await reader.read(_READ_BYTES)
+        except TimeoutError:
+            where = f"{self.about.host}:{self.about.data_port}"
+            raise DeviceTimeout(self._name, f"nothing from {where} for {silent_s:g} s, connecting anew") from None
 
     def _sort(self, block: Block, time_s: float) -> None:
         """Keep a block, unless its counter says that it brings nothing new."""
@@ -237,6 +253,7 @@ class CapancdtLink:
             # A counter that runs backwards is a controller that was restarted: how many are lost is not
             # known.
             self.lost_frames += gap if gap < 0x80000000 else 0
+        self._heard = True
         self._next_counter = (block.counter + block.frames) & 0xFFFFFFFF
         for channel, kept in self._kept.items():
             if values := block.of(channel):

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from drivers import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, Quality
+from drivers.lines import capancdt_link
 
 
 def block(counter: int, *frames: tuple[int, int]) -> bytes:
@@ -248,6 +249,20 @@ async def test_controller_gone_and_back(rig: Any, controller: Controller) -> Non
     async with asyncio.timeout(1.0):
         while not isinstance((await asyncio.gather(made.read(), return_exceptions=True))[0], dict):
             await asyncio.sleep(0.01)
+
+
+async def test_silent_stream_is_connected_anew(
+    rig: Any, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cable pulled out leaves a connection that looks sound for hours."""
+    monkeypatch.setattr(capancdt_link, "SILENT_S", 0.05)
+    monkeypatch.setattr(capancdt_link, "SILENT_TIMEOUTS", 0.1)
+    made = await started(rig, controller)
+    controller.connected.clear()
+    with pytest.raises(DeviceTimeout):
+        await made.read()
+    async with asyncio.timeout(1.0):
+        await controller.connected.wait()
 
 
 async def test_old_measurements_are_left_out(rig: Any, controller: Controller) -> None:
