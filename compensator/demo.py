@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 import zenoh
+from rich.console import Console
+from rich.progress import Progress
 
 from compensator.clock import NS, VirtualClock
 from compensator.config import Zenoh
@@ -140,7 +143,15 @@ def run_day(folder: Path, *, machine: str, hours: float, seed: int) -> Day:
         outcomes: list[Outcome] = []
         received: list[Offset] = []
         clock = VirtualClock(START_NS, advance)
-        asyncio.run(_serve(config, clock, round(hours * 60), outcomes, received, port))
+        samples = round(hours * 60)
+        with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
+            bar = progress.add_task(f"simulated machine {machine}", total=samples)
+
+            def took(outcome: Outcome) -> None:
+                outcomes.append(outcome)
+                progress.advance(bar)
+
+            asyncio.run(_serve(config, clock, samples, took, received, port))
     return Day(outcomes=outcomes, received=received, truth=world.history(), seconds=time.perf_counter() - began)
 
 
@@ -148,7 +159,7 @@ async def _serve(
     config: Path,
     clock: VirtualClock,
     samples: int,
-    outcomes: list[Outcome],
+    took: Callable[[Outcome], None],
     received: list[Offset],
     port: int,
 ) -> None:
@@ -173,7 +184,7 @@ async def _serve(
             clock=clock,
             samples=samples,
             on_ready=lambda _: ready.set(),
-            on_sample=outcomes.append,
+            on_sample=took,
         )
         await task
     finally:

@@ -147,6 +147,17 @@ class Compensation:
         """Hold the offset because the service met an error of its own."""
         self._memory.internal_error = True
 
+    def held(self, machine: str, seq: int, time_utc_ns: int) -> Offset:
+        """Return the message that the last offset stands, for a sample that could not be worked on."""
+        stands = self._limiter.offset_um if self._memory.estimate else NAN
+        return Offset(
+            schema=SCHEMA, machine=machine, seq=seq, time_utc_ns=time_utc_ns,
+            valid_for_s=VALID_SAMPLES * self.model.period_s, y_offset_um=stands,
+            y_offset_rate_um_per_min=0.0 if self._memory.estimate else NAN, y_offset_std_um=NAN,
+            state="hold" if self._memory.estimate else "fault", reasons=["internal_error"],
+            model_sha256=self.model.sha256,
+        )  # fmt: skip
+
     # ------------------------------------------------------------------ one sample
 
     def process(self, raw: Sample) -> Outcome:

@@ -6,6 +6,7 @@ The order within a sample is fixed: everything is on disk before the offset goes
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -23,6 +24,8 @@ from compensator.service.publisher import COMMANDS
 from compensator.service.sampling import ChannelCollector
 from drivers.errors import DriverError
 from drivers.reading import Device, Reading
+
+log = logging.getLogger("compensator")
 
 #: Part of the poll interval that a sample waits for devices at most.
 WAIT_PART = 0.5
@@ -117,15 +120,39 @@ class Daemon:
                 await self._clock.sleep(grid.seconds_to_next_poll())
                 if self._stop:
                     break
-                await self._poll(period_s / polls)
-                if grid.polled():
-                    outcome = self._sample(grid.label_ns)
+                label_ns, last = grid.label_ns, grid.polled()
+                outcome = await self._turn(period_s / polls, label_ns if last else None)
+                if last:
                     self._tell_clock_step(grid.next_sample())
                     done += 1
-                    if on_sample is not None:
-                        on_sample(outcome)
+                if outcome is not None and on_sample is not None:
+                    on_sample(outcome)
         finally:
             await self._close()
+
+    async def _turn(self, interval_s: float, label_ns: int | None) -> Outcome | None:
+        """Poll, and make the sample where one ends here; whatever goes wrong, the offset is held and it is said.
+
+        This is the supervisor, the one place that catches everything: a defect in any room must not leave the
+        machine without a word, and must never move the offset.
+        """
+        try:
+            await self._poll(interval_s)
+            return self._sample(label_ns) if label_ns is not None else None
+        except Exception as error:
+            log.exception("internal error")
+            self._note("error", f"internal error: {type(error).__name__}: {error}")
+            self._compensation.fail()
+            if label_ns is not None:
+                self._hold(label_ns)
+            return None
+
+    def _hold(self, label_ns: int) -> None:
+        """Publish that the last offset stands, without the sample that could not be worked on."""
+        offset = encode(self._compensation.held(self._config.machine.name, self._sequence, label_ns))
+        self._record([("offset", offset)], label_ns)
+        self._publish("offset", offset)
+        self._sequence += 1
 
     def stop(self) -> None:
         """End the run after the poll under way; the recording is finished."""
