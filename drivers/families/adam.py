@@ -16,16 +16,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from drivers.families.base import (
-    MODBUS,
-    MODBUS_TCP,
-    Check,
-    Family,
-    ModbusDevice,
-    ModbusSettings,
-    analogue_inputs,
-    thermocouples,
-)
+from drivers.families.base import MODBUS, MODBUS_TCP, Check, Family, ModbusDevice, ModbusSettings
+from drivers.families.inputs import analogue_inputs, thermocouples
 from drivers.lines.modbus_line import ModbusLine
 from drivers.protocols.analogue import RANGE_CODES, Probe, advantech_volts, reading_of
 from drivers.protocols.couples import ADVANTECH, couple_of_code

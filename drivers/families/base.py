@@ -1,4 +1,4 @@
-"""What the families share: the settings of a module, its inputs, and the poll of a Modbus module."""
+"""What the families share: the settings of a module, and the poll of a Modbus module."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from drivers.errors import DeviceRefused
 from drivers.lines.capancdt_link import CapancdtLink
 from drivers.lines.dcon_line import DconLine
 from drivers.lines.modbus_line import Member, ModbusLine, ModbusRefused
-from drivers.protocols.analogue import AnalogueInput, Probe, probe_settings
-from drivers.protocols.couples import Span
 from drivers.protocols.modbus import READ_COILS, Request, fence_for
 from drivers.reading import Device, Reading
-from drivers.settings import Name, Where, one_of, settings
+from drivers.settings import Name, Where
 
 LOG = logging.getLogger(__name__)
 
@@ -58,21 +56,6 @@ class ModbusSettings(DeviceSettings, frozen=True, kw_only=True, forbid_unknown_f
 
     address: Annotated[int, msgspec.Meta(ge=1, le=247)]
     verify: bool = True
-
-
-class ThermocoupleInput(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One thermocouple input.
-
-    Parameters
-    ----------
-    input : int
-        Number on the module, from 0.
-    couple : str, optional
-        Type letter; the module's `couple` where it is missing.
-    """
-
-    input: Annotated[int, msgspec.Meta(ge=0)]
-    couple: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,79 +203,3 @@ class ModbusDevice:
                     f"{check.what} in {kind} {check.request.address + place} is {check.words(found)}, "
                     f"the configuration expects {check.words(expected)}",
                 )
-
-
-def thermocouples(
-    about: DeviceSettings,
-    table: Mapping[str, Span],
-    count: int,
-    where: Where,
-    couple: str | None = None,
-) -> dict[int, str]:
-    """Convert the thermocouple inputs of a module.
-
-    Parameters
-    ----------
-    about : DeviceSettings
-        The module's settings.
-    table : Mapping
-        The maker's ranges by couple letter.
-    count : int
-        Inputs of the module.
-    couple : str, optional
-        Couple of inputs that name none.
-
-    Returns
-    -------
-    dict
-        Couple letter by input.
-
-    Raises
-    ------
-    DriverConfigError
-        An input or a couple the module does not have, or an input twice.
-    """
-    couples: dict[int, str] = {}
-    if couple is not None and couple not in table:
-        raise where.wrong("couple", couple, one_of(table))
-    for place, spot in input_tables(about, where):
-        given = settings(place, ThermocoupleInput, spot)
-        check_input(given.input, couples, count, about.model, spot)
-        letter = given.couple if given.couple is not None else couple
-        if letter is None:
-            raise spot.error(f"key 'couple' is missing, expected {one_of(table)}")
-        if letter not in table:
-            raise spot.wrong("couple", letter, one_of(table))
-        couples[given.input] = letter
-    return couples
-
-
-def analogue_inputs(about: DeviceSettings, count: int, where: Where) -> dict[int, Probe | None]:
-    """Convert the voltage inputs of a module; None stands for a plain voltage.
-
-    Raises
-    ------
-    DriverConfigError
-        An input the module does not have, an input twice, or a wrong probe.
-    """
-    probes: dict[int, Probe | None] = {}
-    for place, spot in input_tables(about, where):
-        given = settings(place, AnalogueInput, spot)
-        check_input(given.input, probes, count, about.model, spot)
-        probes[given.input] = probe_settings(given.probe, spot.inside("probe"))
-    return probes
-
-
-def check_input(number: int, taken: Mapping[int, object], count: int, model: str, where: Where) -> None:
-    """Raise where a module has no such input, or it stands twice."""
-    if number >= count:
-        raise where.wrong("input", number, f"0..{count - 1} on {model}")
-    if number in taken:
-        raise where.error(f"input {number} stands twice")
-
-
-def input_tables(about: DeviceSettings, where: Where) -> list[tuple[dict[str, object], Where]]:
-    """List the input tables with their places; there must be one at least."""
-    if not about.inputs:
-        raise where.wrong("inputs", about.inputs, "at least one input")
-    return [(table, where.inside(f"inputs[{index}]")) for index, table in enumerate(about.inputs)]

@@ -15,7 +15,8 @@ from typing import Annotated
 
 import msgspec
 
-from drivers.families.base import DeviceSettings, Family, check_input, input_tables
+from drivers.families.base import DeviceSettings, Family
+from drivers.families.inputs import check_input, input_tables
 from drivers.lines.capancdt_link import CapancdtLink, Sums
 from drivers.protocols.capancdt import MOST_CHANNELS, Channel, micrometres
 from drivers.reading import Quality, Reading

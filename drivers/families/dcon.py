@@ -18,7 +18,8 @@ from typing import Annotated, Literal
 import msgspec
 
 from drivers.errors import DeviceGarbled, DeviceRefused
-from drivers.families.base import DeviceSettings, Family, thermocouples
+from drivers.families.base import DeviceSettings, Family
+from drivers.families.inputs import thermocouples
 from drivers.lines.dcon_line import DconLine
 from drivers.protocols.couples import ADVANTECH, ICPDAS, STANDARD, Span, couple_of_code
 from drivers.protocols.dcon import BadTextError, split_values, thermocouple

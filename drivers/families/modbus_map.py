@@ -13,14 +13,8 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from drivers.families.base import (
-    MODBUS,
-    Family,
-    ModbusDevice,
-    ModbusSettings,
-    check_input,
-    input_tables,
-)
+from drivers.families.base import MODBUS, Family, ModbusDevice, ModbusSettings
+from drivers.families.inputs import check_input, input_tables
 from drivers.lines.modbus_line import ModbusLine
 from drivers.protocols.modbus import MOST_REGISTERS, Request
 from drivers.protocols.registers import NumberType, WordOrder, decode, words_of

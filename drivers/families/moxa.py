@@ -13,7 +13,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from drivers.families.base import MODBUS_TCP, Family, ModbusDevice, ModbusSettings, thermocouples
+from drivers.families.base import MODBUS_TCP, Family, ModbusDevice, ModbusSettings
+from drivers.families.inputs import thermocouples
 from drivers.lines.modbus_line import ModbusLine
 from drivers.protocols.couples import STANDARD
 from drivers.protocols.modbus import READ_INPUT, Request
