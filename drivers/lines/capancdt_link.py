@@ -82,6 +82,8 @@ class CapancdtLink:
         self._next_counter: int | None = None
         self._standing = 0
         self._heard = False
+        self._blocks = Blocks()
+        self._skipped = 0
         self._changed = asyncio.Event()
         self._failure: DriverError | None = None
         self._task: asyncio.Task[None] | None = None
@@ -138,6 +140,7 @@ class CapancdtLink:
         for kept in self._kept.values():
             kept.clear()
         self._standing = 0
+        self._skipped = self._blocks.skipped
 
     def _why_nothing(self, wait_s: float) -> DriverError:
         """Say why there is nothing new. A new error each time, as a raised one grows a traceback."""
@@ -147,6 +150,9 @@ class CapancdtLink:
             text = f"{self._standing} blocks with the counter standing still at {self._next_counter}"
             self._standing = 0
             return DeviceGarbled(self._name, text)
+        if (skipped := self._blocks.skipped - self._skipped) > 0:
+            self._skipped = self._blocks.skipped
+            return DeviceGarbled(self._name, f"{skipped} bytes that belong to no block")
         missing = [channel for channel in self._channels if not self._kept[channel]]
         if self._infos and len(missing) < len(self._channels):
             numbers = ", ".join(str(channel + 1) for channel in missing)
@@ -221,11 +227,11 @@ class CapancdtLink:
         about = self.about
         async with asyncio.timeout(self.timeout_s):
             reader, writer = await asyncio.open_connection(about.host, about.data_port)
-        self._failure, self._next_counter, blocks = None, None, Blocks()
+        self._failure, self._next_counter, self._blocks, self._skipped = None, None, Blocks(), 0
         loop = asyncio.get_running_loop()
         try:
             while data := await self._more(reader):
-                for block in blocks.feed(data):
+                for block in self._blocks.feed(data):
                     self._sort(block, loop.time())
                 self._changed.set()
         finally:

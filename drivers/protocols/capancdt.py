@@ -27,6 +27,8 @@ MOST_CHANNELS = 32
 # A block never holds this many frames; a length beyond it is taken for a preamble found in measurements.
 MOST_FRAMES = 4096
 _HEADER = struct.Struct("<4siiQIHHI")
+# Order number, serial number and channels: the same in every block of a controller.
+_SENDER = slice(4, 20)
 _ODD_BITS = 0xAAAAAAAAAAAAAAAA
 
 
@@ -97,25 +99,35 @@ class Blocks:
                 self._skip(len(PREAMBLE))
                 continue
             size = _HEADER.size + frames * width
-            if len(self._rest) < size:
-                # Another block begins where this one should still last: it was torn, begin there.
-                if (torn := self._next_header()) > 0:
-                    self._skip(torn)
-                    continue
+            # Another block begins where this one should still last: it was torn, go on there.
+            inner, certain = self._inner_header(size)
+            if inner and certain:
+                self._skip(inner)
+                continue
+            if inner or len(self._rest) < size:
                 return blocks
             values = struct.unpack_from(f"<{frames * len(channels)}i", self._rest, _HEADER.size)
             blocks.append(Block(counter=counter, channels=channels, values=values))
             del self._rest[:size]
 
-    def _next_header(self) -> int:
-        """Find a sound header after the first one; 0 when there is none."""
-        start = self._rest.find(PREAMBLE, len(PREAMBLE))
-        while start > 0 and len(self._rest) - start >= _HEADER.size:
-            first, second = bytes(self._rest[4:24]), bytes(self._rest[start + 4 : start + 24])
-            if first == second:  # same controller, same channels
-                return start
-            start = self._rest.find(PREAMBLE, start + 1)
-        return 0
+    def _inner_header(self, size: int) -> tuple[int, bool]:
+        """Find a header like the first one before the block's end.
+
+        Returns
+        -------
+        int
+            Where it begins; 0 when there is none.
+        bool
+            False while so little of it has come that it might be measurements.
+        """
+        sender = bytes(self._rest[_SENDER])
+        start = self._rest.find(PREAMBLE, len(PREAMBLE), size)
+        while start > 0:
+            other = bytes(self._rest[start + _SENDER.start : start + _SENDER.stop])
+            if other == sender[: len(other)]:
+                return start, len(other) == len(sender)
+            start = self._rest.find(PREAMBLE, start + 1, size)
+        return 0, False
 
     def _skip(self, count: int) -> None:
         self.skipped += count

@@ -174,6 +174,15 @@ async def test_split_joined_and_torn_blocks(rig: Any, controller: Controller) ->
     assert (await made.read())[0].count == 1
 
 
+async def test_garbage_instead_of_blocks(rig: Any, controller: Controller) -> None:
+    made = await started(rig, controller)
+    controller.send(bytes(range(200)))
+    with pytest.raises(DeviceGarbled, match="197 bytes that belong to no block"):
+        await made.read()
+    controller.send(block(1, (10, 10)))
+    assert (await made.read())[0].count == 1
+
+
 async def test_no_new_frame_is_bounded_and_named(rig: Any, controller: Controller) -> None:
     made = await started(rig, controller)
     began = time.monotonic()

@@ -264,6 +264,17 @@ def test_capancdt_torn_block_costs_only_itself() -> None:
     assert blocks.skipped == 90
 
 
+@pytest.mark.parametrize("cut", range(33, 112))
+@pytest.mark.parametrize("piece", [5, 1000])
+def test_capancdt_torn_blocks_of_any_length_give_no_wrong_value(cut: int, piece: int) -> None:
+    whole = block(1, [[1, 2]] * 10)
+    stream = whole[:cut] + block(11, [[3, 4]] * 10) + block(21, [[5, 6]])
+    blocks = Blocks()
+    found = [b for place in range(0, len(stream), piece) for b in blocks.feed(stream[place : place + piece])]
+    assert [b.counter for b in found] == ([1, 11, 21] if cut == len(whole) else [11, 21])
+    assert {v for b in found for v in b.values} <= {1, 2, 3, 4, 5, 6}
+
+
 @given(st.binary(max_size=200))
 @settings(max_examples=100, deadline=None)
 def test_capancdt_random_bytes(data: bytes) -> None:

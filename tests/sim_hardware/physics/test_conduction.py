@@ -119,9 +119,7 @@ def test_figures_of_a_90_w_step():
 
 
 def test_responses_come_near_the_published_ones():
-    fits = [
-        fit_pct(p, s) for p, s in zip(step_responses(1440), responses(QuillMachine().design), strict=True)
-    ]
+    fits = [fit_pct(p, s) for p, s in zip(step_responses(1440), responses(QuillMachine().design), strict=True)]
     assert fits[0] > 93.0
     assert fits[1] > 90.0
     assert fits[2] > 95.0

@@ -58,9 +58,7 @@ def test_icp_resolves_what_sixteen_bits_resolve(value):
 
 @pytest.mark.parametrize("data_format", ["hex", "engineering"])
 def test_icp_open_and_under(data_format, value):
-    module = IcpDas(
-        "m-7019r", couples="K", sources={0: value(20.0), 1: value(-271.0)}, data_format=data_format
-    )
+    module = IcpDas("m-7019r", couples="K", sources={0: value(20.0), 1: value(-271.0)}, data_format=data_format)
     module.faults.set("open", input=0)
     assert (word(module, 0), word(module, 1), word(module, 2)) == (0x7FFF, 0x8000, 0x7FFF)
     # Bits 0, 1 and the unwired rest; function 02 as well as 01.
@@ -70,9 +68,7 @@ def test_icp_open_and_under(data_format, value):
 
 
 def test_plain_7018_does_not_notice_a_broken_couple():
-    module = IcpDas(
-        "m-7018", couples="K", sources={0: lambda: 90.0}, data_format="engineering", cjc_degc=26.0
-    )
+    module = IcpDas("m-7018", couples="K", sources={0: lambda: 90.0}, data_format="engineering", cjc_degc=26.0)
     module.faults.set("open", input=0)
     assert word(module) == 260
 
