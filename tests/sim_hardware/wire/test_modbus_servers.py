@@ -121,6 +121,8 @@ def test_tcp_disconnect_and_return(tcp, wire, wires):
         assert wire.once() == b""
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((tcp.host, port))
+    with socket.socket() as thief, pytest.raises(OSError, match="in use"):
+        thief.bind((tcp.host, port))
     tcp.module(1).faults.clear("disconnect")
     assert tcp.port == port
     assert wires(tcp.host, port).ask(request(2), 11) == reply(2)
