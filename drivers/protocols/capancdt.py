@@ -121,12 +121,17 @@ class Blocks:
             False while so little of it has come that it might be measurements.
         """
         sender = bytes(self._rest[_SENDER])
-        start = self._rest.find(PREAMBLE, len(PREAMBLE), size)
+        reach = size + len(PREAMBLE) - 1
+        start = self._rest.find(PREAMBLE, len(PREAMBLE), reach)
         while start > 0:
             other = bytes(self._rest[start + _SENDER.start : start + _SENDER.stop])
             if other == sender[: len(other)]:
                 return start, len(other) == len(sender)
-            start = self._rest.find(PREAMBLE, start + 1, size)
+            start = self._rest.find(PREAMBLE, start + 1, reach)
+        for start in range(size - 1, size - len(PREAMBLE), -1):
+            begun = bytes(self._rest[start:reach])
+            if begun and len(begun) < len(PREAMBLE) and PREAMBLE.startswith(begun):
+                return start, False
         return 0, False
 
     def _skip(self, count: int) -> None:
