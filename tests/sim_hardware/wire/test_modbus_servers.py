@@ -121,11 +121,16 @@ def test_tcp_disconnect_and_return(tcp, wire, wires):
         assert wire.once() == b""
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((tcp.host, port))
-    with socket.socket() as thief, pytest.raises(OSError, match="in use"):
-        thief.bind((tcp.host, port))
     tcp.module(1).faults.clear("disconnect")
     assert tcp.port == port
     assert wires(tcp.host, port).ask(request(2), 11) == reply(2)
+
+
+def test_a_refusing_port_stays_reserved(tcp):
+    # No connection has been made, so that none in TIME_WAIT keeps the number busy.
+    tcp.faults.set("disconnect")
+    with socket.socket() as thief, pytest.raises(OSError, match="in use"):
+        thief.bind((tcp.host, tcp.port))
 
 
 def test_the_other_module_is_not_touched(rack, wires):
