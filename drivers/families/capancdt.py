@@ -17,8 +17,9 @@ import msgspec
 
 from drivers.families.base import DeviceSettings, Family
 from drivers.families.inputs import check_input, input_tables
-from drivers.lines.capancdt_link import CapancdtLink, Sums
+from drivers.lines.capancdt_link import CapancdtLink
 from drivers.protocols.capancdt import MOST_CHANNELS, Channel, micrometres
+from drivers.protocols.capancdt_sums import Sums
 from drivers.reading import Quality, Reading
 from drivers.settings import Where, settings
 

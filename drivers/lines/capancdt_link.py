@@ -11,11 +11,11 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, DriverError
 from drivers.lines.settings import CapancdtLine
-from drivers.protocols.capancdt import FULL_SCALE, BadReplyError, Block, Blocks, Channel, channel_info
+from drivers.protocols.capancdt import BadReplyError, Block, Blocks, Channel, channel_info
+from drivers.protocols.capancdt_sums import Sums, sums
 
 # Between tries to connect, s: soon at first, as after a cable came loose.
 RETRY_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
@@ -24,42 +24,6 @@ SILENT_TIMEOUTS = 10.0
 SILENT_S = 2.0
 _MOST_BLOCKS = 2048
 _READ_BYTES = 65536
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sums:
-    """What is kept of one channel in one block.
-
-    Parameters
-    ----------
-    time_s : float
-        When the block came, on the loop's clock.
-    count, total, minimum, maximum : int
-        Of the values as sent.
-    under, over : int
-        How many of them are at or beyond an end of the converter.
-    """
-
-    time_s: float
-    count: int
-    total: int
-    minimum: int
-    maximum: int
-    under: int
-    over: int
-
-
-def sums(values: Sequence[int], time_s: float) -> Sums:
-    """Sum a channel's values."""
-    return Sums(
-        time_s=time_s,
-        count=len(values),
-        total=sum(values),
-        minimum=min(values),
-        maximum=max(values),
-        under=sum(value <= 0 for value in values),
-        over=sum(value >= FULL_SCALE for value in values),
-    )
 
 
 class CapancdtLink:
