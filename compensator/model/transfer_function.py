@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import signal
 
 from compensator.errors import ModelError
 
@@ -145,7 +144,9 @@ class SampledTransferFunction:
         >>> SampledTransferFunction(b=(0.5,), a=(1.0, -0.5), period_s=60.0).response([1, 1, 1])
         array([0.5  , 0.75 , 0.875])
         """
-        return np.asarray(signal.lfilter(self.b, self.a, np.asarray(u, dtype=float)), dtype=np.float64)
+        from scipy.signal import lfilter  # here, because the service never needs it and it costs 40 MB
+
+        return np.asarray(lfilter(self.b, self.a, np.asarray(u, dtype=float)), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
