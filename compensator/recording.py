@@ -14,6 +14,8 @@ from mcap.reader import NonSeekingReader
 from compensator.errors import DataError
 from compensator.messages import MESSAGES, Offset, Sample
 
+_EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
+
 #: What the reader raises on a torn or damaged file.
 TORN = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, MemoryError)
 
@@ -91,6 +93,28 @@ def decode(record: Recorded, path: Path) -> msgspec.Struct:
 def recordings(folder: Path, machine: str) -> list[Path]:
     """Return a machine's recordings in the order in which they were started."""
     return sorted(folder.glob(f"{machine}_????????T??????Z*.mcap"))
+
+
+def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:
+    """Return a sequence number that the machine has never published.
+
+    Numbers go on after the last one on disk. A recording may have been removed, or a disk may not have taken the
+    last ones, so the number is also at least that of the periods since 2020: a service cannot have published
+    more samples than there were periods.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Folder of the recordings.
+    machine : str
+        Name of the machine.
+    utc_ns : int
+        Now, ns since 1970 UTC.
+    period_s : float
+        Length of a sample, s.
+    """
+    periods = int((utc_ns - _EPOCH_2020_NS) / 1e9 // period_s)
+    return max(last_sequence(folder, machine) + 1, periods, 0)
 
 
 def last_sequence(folder: Path, machine: str) -> int:

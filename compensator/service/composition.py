@@ -12,7 +12,7 @@ from compensator.config import LoadedConfig, load_config
 from compensator.errors import ConfigError, ModelError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.model.thermal_model import ThermalModel
-from compensator.recording import last_sequence
+from compensator.recording import first_sequence
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.publisher import Publisher
@@ -108,10 +108,11 @@ async def run_service(
         return daemon.command(name, payload)
 
     publisher = Publisher(config.zenoh, command)
+    clock = clock or SystemClock()
     daemon = Daemon(
         config=config, compensation=Compensation(config, model), devices=fleet.devices, recorder=recorder,
-        publish=publisher.publish, clock=clock or SystemClock(),
-        first_sequence=last_sequence(folder, config.machine.name) + 1,
+        publish=publisher.publish, clock=clock,
+        first_sequence=first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s),
     )  # fmt: skip
     try:
         with publisher:

@@ -27,7 +27,11 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("day")
     result = run_day(folder, machine="published", hours=2.0, seed=3)
     assert len(result.outcomes) == 120
-    assert len(result.received) >= 110  # the subscriber joins while the run is under way
+    # The subscriber joins while the run is under way; from then on it misses nothing and gets what was decided.
+    sent = {outcome.offset.seq: outcome.offset for outcome in result.outcomes}
+    numbers = [offset.seq for offset in result.received]
+    assert numbers and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert all(sent[offset.seq] == offset for offset in result.received if offset.state == "ok")
     return folder
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import MESSAGES, Offset, number, schemas, shipped_schema
-from compensator.recording import decode, last_sequence, read_messages, recordings
+from compensator.recording import decode, first_sequence, last_sequence, read_messages, recordings
 from drivers.errors import DeviceTimeout
 from drivers.reading import Quality, Reading
 from tests.service.simulated import START_NS, Bench, config
@@ -242,6 +242,18 @@ async def test_recording_holds_every_sample_and_what_was_published(bench: Bench)
     assert last_sequence(paths[0].parent, "vmc-07") == 49
     kinds = [decode(r, paths[0]).kind for r in read_messages(paths[0], ("event",))]  # type: ignore[attr-defined]
     assert kinds[0] == "start" and kinds[-1] == "stop" and "zero" in kinds
+
+
+async def test_sequence_never_repeats_even_without_the_recordings(bench: Bench) -> None:
+    await bench.run(50)
+    folder = bench.recorder.path.parent  # type: ignore[union-attr]
+    now = bench.clock.utc_ns()
+    first = first_sequence(folder, "vmc-07", now, 60.0)
+    assert first > 49
+    for path in recordings(folder, "vmc-07"):
+        path.unlink()
+    assert first_sequence(folder, "vmc-07", now, 60.0) >= first  # nothing on disk: the clock tells
+    assert first_sequence(folder, "vmc-07", 0, 60.0) == 0  # a clock that was never set
 
 
 async def test_sample_is_on_disk_before_its_offset_is_published(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
