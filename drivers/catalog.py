@@ -87,7 +87,7 @@ def _lines(tables: Sequence[Mapping[str, object]], source: str) -> dict[str, Lin
     taken: dict[str, str] = {}
     for index, table in enumerate(tables):
         where = _where(table, index, "lines", source)
-        about = line_settings(table, where)
+        about = line_settings(_table(table, where), where)
         if about.name in lines:
             raise where.wrong("name", about.name, "another one than the lines before have")
         for end in about.ends():
@@ -101,13 +101,26 @@ def _lines(tables: Sequence[Mapping[str, object]], source: str) -> dict[str, Lin
 def _where(table: object, index: int, tables: str, source: str) -> Where:
     """Name a table by its place and, where it has one, its name."""
     name = table.get("name") if isinstance(table, Mapping) else None
-    return Where(source=source, table=f"{tables}[{index}]" + (f' "{name}"' if isinstance(name, str) else ""))
+    return Where(
+        source=source, table=f"{tables}[{index}]" + (f' "{_in_one_line(name)}"' if isinstance(name, str) else "")
+    )
 
 
-def _family(table: object, where: Where) -> Family:
-    """Find the family of a device table."""
+def _in_one_line(text: str) -> str:
+    """Escape what would tear a message apart: TOML allows line breaks in a name."""
+    return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
+
+
+def _table(table: object, where: Where) -> Mapping[str, object]:
+    """Return a table that is one."""
     if not isinstance(table, Mapping):
         raise where.error(f"is {table!r}, expected a table")
+    return table
+
+
+def _family(given: object, where: Where) -> Family:
+    """Find the family of a device table."""
+    table = _table(given, where)
     if "model" not in table:
         raise where.error(f"key 'model' is missing, expected {one_of(tuple(MODELS))}")
     model = table["model"]
@@ -119,7 +132,8 @@ def _family(table: object, where: Where) -> Family:
 def _line_of(about: DeviceSettings, family: Family, known: Mapping[str, LineSettings], where: Where) -> LineSettings:
     """Find the line of a device, with a protocol that its model speaks."""
     if about.line not in known:
-        raise where.wrong("line", about.line, f"the name of a line ({', '.join(known) or 'there is none'})")
+        names = _in_one_line(", ".join(known)) or "there is none"
+        raise where.wrong("line", about.line, f"the name of a line ({names})")
     line = known[about.line]
     if line.protocol not in family.protocols:
         expected = f"a line with protocol {' or '.join(family.protocols)} for {about.model}"
