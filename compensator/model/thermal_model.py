@@ -206,7 +206,7 @@ def check_runnable(model: ThermalModel) -> None:
         if path is not None:
             _check_path(model, name, path)
     if model.ttf is not None:
-        _check_inverse(model.name, model.ttf.sampled)
+        check_inverse(model.name, model.ttf.sampled)
 
 
 def _check_path(model: ThermalModel, name: str, path: Path) -> None:
@@ -223,7 +223,21 @@ def _check_path(model: ThermalModel, name: str, path: Path) -> None:
         raise ModelError(f"model {model.name}: path {name} is unstable: pole at z = {worst:.6g}, expected |z| < 1")
 
 
-def _check_inverse(model_name: str, ttf: SampledTransferFunction) -> None:
+def check_inverse(model_name: str, ttf: SampledTransferFunction) -> None:
+    """Refuse a TTF whose inverse is improper, unstable or rings.
+
+    Parameters
+    ----------
+    model_name : str
+        Name for the message.
+    ttf : SampledTransferFunction
+        Heat to T_Q − AT.
+
+    Raises
+    ------
+    ModelError
+        Naming the zero that is at fault.
+    """
     where = f"model {model_name}: TTF cannot be inverted: "
     if ttf.b[0] == 0.0:
         raise ModelError(where + "no direct feed-through (b0 = 0), so its inverse needs the future")

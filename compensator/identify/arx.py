@@ -1,0 +1,103 @@
+"""ARX by least squares: the linear estimate that the search starts from, and the usual tools' answer to compare with.
+
+    A(z) y = Σ_j B_j(z) u_j + e
+
+It minimises the one-step prediction error. With white noise on the output it is biased, which is why it is a
+start here and not a result.
+
+Source: Ljung, System Identification (1999), section 4.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.identify.output_error import Segment, Structure
+from compensator.model.transfer_function import SampledTransferFunction
+
+Vector = npt.NDArray[np.float64]
+
+
+def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: float) -> list[SampledTransferFunction]:
+    """Fit A and every B_j by least squares.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+        Data; rows with a missing y in reach are left out.
+    structure : Structure
+        Orders and delays; an offset is fitted beside them.
+    period_s : float
+        Sample period, s.
+
+    Returns
+    -------
+    list of SampledTransferFunction
+        One for each input, with the common denominator.
+
+    Examples
+    --------
+    >>> u = np.random.default_rng(0).normal(size=200)
+    >>> y = np.zeros(200)
+    >>> for k in range(1, 200):
+    ...     y[k] = 0.9 * y[k - 1] + 0.2 * u[k]
+    >>> fit = fit_arx([Segment.of(u, y)], Structure(order=1, terms=(1,)), period_s=60.0)[0]
+    >>> [round(c, 6) for c in (*fit.b, *fit.a)]
+    [0.2, 1.0, -0.9]
+    """
+    n = structure.order
+    rows, targets = [], []
+    for segment in segments:
+        size = segment.y.size
+        reach = max(n, *(t + d - 1 for t, d in zip(structure.terms, structure.delays, strict=True)))
+        index = np.arange(reach, size)
+        y = np.where(segment.used, segment.y, np.nan)
+        columns = [-y[index - i] for i in range(1, n + 1)]
+        for u, terms, delay in zip(segment.inputs, structure.terms, structure.delays, strict=True):
+            columns += [u[index - delay - i] for i in range(terms)]
+        columns.append(np.ones(index.size))
+        table = np.stack(columns, axis=1)
+        good = np.isfinite(table).all(axis=1) & np.isfinite(y[index])
+        rows.append(table[good])
+        targets.append(y[index][good])
+    solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(targets), rcond=None)[0]
+    a = (1.0, *solution[:n].tolist())
+    functions, at = [], n
+    for terms, delay in zip(structure.terms, structure.delays, strict=True):
+        b = (*([0.0] * delay), *solution[at : at + terms].tolist())
+        functions.append(SampledTransferFunction(b=b, a=a, period_s=period_s))
+        at += terms
+    return functions
+
+
+def starts(segments: Sequence[Segment], structure: Structure, *, period_s: float) -> list[list[float]]:
+    """Return time constants to start a search from, min: ARX's poles, and two spreads over the record's length.
+
+    Parameters
+    ----------
+    segments, structure, period_s
+        As :func:`fit_arx`.
+    """
+    n = structure.order
+    if n == 0:
+        return [[]]
+    period = period_s / 60.0
+    longest = max(segment.y.size for segment in segments) * period
+    spread = [list(np.geomspace(2.0 * period, max(longest / 3.0, 8.0 * period), n + 2)[1:-1])]
+    spread.append(list(np.geomspace(1.5 * period, max(longest / 2.0, 8.0 * period), n)) if n > 1 else [longest / 6.0])
+    a = fit_arx(segments, structure, period_s=period_s)[0].a
+    poles = np.roots(a) if np.isfinite(a).all() else np.zeros(0)
+    # Tustin's rule backwards; a pole that no relaxation has (negative, unstable) says nothing and is replaced.
+    inside = [float(p.real) for p in poles if 0.05 < p.real < 0.9995]
+    taus = sorted(period / 2.0 * (1.0 + p) / (1.0 - p) for p in inside)
+    for tau in spread[0]:
+        if len(taus) < n:
+            taus.append(tau)
+    taus = sorted(taus)
+    # Equal time constants are a saddle of the search: pull them apart.
+    for i in range(1, n):
+        taus[i] = max(taus[i], 1.3 * taus[i - 1])
+    return [taus, *spread]

@@ -1,0 +1,297 @@
+"""From measured runs to a thermal model with everything that has to be known about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.errors import DataError
+from compensator.identify.choice import Told, silent
+from compensator.identify.deformation import DeformationFit, PathFit, fit_deformation
+from compensator.identify.runs import Run, noise_std, walk_std
+from compensator.identify.screening import screen
+from compensator.identify.settings import Settings
+from compensator.identify.temperature import TemperatureFit, fit_temperature
+from compensator.model.engine import Engine
+from compensator.model.thermal_model import PATH_UNITS, Estimator, Kind, Path, ThermalModel
+from compensator.simulation import Scores, scores
+
+Vector = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+#: Least noise that a temperature is taken to have, K: less than a converter's step is no knowledge.
+LEAST_NOISE_K = 0.005
+#: Least change of the ambient in a sample that the estimator is told to expect, K: doors are opened.
+LEAST_AT_WALK_K = 0.1
+#: An unseen run is zeroed on its first hour.
+ZERO_S = 3600.0
+#: What the model is trusted with beyond the range it was made on, as a share of that range, and at least, K.
+BEYOND_SHARE, BEYOND_K = 0.33, 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A part of the data with its free-run prediction.
+
+    Parameters
+    ----------
+    name : str
+        File and part of it.
+    role : {"fitted", "held out"}
+        Whether it took part in fitting or choosing.
+    t_s, y_um, y_pred_um : numpy.ndarray, shape (n,)
+        Time, measured deformation, prediction of the engine from T_Q and AT (with its zero), s, µm, µm.
+    model, nothing, persistence : Scores
+        Of the model, of no compensation (y as a change from the run's start), and of holding the last measured
+        value before the part.
+    """
+
+    name: str
+    role: str
+    t_s: Vector
+    y_um: Vector
+    y_pred_um: Vector
+    model: Scores
+    nothing: Scores
+    persistence: Scores
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """The result of a calibration.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        Ready to be written.
+    settings : Settings
+        What was asked for.
+    runs : tuple of Run
+        Data of the fit.
+    used : tuple of numpy.ndarray of bool
+        Samples of each run that took part.
+    drives : tuple of numpy.ndarray
+        What drove the DTF in each run.
+    temperature : TemperatureFit or None
+        The TTF.
+    deformation : DeformationFit
+        DTF and TDTF.
+    parts : tuple of Part
+        Free-run errors, fitted and held out.
+    folds_rms_um : float
+        Free-run error on held-out folds, µm.
+    noise : dict of str to float
+        White noise of `t_q_degc`, `at_degc`, `y_um`, in their units.
+    remarks : tuple of str
+        What was put right in the data, and what the fit had to change.
+    """
+
+    model: ThermalModel
+    settings: Settings
+    runs: tuple[Run, ...]
+    used: tuple[Mask, ...]
+    drives: tuple[Vector, ...]
+    temperature: TemperatureFit | None
+    deformation: DeformationFit
+    parts: tuple[Part, ...]
+    folds_rms_um: float
+    noise: Mapping[str, float]
+    remarks: tuple[str, ...]
+
+    @property
+    def ttf_fit_pct(self) -> float:
+        """Fit of the TTF in free run from the known heat, %; NaN without one."""
+        if self.temperature is None:
+            return float("nan")
+        pairs = list(zip(self.temperature.segments, self.temperature.fit.residuals, strict=True))
+        y = np.concatenate([s.y[s.used] for s, _ in pairs])
+        return scores(y, y - np.concatenate([r[s.used] for s, r in pairs])).fit_pct
+
+    @property
+    def paths(self) -> tuple[PathFit, ...]:
+        """TTF (where there is one), DTF, TDTF."""
+        first = (PathFit.of("TTF", self.temperature.fit),) if self.temperature else ()
+        return (*first, self.deformation.dtf, self.deformation.tdtf)
+
+
+def calibrate(
+    runs: Sequence[Run], settings: Settings, *, period_s: float, name: str, fit_until_s: float | None = None,
+    etve: Sequence[Run] = (), validation: Sequence[Run] = (), provenance: Mapping[str, Any] | None = None,
+    remarks: Sequence[str] = (),
+    told: Told = silent,
+) -> Calibration:  # fmt: skip
+    """Make a thermal model of measured runs.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Data of the fit.
+    settings : Settings
+        Kind, method, orders.
+    period_s : float
+        Sample period, s.
+    name : str
+        Name of the model, and of the data in messages.
+    fit_until_s : float, optional
+        Only samples before this time take part; the rest is held out.
+    etve, validation : sequence of Run
+        A test without heat source (methods II and III); runs that only judge.
+    provenance : mapping, optional
+        What goes into the model file beside the figures: files and their hashes.
+    remarks : sequence of str
+        What reading the data had to put right.
+    told : callable
+        Is told how many structures of how many are done.
+
+    Returns
+    -------
+    Calibration
+        Model, fits, errors.
+
+    Raises
+    ------
+    DataError
+        If no model can come from this data, with the reason.
+    """
+    kind = _kind(runs, settings)
+    screen(name, runs, period_s, needs_heat=kind == "heat")
+    used = [_mask(run, fit_until_s) for run in runs]
+    if sum(int(mask.sum()) for mask in used) * period_s < 7200.0:
+        raise DataError(f"{name}: less than 2 h of samples left for the fit")
+    temperature = None
+    if kind == "heat":
+        temperature = fit_temperature(runs, _until(runs, fit_until_s), settings.ttf, period_s=period_s,
+                                      folds=settings.folds)  # fmt: skip
+    drives = [_drive(run, temperature, settings) for run in runs]
+    deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, told=told)
+    chosen = next(c for c in deformation.candidates if c.chosen)
+    noise = {
+        "t_q_degc": max(LEAST_NOISE_K, *(noise_std(run.t_q_degc) for run in runs)),
+        "at_degc": max(LEAST_NOISE_K, *(noise_std(run.at_degc) for run in runs)),
+        "y_um": max(noise_std(run.y_um) for run in runs),
+    }
+    model = ThermalModel(
+        name=name, kind=kind, period_s=period_s,
+        ttf=_path("TTF", kind, PathFit.of("TTF", temperature.fit)) if temperature else None,
+        dtf=_path("DTF", kind, deformation.dtf), tdtf=_path("TDTF", kind, deformation.tdtf),
+        estimator=_estimator(runs, drives, noise, kind), validity=_validity(runs, used, kind),
+        y_std_um=float(np.sqrt(max(chosen.rms**2 - noise["y_um"] ** 2, (0.3 * noise["y_um"]) ** 2))),
+        provenance=dict(provenance or {}),
+    )  # fmt: skip
+    fixed = (temperature.remark,) if temperature and temperature.remark else ()
+    return Calibration(
+        model=model, settings=settings, runs=tuple(runs), used=tuple(used), drives=tuple(drives),
+        temperature=temperature, deformation=deformation,
+        parts=tuple(_parts(model, deformation, runs, used, validation)), folds_rms_um=chosen.rms, noise=noise,
+        remarks=(*remarks, *fixed, *deformation.remarks),
+    )  # fmt: skip
+
+
+def _kind(runs: Sequence[Run], settings: Settings) -> Kind:
+    if settings.kind != "auto":
+        return settings.kind
+    return "heat" if any(run.heat_w is not None for run in runs) else "direct"
+
+
+def _until(runs: Sequence[Run], fit_until_s: float | None) -> list[Mask]:
+    return [run.t_s < (np.inf if fit_until_s is None else fit_until_s) for run in runs]
+
+
+def _mask(run: Run, fit_until_s: float | None) -> Mask:
+    return np.asarray(_until([run], fit_until_s)[0] & np.isfinite(run.y_um))
+
+
+def _drive(run: Run, temperature: TemperatureFit | None, settings: Settings) -> Vector:
+    if temperature is None:
+        return run.difference_k
+    if settings.drive == "known" and run.heat_w is not None:
+        return run.heat_w
+    return temperature.heat(run.difference_k)
+
+
+def _path(name: str, kind: Kind, path: PathFit) -> Path:
+    covariance = None
+    if path.fit is not None:
+        covariance = tuple(tuple(row) for row in path.fit.coefficient_covariance(path.column).tolist())
+    return Path(sampled=path.function, unit=PATH_UNITS[kind][name], covariance=covariance)
+
+
+def _estimator(runs: Sequence[Run], drives: Sequence[Vector], noise: Mapping[str, float], kind: Kind) -> Estimator:
+    """Set the filter from the data: sensor noise, and how much heat and ambient change in a sample."""
+    sensor = float(np.hypot(noise["t_q_degc"], noise["at_degc"]))
+    known = [run.heat_w for run in runs if run.heat_w is not None]
+    if kind == "direct":
+        walk = max(walk_std([run.difference_k for run in runs], sensor), sensor)
+    elif known:
+        walk = walk_std(known, 0.0)
+    else:
+        walk = walk_std(drives, max(noise_std(drive) for drive in drives))
+    return Estimator(
+        method="kalman", t_q_noise_std_k=noise["t_q_degc"], at_noise_std_k=noise["at_degc"], drive_walk_std=walk,
+        at_walk_std_k=max(walk_std([run.ambient_k for run in runs], noise["at_degc"]), LEAST_AT_WALK_K),
+    )  # fmt: skip
+
+
+def _validity(runs: Sequence[Run], used: Sequence[Mask], kind: Kind) -> dict[str, tuple[float, float]]:
+    """Return the ranges seen in the fit and a third more: what the model is trusted with."""
+
+    def widened(values: Vector, least: float) -> tuple[float, float]:
+        low, high = float(values.min()), float(values.max())
+        beyond = max(BEYOND_SHARE * (high - low), least)
+        return round(low - beyond, 3), round(high + beyond, 3)
+
+    ranges = {
+        "t_q_degc": widened(np.concatenate([r.t_q_degc[m] for r, m in zip(runs, used, strict=True)]), BEYOND_K),
+        "at_degc": widened(np.concatenate([r.at_degc[m] for r, m in zip(runs, used, strict=True)]), BEYOND_K),
+    }
+    heats = [r.heat_w[m] for r, m in zip(runs, used, strict=True) if r.heat_w is not None]
+    if kind == "heat" and heats:
+        ranges["heat_w"] = widened(np.concatenate(heats), 0.0)
+    return ranges
+
+
+# ---------------------------------------------------------------------------- free run
+
+
+def _parts(
+    model: ThermalModel, deformation: DeformationFit, runs: Sequence[Run], used: Sequence[Mask],
+    validation: Sequence[Run],
+) -> list[Part]:  # fmt: skip
+    parts = []
+    for i, (run, mask) in enumerate(zip(runs, used, strict=True)):
+        predicted = predict(model, run) + deformation.main.free_decay(i, run.t_s.size)
+        predicted += float(np.mean((run.y_um - predicted)[mask]))
+        parts.append(_part(run, predicted, mask, "fitted"))
+        rest = np.isfinite(run.y_um) & ~mask
+        if rest.any():
+            parts.append(_part(run, predicted, rest, "held out"))
+    for run in validation:
+        predicted = predict(model, run)
+        first = np.isfinite(run.y_um) & (run.t_s < run.t_s[0] + ZERO_S)
+        predicted += float(np.mean((run.y_um - predicted)[first]))
+        parts.append(_part(run, predicted, np.isfinite(run.y_um), "held out"))
+    return parts
+
+
+def predict(model: ThermalModel, run: Run) -> Vector:
+    """Return the deformation that the service's engine predicts from T_Q and AT of a run, µm, shape (n,)."""
+    engine = Engine(model)
+    engine.set_reference(*run.reference)
+    return np.array([e.y_um for e in engine.run(run.t_q_degc, run.at_degc, run.channels)])
+
+
+def _part(run: Run, predicted: Vector, mask: Mask, role: str) -> Part:
+    known = np.flatnonzero(np.isfinite(run.y_um))
+    y = run.y_um[mask]
+    before = known[known < np.argmax(mask)]
+    start = float(np.mean(run.y_um[known[:5]]))
+    held = float(run.y_um[before[-1]]) if before.size else start
+    return Part(
+        name=run.name, role=role, t_s=run.t_s[mask], y_um=y, y_pred_um=predicted[mask],
+        model=scores(y, predicted[mask]), nothing=scores(y, np.full(y.size, start)),
+        persistence=scores(y, np.full(y.size, held)),
+    )  # fmt: skip

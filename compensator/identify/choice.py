@@ -1,0 +1,152 @@
+"""How many modes the data can support: free-run error on folds that took no part in the fit.
+
+A fold is a block of time whose measured deformation is hidden while the model is fitted to the others; the
+model runs through it all the same, because its inputs are known. The simplest structure whose held-out error
+is not worse than the best one's by more than its standard error wins, and one whose amplitudes
+the data does not determine does not take part.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.errors import DataError
+from compensator.identify.arx import starts
+from compensator.identify.output_error import OutputErrorFit, Segment, Structure, fit_output_error
+
+
+#: Is told how many steps of how many are done.
+Told = Callable[[int, int], None]
+
+
+def silent(done: int, total: int) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """A structure and how it did.
+
+    Parameters
+    ----------
+    structure : Structure
+        What was tried.
+    rms : float
+        Root mean square of the free-run error on the held-out folds.
+    fold_rms : tuple of float
+        The same for each fold.
+    supported : bool
+        Whether the data determines all of its amplitudes.
+    chosen : bool
+        Whether it won.
+    """
+
+    structure: Structure
+    rms: float
+    fold_rms: tuple[float, ...]
+    supported: bool
+    chosen: bool = False
+
+
+def fit(
+    segments: Sequence[Segment], structure: Structure, period_s: float, warm: Sequence[float] | None = None
+) -> OutputErrorFit:
+    """Fit from ARX's poles and two spreads of time constants, or from a fit that is near."""
+    begin = [list(warm)] if warm is not None else starts(segments, structure, period_s=period_s)
+    return fit_output_error(segments, structure, period_s=period_s, starts=begin)
+
+
+def folds_of(segments: Sequence[Segment], count: int) -> Iterator[list[Segment]]:
+    """Yield the segments with one block after another hidden from the fit."""
+    sizes = [segment.y.size for segment in segments]
+    edges = np.linspace(0, sum(sizes), count + 1).astype(int)
+    begin = np.cumsum([0, *sizes[:-1]])
+    for low, high in pairwise(edges.tolist()):
+        hidden = []
+        for start, segment in zip(begin, segments, strict=True):
+            at = start + np.arange(segment.y.size)
+            hidden.append(dataclasses.replace(segment, used=segment.used & ~((at >= low) & (at < high))))
+        yield hidden
+
+
+def held_out_errors(
+    segments: Sequence[Segment], structure: Structure, period_s: float, folds: int
+) -> list[npt.NDArray[np.float64]]:
+    """Return the free-run errors on each fold, of the fit to the others."""
+    whole = fit(segments, structure, period_s)
+    errors = []
+    for part in folds_of(segments, folds):
+        if sum(int(segment.used.sum()) for segment in part) == 0:
+            continue
+        residuals = fit(part, structure, period_s, warm=whole.taus_min.tolist()).residuals
+        hidden = [s.used & ~p.used for s, p in zip(segments, part, strict=True)]
+        errors.append(np.concatenate([r[h] for r, h in zip(residuals, hidden, strict=True)]))
+    return [e for e in errors if e.size]
+
+
+def choose(
+    segments: Sequence[Segment], structures: Sequence[Structure], *, period_s: float, folds: int, told: Told = silent
+) -> list[Candidate]:
+    """Try structures on folds and mark the one to take.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+        Data.
+    structures : sequence of Structure
+        Candidates.
+    period_s : float
+        Sample period, s.
+    folds : int
+        Number of blocks.
+    told : callable
+        Is told how many structures of how many are done.
+
+    Returns
+    -------
+    list of Candidate
+        In the order given, one of them chosen.
+
+    Raises
+    ------
+    DataError
+        If the data is too short for every candidate.
+    """
+    tried: list[Candidate] = []
+    for done, structure in enumerate(structures):
+        told(done, len(structures))
+        try:
+            tried.append(_tried(segments, structure, period_s, folds))
+        except DataError:
+            continue
+    if not tried:
+        raise DataError(f"too little data for the smallest structure tried ({structures[0]})")
+    among = [c for c in tried if c.supported] or tried
+    best = min(among, key=lambda c: c.rms)
+    simplest = min(
+        (c for c in among if no_worse(c.fold_rms, best.fold_rms)), key=lambda c: (c.structure.parameters, c.rms)
+    )
+    return [dataclasses.replace(c, chosen=c is simplest) for c in tried]
+
+
+def _tried(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> Candidate:
+    whole = fit(segments, structure, period_s)
+    errors = held_out_errors(segments, structure, period_s, folds)
+    return Candidate(
+        structure=structure, rms=float(np.sqrt(np.mean(np.concatenate(errors) ** 2))),
+        fold_rms=tuple(float(np.sqrt(np.mean(e**2))) for e in errors), supported=whole.rank_deficit == 0,
+    )  # fmt: skip
+
+
+def no_worse(fold_rms: Sequence[float], best: Sequence[float]) -> bool:
+    """Tell whether the folds' mean squares exceed the best one's by no more than one standard error of the excess."""
+    worse = np.array(fold_rms) ** 2 - np.array(best) ** 2
+    if worse.size < 2:
+        return bool(worse.mean() <= 0.0)
+    return bool(worse.mean() <= worse.std(ddof=1) / np.sqrt(worse.size))

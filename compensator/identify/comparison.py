@@ -1,0 +1,115 @@
+"""Two models side by side, coefficient by coefficient: what was identified beside what was printed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.errors import ModelError
+from compensator.model.thermal_model import Path, ThermalModel
+from compensator.model.transfer_function import SampledTransferFunction, TransferFunction, continuous_image
+
+Vector = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One figure of a path in both models.
+
+    Parameters
+    ----------
+    path : str
+        TTF, DTF or TDTF.
+    figure : str
+        Which coefficient, gain or time constant, with its unit.
+    found, std, reference : float
+        As identified, its standard error (NaN where the model file has no covariance), and in the other model.
+    """
+
+    path: str
+    figure: str
+    found: float
+    std: float
+    reference: float
+
+    @property
+    def deviations(self) -> float:
+        """How many standard errors the two are apart."""
+        return (self.found - self.reference) / self.std if self.std > 0 else float("nan")
+
+
+def compare(found: ThermalModel, reference: ThermalModel) -> list[Row]:
+    """Put the paths of two models side by side, as functions of s with a highest denominator coefficient of 1.
+
+    Parameters
+    ----------
+    found, reference : ThermalModel
+        What was identified, and what it is held against.
+
+    Returns
+    -------
+    list of Row
+        Gain at rest and time constants of each path that both have; coefficients where the orders are the same.
+    """
+    rows: list[Row] = []
+    for name in ("TTF", "DTF", "TDTF"):
+        first: Path | None = getattr(found, name.lower())
+        second: Path | None = getattr(reference, name.lower())
+        if first is not None and second is not None and first.unit == second.unit:
+            rows += _rows(name, first, second)
+    return rows
+
+
+def _rows(name: str, found: Path, reference: Path) -> Iterator[Row]:
+    mine, other = _figures(found.in_s()), _figures(reference.in_s())
+    stds = _standard_errors(found, list(mine))
+    unit = found.unit.replace("um", "µm")
+    for key, value in mine.items():
+        if key in other:
+            yield Row(path=name, figure=key.replace("UNIT", unit), found=value, std=stds[key], reference=other[key])
+
+
+def _figures(function: TransferFunction) -> dict[str, float]:
+    figures = {"gain at rest, UNIT": function.dc_gain}
+    for i, tau in enumerate(function.time_constants_min(), start=1):
+        figures[f"time constant {i} of {function.order}, min"] = tau
+    lead = function.denominator[-1]
+    for part, values in (("numerator", function.numerator), ("denominator", function.denominator)):
+        for power, value in enumerate(values):
+            if part == "numerator" or power < function.order:
+                figures[f"{part} s^{power} of {function.order}"] = value / lead
+    return figures
+
+
+def _standard_errors(path: Path, keys: list[str]) -> dict[str, float]:
+    """Carry the covariance of b and a over to the figures, by central differences."""
+    if path.covariance is None:
+        return dict.fromkeys(keys, float("nan"))
+    covariance = np.array(path.covariance)
+    sampled = path.sampled
+    values = np.array([*sampled.b, *sampled.a[1:]])
+    steps = 1e-4 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    gradient = np.zeros((len(keys), values.size))
+    for i, step in enumerate(steps):
+        if step == 0.0:
+            continue
+        above, below = (_moved(path, values, i, side * step) for side in (1.0, -1.0))
+        gradient[:, i] = [(above.get(k, np.nan) - below.get(k, np.nan)) / (2.0 * step) for k in keys]
+    variance = np.einsum("ij,jk,ik->i", gradient, covariance, gradient)
+    return dict(zip(keys, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True))
+
+
+def _moved(path: Path, values: Vector, index: int, step: float) -> dict[str, float]:
+    moved = values.copy()
+    moved[index] += step
+    count = len(path.sampled.b)
+    sampled = SampledTransferFunction(
+        b=tuple(moved[:count].tolist()), a=(1.0, *moved[count:].tolist()), period_s=path.sampled.period_s
+    )
+    try:
+        return _figures(continuous_image(sampled, unit=path.unit))
+    except ModelError:
+        return {}

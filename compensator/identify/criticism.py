@@ -1,0 +1,377 @@
+"""The critical view of a calibration: what its functions do, and what the residual still knows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import freqz
+from scipy.special import gammaincc
+
+from compensator.identify.calibration import Calibration
+from compensator.identify.deformation import PathFit
+from compensator.identify.runs import Run, noise_std
+
+Vector = npt.NDArray[np.float64]
+
+#: Lags of the correlations, samples.
+LAGS = 60
+#: Two-sided 99 % of a normal.
+NORMAL_99 = 2.576
+#: Points of a frequency response.
+FREQUENCIES = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathView:
+    """What a path does.
+
+    Parameters
+    ----------
+    name, unit : str
+        Which path; unit of its gain.
+    t_min : numpy.ndarray, shape (n,)
+        Time axis, min.
+    step, step_std : numpy.ndarray, shape (n,)
+        Response to a unit step and its standard error, in the gain's unit.
+    impulse : numpy.ndarray, shape (n,)
+        Response to a unit pulse of one sample.
+    frequency_per_h : numpy.ndarray, shape (f,)
+        Frequencies, 1/h.
+    magnitude, phase_deg : numpy.ndarray, shape (f,)
+        Frequency response.
+    poles, zeros : numpy.ndarray of complex
+        In the z plane.
+    gain, gain_std : float
+        At rest.
+    taus_min, taus_std_min : tuple of float
+        Time constants of its denominator.
+    """
+
+    name: str
+    unit: str
+    t_min: Vector
+    step: Vector
+    step_std: Vector
+    impulse: Vector
+    frequency_per_h: Vector
+    magnitude: Vector
+    phase_deg: Vector
+    poles: npt.NDArray[np.complex128]
+    zeros: npt.NDArray[np.complex128]
+    gain: float
+    gain_std: float
+    taus_min: tuple[float, ...]
+    taus_std_min: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResidualView:
+    """What a residual still knows.
+
+    Parameters
+    ----------
+    name : str
+        Of which fit.
+    autocorrelation : numpy.ndarray, shape (LAGS,)
+        Lags 1 … LAGS.
+    limit : float
+        99 % limit of white noise.
+    white_chance : float
+        Chance of so much autocorrelation in white noise (Ljung and Box).
+    cross : dict of str to (numpy.ndarray, float)
+        Correlation with each input at lags −LAGS … LAGS and its 99 % limit, both colours counted in.
+    """
+
+    name: str
+    autocorrelation: Vector
+    limit: float
+    white_chance: float
+    cross: dict[str, tuple[Vector, float]]
+
+
+def view_path(path: PathFit, unit: str, period_s: float) -> PathView:
+    """Look at one path.
+
+    Parameters
+    ----------
+    path : PathFit
+        Which.
+    unit : str
+        Unit of its gain.
+    period_s : float
+        Sample period, s.
+    """
+    function = path.function
+    poles = function.poles()
+    slowest = _slowest_min(poles, period_s)
+    n = int(np.clip(5.0 * slowest / (period_s / 60.0), 60, 6000))
+    t_min: Vector = np.arange(n, dtype=np.float64) * period_s / 60.0
+    step, std = np.asarray(function.response(np.ones(n))), np.zeros(n)
+    if path.fit is not None:
+        units = np.zeros((len(path.fit.structure.terms), n))
+        units[path.column] = 1.0
+        step, std = path.fit.simulate_with_std(units)
+    pulse = np.zeros(n)
+    pulse[0] = 1.0
+    frequency = np.geomspace(1.0 / (20.0 * slowest / 60.0), 0.5 * 3600.0 / period_s, FREQUENCIES)
+    response = freqz(function.b, function.a, worN=2.0 * np.pi * frequency * period_s / 3600.0)[1]
+    gain, gain_std = path.fit.gain(path.column) if path.fit else (function.dc_gain, 0.0)
+    taus = tuple(path.fit.taus_min.tolist()) if path.fit else (slowest,)
+    return PathView(
+        name=path.name, unit=unit, t_min=t_min, step=step, step_std=std, impulse=np.asarray(function.response(pulse)),
+        frequency_per_h=frequency, magnitude=np.abs(response), phase_deg=np.degrees(np.unwrap(np.angle(response))),
+        poles=poles, zeros=function.zeros(), gain=gain, gain_std=gain_std, taus_min=taus,
+        taus_std_min=tuple(path.fit.taus_std_min.tolist()) if path.fit else (0.0,) * len(taus),
+    )  # fmt: skip
+
+
+def _slowest_min(poles: npt.NDArray[np.complex128], period_s: float) -> float:
+    if poles.size == 0:
+        return period_s / 60.0
+    return float(-period_s / 60.0 / np.log(min(float(np.max(np.abs(poles))), 1.0 - 1e-9)))
+
+
+def view_residual(name: str, residuals: Sequence[Vector], inputs: dict[str, Sequence[Vector]]) -> ResidualView:
+    """Look at a residual.
+
+    Parameters
+    ----------
+    name : str
+        Of which fit.
+    residuals : sequence of numpy.ndarray
+        One for each run; NaN where there is none.
+    inputs : dict of str to sequence of numpy.ndarray
+        Inputs on the same samples.
+    """
+    filled = [np.where(np.isfinite(r), r - np.nanmean(r), 0.0) for r in residuals]
+    count = sum(int(np.isfinite(r).sum()) for r in residuals)
+    own = _correlation(filled, filled)[LAGS:]
+    statistic = count * (count + 2) * float(np.sum(own[1:] ** 2 / (count - np.arange(1, LAGS + 1))))
+    cross = {}
+    for input_name, values in inputs.items():
+        moved = [v - np.mean(v) for v in values]
+        input_own = _correlation(moved, moved)[LAGS:]
+        spread = np.sqrt(max(1.0 + 2.0 * float(np.sum(own[1:] * input_own[1:])), 1.0))
+        cross[input_name] = (_correlation(filled, moved), float(NORMAL_99 * spread / np.sqrt(count)))
+    return ResidualView(
+        name=name, autocorrelation=own[1:], limit=float(NORMAL_99 / np.sqrt(count)),
+        white_chance=float(gammaincc(LAGS / 2.0, statistic / 2.0)), cross=cross,
+    )  # fmt: skip
+
+
+def _correlation(first: Sequence[Vector], second: Sequence[Vector]) -> Vector:
+    """Return Σ first[k] second[k − lag] for lag −LAGS … LAGS over the norms."""
+    total = np.zeros(2 * LAGS + 1)
+    for a, b in zip(first, second, strict=True):
+        size = 1 << int(np.ceil(np.log2(a.size + LAGS + 1)))
+        both = np.fft.irfft(np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size)), size)
+        total += np.concatenate((both[-LAGS:], both[: LAGS + 1]))
+    norm = np.sqrt(sum(float(a @ a) for a in first) * sum(float(b @ b) for b in second))
+    return total / norm if norm > 0 else total
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Criticism:
+    """The critical view of a calibration.
+
+    Parameters
+    ----------
+    paths : tuple of PathView
+        TTF (where there is one), DTF, TDTF.
+    residuals : tuple of ResidualView
+        Of the TTF's and the DTF's fit.
+    warnings : tuple of str
+        In words, the gravest first.
+    """
+
+    paths: tuple[PathView, ...]
+    residuals: tuple[ResidualView, ...]
+    warnings: tuple[str, ...]
+
+
+def criticise(calibration: Calibration) -> Criticism:
+    """Look at a calibration as the one who has to sign it would.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What came out.
+    """
+    model = calibration.model
+    units = {"TTF": "K/W", "DTF": model.dtf.unit, "TDTF": "um/K"}
+    paths = tuple(view_path(path, units[path.name], model.period_s) for path in calibration.paths)
+    drive = "heat" if model.kind == "heat" else "T_Q − AT"
+    residuals = [
+        view_residual(
+            "deformation", calibration.deformation.main.residuals,
+            {drive: calibration.drives, "AT": [run.ambient_k for run in calibration.runs]},
+        )
+    ]  # fmt: skip
+    if calibration.temperature is not None:
+        known = [run.heat_w for run in calibration.runs if run.heat_w is not None]
+        residuals.insert(0, view_residual("T_Q − AT", calibration.temperature.fit.residuals, {"heat": known}))
+    warnings = _Warnings(calibration, paths, residuals)
+    return Criticism(paths=paths, residuals=tuple(residuals), warnings=warnings.all())
+
+
+class _Warnings:
+    """Every warning is one method that returns a sentence or nothing."""
+
+    def __init__(self, calibration: Calibration, paths: Sequence[PathView], residuals: Sequence[ResidualView]) -> None:
+        self.calibration, self.residuals = calibration, residuals
+        self.paths = {path.name: path for path in paths}
+        self.hours = [float(np.sum(mask)) * calibration.model.period_s / 3600.0 for mask in calibration.used]
+
+    def all(self) -> tuple[str, ...]:
+        found = [
+            self.worse_than_nothing(), self.quiet_ambient(), self.short_record(), self.ramp(), self.common_cause(),
+            *self.undetermined_gain(), *self.odd_zero(), *self.wrong_way(), *self.twin_modes(), self.inverse_noise(),
+            self.coloured(), self.narrow_range(),
+        ]  # fmt: skip
+        return tuple(words for words in found if words)
+
+    def worse_than_nothing(self) -> str:
+        for part in self.calibration.parts:
+            if part.role == "held out" and part.model.rms_um > part.nothing.rms_um:
+                return (
+                    f"On {part.name} (held out) the model is worse than none: {part.model.rms_um:.1f} "
+                    f"against {part.nothing.rms_um:.1f} µm rms. Do not use it there."
+                )
+        return ""
+
+    def quiet_ambient(self) -> str:
+        swing = max(float(np.ptp(run.ambient_k[mask])) for run, mask in self._pairs())
+        path = self.paths["TDTF"]
+        if path.gain_std == 0.0:
+            return ""
+        gain = f"the TDTF's gain is {path.gain:.2f} ± {path.gain_std:.2f} µm/K"
+        if swing < 2.0:
+            return (
+                f"The ambient moved by {swing:.1f} K only; {gain} and should not be trusted beyond that. "
+                "Add a record with a larger ambient change (an ETVE over a day)."
+            )
+        if path.gain_std > 0.3 * abs(path.gain):
+            return f"The ambient's part is hardly determined, although it moved by {swing:.1f} K: {gain}."
+        return ""
+
+    def short_record(self) -> str:
+        slowest = max(path.taus_min[-1] for path in self.paths.values())
+        longest = max(self.hours)
+        if longest * 60.0 < 3.0 * slowest:
+            return (
+                f"The longest record has {longest:.1f} h, the slowest time constant is {slowest / 60.0:.1f} h: what it "
+                "settles to is extrapolated. Record at least three times the slowest time constant."
+            )
+        return ""
+
+    def ramp(self) -> str:
+        main = self.calibration.deformation.main
+        if main.taus_min[-1] < 0.95 * main.longest_min:
+            return ""
+        return (
+            f"The slowest mode is slower than the record ({main.longest_min / 60.0:.0f} h) and was held at its length: "
+            "something drifts there that the inputs do not explain, and free run beyond that is extrapolation."
+        )
+
+    def common_cause(self) -> str:
+        drives = np.concatenate([d[m] for d, m in zip(self.calibration.drives, self.calibration.used, strict=True)])
+        ambient = np.concatenate([run.ambient_k[mask] for run, mask in self._pairs()])
+        if np.ptp(ambient) == 0.0 or np.ptp(drives) == 0.0:
+            return ""
+        together = abs(float(np.corrcoef(drives, ambient)[0, 1]))
+        if together < 0.8:
+            return ""
+        return (
+            f"Drive and ambient moved together (correlation {together:.2f}): how the deformation divides between DTF "
+            "and TDTF is ambiguous. Heat at another time of the day."
+        )
+
+    def undetermined_gain(self) -> list[str]:
+        return [
+            f"The gain of the {name} at rest is {path.gain:.3g} ± {path.gain_std:.2g} {_shown(path.unit)}: "
+            "hardly determined."
+            for name, path in self.paths.items()
+            if name != "TDTF" and path.gain_std > 0.3 * abs(path.gain)
+        ]
+
+    def odd_zero(self) -> list[str]:
+        words = []
+        for name, path in self.paths.items():
+            outside = [z for z in path.zeros if abs(z) > 1.0]
+            if outside:
+                worst = max(outside, key=abs)
+                words.append(
+                    f"The {name} has a zero outside the unit circle (z = {worst.real:.3g}): its response starts the "
+                    "wrong way. Nothing inverts it, so nothing becomes unstable."
+                )
+        return words
+
+    def wrong_way(self) -> list[str]:
+        words = []
+        for name, path in self.paths.items():
+            if path.gain * path.step[np.argmax(np.abs(path.step))] < 0:
+                words.append(
+                    f"The {name}'s step response turns round: it peaks at {_peak(path):.3g} and settles at "
+                    f"{path.gain:.3g} {_shown(path.unit)}. Ask whether the machine does that."
+                )
+        return words
+
+    def twin_modes(self) -> list[str]:
+        words = []
+        for name, path in self.paths.items():
+            twins = [t for t, u in zip(path.taus_min, path.taus_min[1:], strict=False) if u < 1.05 * t]
+            if twins and name != "TDTF":
+                words.append(f"Two time constants of the {name} coincide at {twins[0]:.3g} min: their standard errors "
+                             "say nothing, and one mode less may do.")  # fmt: skip
+        return words
+
+    def inverse_noise(self) -> str:
+        temperature = self.calibration.temperature
+        if temperature is None:
+            return ""
+        noise = self.calibration.noise
+        watts = temperature.noise_gain_w_per_k * float(np.hypot(noise["t_q_degc"], noise["at_degc"]))
+        known = [run.heat_w for run in self.calibration.runs if run.heat_w is not None]
+        span = max(float(np.ptp(heat)) for heat in known)
+        if watts < 0.2 * span:
+            return ""
+        return (
+            f"The thermocouples' noise becomes {watts:.0f} W of noise in the heat, of {span:.0f} W in all. "
+            "Average more readings, or place T_Q closer to the source."
+        )
+
+    def coloured(self) -> str:
+        main = self.calibration.deformation.main
+        noise = noise_std(np.concatenate([run.y_um for run in self.calibration.runs]))
+        still = self.residuals[-1]
+        known = {name: float(np.max(np.abs(values))) / limit for name, (values, limit) in still.cross.items()}
+        largest = max(known, key=lambda name: known[name])
+        if still.white_chance > 0.01 and known[largest] < 1.0:
+            return ""
+        tail = f" and is correlated with {largest}" if known[largest] > 1.0 else ""
+        return (
+            f"The residual ({main.sigma:.2f} µm rms, sensor noise {noise:.2f}) is not white{tail}: the model lacks "
+            "something. Standard errors count that in; compensator diagnose looks for what it is."
+        )
+
+    def narrow_range(self) -> str:
+        low, high = self.calibration.model.validity["at_degc"]
+        t_low, t_high = self.calibration.model.validity["t_q_degc"]
+        return (
+            f"Valid for AT from {low:.0f} to {high:.0f} °C and T_Q from {t_low:.0f} to {t_high:.0f} °C (what was seen, "
+            "and a third more); outside, the service says degraded."
+        )
+
+    def _pairs(self) -> list[tuple[Run, npt.NDArray[np.bool_]]]:
+        return list(zip(self.calibration.runs, self.calibration.used, strict=True))
+
+
+def _peak(path: PathView) -> float:
+    return float(path.step[np.argmax(np.abs(path.step))])
+
+
+def _shown(unit: str) -> str:
+    return unit.replace("um", "µm")

@@ -1,0 +1,204 @@
+"""DTF and TDTF: the paper's four ways, each with its order chosen on held-out folds.
+
+I to III take the ambient's share off the deformation first (the paper's equation 1),
+
+    δ_Q = δ_y − TDTF · ΔAT,
+
+with a TDTF that is given (I) or fitted to a test without any heat source (ETVE, ISO 230-3: the whole of it, II,
+or its end, III), and fit the DTF to what is left. IV fits both at once, with a common denominator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.errors import DataError
+from compensator.identify.choice import Candidate, Told, choose, fit, silent
+from compensator.identify.output_error import OutputErrorFit, Segment, Structure
+from compensator.identify.rest import settle_starts
+from compensator.identify.runs import Run
+from compensator.identify.settings import Settings
+from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
+
+Vector = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+#: Modes of an ETVE that are tried; the paper's own had five.
+ETVE_ORDERS = (1, 2, 3, 4, 5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathFit:
+    """A path with the fit that it comes from.
+
+    Parameters
+    ----------
+    name : {"TTF", "DTF", "TDTF"}
+        Which path.
+    fit : OutputErrorFit or None
+        None where the path was given.
+    column : int
+        Which input of the fit it is.
+    function : SampledTransferFunction
+        What the engine evaluates.
+    """
+
+    name: str
+    fit: OutputErrorFit | None
+    column: int
+    function: SampledTransferFunction
+
+    @classmethod
+    def of(cls, name: str, result: OutputErrorFit, column: int = 0) -> PathFit:
+        """Take one input of a fit."""
+        return cls(name=name, fit=result, column=column, function=result.function(column))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeformationFit:
+    """What leads to the deformation.
+
+    Parameters
+    ----------
+    dtf, tdtf : PathFit
+        The two paths.
+    segments : tuple of Segment
+        What the DTF was fitted to, one for each run.
+    candidates : tuple of Candidate
+        Structures tried for the DTF (and TDTF, in method IV).
+    etve_candidates : tuple of Candidate
+        Structures tried for the TDTF on the ETVE.
+    remarks : tuple of str
+        What the engineer should know of how it came about.
+    """
+
+    dtf: PathFit
+    tdtf: PathFit
+    segments: tuple[Segment, ...]
+    candidates: tuple[Candidate, ...]
+    etve_candidates: tuple[Candidate, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def main(self) -> OutputErrorFit:
+        """The fit that has the DTF in it."""
+        assert self.dtf.fit is not None
+        return self.dtf.fit
+
+
+def fit_deformation(
+    runs: Sequence[Run], used: Sequence[Mask], drives: Sequence[Vector], settings: Settings, *, period_s: float,
+    etve: Sequence[Run] = (),
+    told: Told = silent,
+) -> DeformationFit:  # fmt: skip
+    """Fit DTF and TDTF by one of the four methods.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Data.
+    used : sequence of array of bool
+        Samples of each run that take part.
+    drives : sequence of numpy.ndarray
+        What drives the DTF in each run: heat, W, or T_Q − AT, K.
+    settings : Settings
+        Method, orders, folds.
+    period_s : float
+        Sample period, s.
+    etve : sequence of Run
+        Runs without a heat source, for methods II and III.
+    told : callable
+        Is told how many structures of how many are done.
+
+    Raises
+    ------
+    DataError
+        If the method needs an ETVE and there is none, or an order cannot be fitted.
+    """
+    if settings.method == "IV":
+        return _together(runs, used, drives, settings, period_s, told)
+    etve_candidates: tuple[Candidate, ...] = ()
+    if settings.method == "I":
+        assert settings.given_tdtf is not None
+        tdtf = _given(settings.given_tdtf, period_s)
+    else:
+        tdtf, etve_candidates = _from_etve(etve, settings, period_s, told)
+    rest = [
+        Segment.of(drive, run.y_um - tdtf.function.response(run.ambient_k), mask)
+        for run, mask, drive in zip(runs, used, drives, strict=True)
+    ]
+    if settings.order is not None:
+        structures = [Structure(order=settings.order[0], terms=(settings.order[1],))]
+    else:
+        structures = [Structure(order=n, terms=(m,)) for n in range(1, settings.max_order + 1) for m in _terms(n)]
+    segments, candidates, result = _chosen(rest, structures, settings, period_s, told)
+    return DeformationFit(
+        dtf=PathFit.of("DTF", result), tdtf=tdtf, segments=tuple(segments), candidates=tuple(candidates),
+        etve_candidates=etve_candidates,
+    )  # fmt: skip
+
+
+def _together(
+    runs: Sequence[Run], used: Sequence[Mask], drives: Sequence[Vector], settings: Settings, period_s: float, told: Told
+) -> DeformationFit:
+    data = [
+        Segment.of([drive, run.ambient_k], run.y_um, mask)
+        for run, mask, drive in zip(runs, used, drives, strict=True)
+    ]  # fmt: skip
+    if settings.order is not None:
+        n, nb_dtf, nb_tdtf = settings.order
+        structures = [Structure(order=n, terms=(nb_dtf, nb_tdtf))]
+    else:
+        structures = [
+            Structure(order=n, terms=(m, k))
+            for n in range(1, settings.max_order + 1)
+            for m in _terms(n)
+            for k in range(1, n + 1)
+        ]
+    segments, candidates, result = _chosen(data, structures, settings, period_s, told)
+    return DeformationFit(
+        dtf=PathFit.of("DTF", result, 0), tdtf=PathFit.of("TDTF", result, 1), segments=tuple(segments),
+        candidates=tuple(candidates),
+    )  # fmt: skip
+
+
+def _terms(order: int) -> tuple[int, ...]:
+    """Return numbers of numerator terms worth trying: direct feed-through and every mode's own share."""
+    return (order,)
+
+
+def _chosen(
+    data: Sequence[Segment], structures: Sequence[Structure], settings: Settings, period_s: float, told: Told
+) -> tuple[list[Segment], list[Candidate], OutputErrorFit]:
+    """Settle how the runs start, choose a structure on the folds and fit it to everything."""
+    largest = structures[-1] if len(structures) == 1 else structures[len(structures) // 2]
+    segments = settle_starts(data, largest, period_s, settings.folds)
+    candidates = choose(segments, structures, period_s=period_s, folds=settings.folds, told=told)
+    winner = next(c for c in candidates if c.chosen).structure
+    return segments, candidates, fit(segments, winner, period_s)
+
+
+def _given(tdtf: tuple[float, float], period_s: float) -> PathFit:
+    gain, tau = tdtf
+    function = TransferFunction(numerator=(gain,), denominator=(1.0, tau), unit="um/K").sampled(period_s)
+    return PathFit(name="TDTF", fit=None, column=0, function=function)
+
+
+def _from_etve(etve: Sequence[Run], settings: Settings, period_s: float, told: Told) -> tuple[PathFit, tuple[Candidate, ...]]:
+    if not etve:
+        raise DataError(f"method {settings.method} needs an ETVE (a run without any heat source): name it with --etve")
+    data = []
+    for run in etve:
+        used = np.isfinite(run.y_um)
+        if settings.method == "III":
+            used &= run.t_s >= run.t_s[-1] - settings.etve_end_h * 3600.0
+        data.append(Segment.of(run.ambient_k, run.y_um, used))
+    orders = ETVE_ORDERS if settings.order is None else (settings.order[0],)
+    terms = None if settings.order is None else settings.order[2]
+    structures = [Structure(order=n, terms=(terms or m,)) for n in orders for m in ((n, 1) if n > 1 else (1,))]
+    _, candidates, result = _chosen(data, structures, settings, period_s, told)
+    return PathFit.of("TDTF", result), tuple(candidates)

@@ -1,0 +1,182 @@
+"""Measured runs as the fits want them: changes from the start, no gaps, no wild single readings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.tables import SHORT_GAP_SAMPLES, Record
+
+Vector = npt.NDArray[np.float64]
+
+#: A single reading further from the median of its neighbours than this many noise deviations is wild.
+WILD_DEVIATIONS = 12.0
+#: Longest stretch at the start of a run that is averaged for its reference, samples.
+REST_SAMPLES = 30
+#: Shortest stretch between two long gaps that is worth fitting, samples.
+SHORTEST_RUN = 30
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """A stretch of data without a long gap.
+
+    Parameters
+    ----------
+    name : str
+        File, and the part of it where a long gap split it.
+    t_s : numpy.ndarray, shape (n,)
+        Time, s.
+    difference_k, ambient_k : numpy.ndarray, shape (n,)
+        T_Q − AT and AT as changes from the reference, K.
+    y_um : numpy.ndarray, shape (n,)
+        Measured deformation, µm; NaN where missing.
+    heat_w : numpy.ndarray or None, shape (n,)
+        Known heat, W.
+    reference : tuple of float
+        T_Q and AT that the changes count from, °C.
+    channels : dict of str to numpy.ndarray, shape (n,)
+        Every other column, gaps bridged.
+    """
+
+    name: str
+    t_s: Vector
+    difference_k: Vector
+    ambient_k: Vector
+    y_um: Vector
+    heat_w: Vector | None
+    reference: tuple[float, float]
+    channels: dict[str, Vector]
+
+    @property
+    def t_q_degc(self) -> Vector:
+        """T_Q, °C."""
+        return np.asarray(self.difference_k + self.at_degc + self.reference[0] - self.reference[1])
+
+    @property
+    def at_degc(self) -> Vector:
+        """AT, °C."""
+        return np.asarray(self.ambient_k + self.reference[1])
+
+
+def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[str, ...]]]:
+    """Yield the runs of a record with remarks on what was put right.
+
+    Parameters
+    ----------
+    name : str
+        Name for messages.
+    record : Record
+        Needs `t_q_degc`, `at_degc`, `y_um`; `heat_w` where it is known.
+    """
+    columns, remarks = {}, []
+    for column, values in record.columns.items():
+        cleaned, wild = without_wild(values) if column != "heat_w" else (values, 0)
+        if wild and column in ("t_q_degc", "at_degc", "y_um"):
+            remarks.append(f"{name}: {column}: {wild} wild single reading(s) left out")
+        columns[column] = cleaned
+    inputs = ["t_q_degc", "at_degc", *(["heat_w"] if "heat_w" in columns else [])]
+    missing = np.any([np.isnan(columns[c]) for c in inputs], axis=0)
+    parts = list(_stretches(missing))
+    for i, (first, last) in enumerate(parts, start=1):
+        part = {c: v[first:last] for c, v in columns.items()}
+        bridged = {c: v if c == "y_um" else _bridged(v) for c, v in part.items()}
+        label = name if len(parts) == 1 else f"{name} part {i}"
+        yield _run(label, record.t_s[first:last], bridged), tuple(remarks if i == 1 else ())
+
+
+def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:
+    t_q, at, heat = columns["t_q_degc"], columns["at_degc"], columns.get("heat_w")
+    difference = t_q - at
+    rest = _rest_length(difference, heat)
+    reference = float(np.mean(t_q[:rest])), float(np.mean(at[:rest]))
+    return Run(
+        name=name, t_s=t_s, difference_k=difference - (reference[0] - reference[1]), ambient_k=at - reference[1],
+        y_um=columns["y_um"] if "y_um" in columns else np.full(t_s.size, np.nan), heat_w=heat, reference=reference,
+        channels={c: v for c, v in columns.items() if c not in ("t_q_degc", "at_degc", "y_um", "heat_w")},
+    )  # fmt: skip
+
+
+def _rest_length(difference: Vector, heat: Vector | None) -> int:
+    """Return how many samples at the start show nothing but noise: their mean is a better zero than one sample."""
+    head = difference[:REST_SAMPLES]
+    moved = np.abs(head - np.median(head[:5])) > 5.0 * noise_std(difference) + 0.01
+    if heat is not None:
+        moved |= np.abs(heat[: head.size] - heat[0]) > 1e-9
+    return max(1, int(np.argmax(moved)) if moved.any() else head.size)
+
+
+def _stretches(missing: npt.NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Yield the stretches between long gaps; ends that are missing are cut off."""
+    present = np.flatnonzero(~missing)
+    if present.size == 0:
+        return
+    breaks = np.flatnonzero(np.diff(present) > SHORT_GAP_SAMPLES + 1)
+    for group in np.split(present, breaks + 1):
+        if group.size >= SHORTEST_RUN:
+            yield int(group[0]), int(group[-1]) + 1
+
+
+def _bridged(values: Vector) -> Vector:
+    known = np.flatnonzero(~np.isnan(values))
+    if known.size in (0, values.size):
+        return values
+    return np.interp(np.arange(values.size), known, values[known])
+
+
+def without_wild(values: Vector) -> tuple[Vector, int]:
+    """Replace single readings far outside their neighbours by NaN.
+
+    A real jump stays: only a sample that stands apart from both sides of it is wild.
+
+    Examples
+    --------
+    >>> without_wild(np.array([1.0, 1.1, 1.0, 9.0, 1.1, 1.0, 1.1]))[1]
+    1
+    """
+    known = np.flatnonzero(~np.isnan(values))
+    v = values[known]
+    if v.size < 7:
+        return values, 0
+    limit = WILD_DEVIATIONS * noise_std(v) + 1e-9
+    before, after = v[1:-1] - v[:-2], v[1:-1] - v[2:]
+    across = np.abs(v[2:] - v[:-2])
+    apart = (np.abs(before) > limit) & (np.abs(after) > limit) & (before * after > 0)
+    apart &= across < 0.3 * np.minimum(np.abs(before), np.abs(after))
+    wild = known[1:-1][apart]
+    if wild.size == 0 or wild.size > 0.02 * v.size:
+        return values, 0
+    cleaned = values.copy()
+    cleaned[wild] = np.nan
+    return cleaned, int(wild.size)
+
+
+def noise_std(values: Vector) -> float:
+    """Return the standard deviation of white noise on a slow signal, by third differences.
+
+    The median keeps steps and wild readings out of it. A signal that moves in converter steps has many
+    differences of zero; the mean over the lower nine tenths then serves instead.
+
+    Examples
+    --------
+    >>> slow = np.sin(np.arange(5000) / 500.0)
+    >>> round(noise_std(slow + np.random.default_rng(0).normal(0.0, 0.3, 5000)), 1)
+    0.3
+    """
+    v = values[~np.isnan(values)]
+    if v.size < 8:
+        return 0.0
+    size = np.sort(np.abs(np.diff(v, 3))) / np.sqrt(20.0)
+    typical = float(np.median(size)) / 0.6745
+    lower = size[: max(1, int(0.9 * size.size))]
+    # The mean square over the lower nine tenths of a normal's magnitudes is 0.6107 of its variance.
+    return max(typical, float(np.sqrt(np.mean(lower**2) / 0.6107)) if typical == 0.0 else typical)
+
+
+def walk_std(values: Sequence[Vector], noise: float) -> float:
+    """Return the standard deviation of the change in one sample, the sensor's noise taken off."""
+    changes = np.concatenate([np.diff(v) for v in values])
+    return float(np.sqrt(max(float(np.mean(changes**2)) - 2.0 * noise**2, 0.0))) if changes.size else 0.0

@@ -1,0 +1,144 @@
+"""Refuses data that no model can come from, with one line that says why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.errors import DataError
+from compensator.identify.runs import Run, noise_std
+
+Vector = npt.NDArray[np.float64]
+
+#: Shortest data that is fitted at all, min.
+SHORTEST_MIN = 120.0
+#: Share of samples of a column that may be missing.
+MISSING_SHARE = 0.5
+#: A shop's air above this is Fahrenheit, kelvin or a wrong scale, °C.
+HOTTEST_AIR_DEGC = 50.0
+#: A machine's temperature lies in here, °C.
+MACHINE_DEGC = (-30.0, 150.0)
+#: Deformations of a machine tool's spindle lie in here, peak to peak, µm.
+DEFORMATION_UM = (0.5, 3000.0)
+#: K per W at rest of anything that is a spindle; a thousandfold beyond is a wrong unit.
+HEAT_K_PER_W = (0.0005, 20.0)
+
+
+def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool, needs_y: bool = True) -> None:
+    """Refuse bad data.
+
+    Parameters
+    ----------
+    name : str
+        File or files, for the message.
+    runs : sequence of Run
+        What they hold.
+    period_s : float
+        Sample period, s.
+    needs_heat, needs_y : bool
+        Whether a model with a TTF is wanted; whether a deformation is needed.
+
+    Raises
+    ------
+    DataError
+        Too short, a dead or missing sensor, an input that never moves, units that cannot be right.
+    """
+    minutes = sum(run.t_s.size for run in runs) * period_s / 60.0
+    if minutes < SHORTEST_MIN:
+        raise DataError(
+            f"{name}: {minutes:.0f} min of complete samples, expected at least {SHORTEST_MIN:.0f} min "
+            "(and better three times the slowest time constant)"
+        )
+    for label, values in (
+        ("t_q_degc", _joined(run.t_q_degc for run in runs)),
+        ("at_degc", _joined(run.at_degc for run in runs)),
+    ):
+        _check_temperature(name, label, values)
+    _check_pair(name, _joined(run.t_q_degc for run in runs), _joined(run.at_degc for run in runs))
+    if needs_y:
+        _check_deformation(name, _joined(run.y_um for run in runs))
+    if needs_heat:
+        _check_heat(name, runs)
+
+
+def _joined(parts: object) -> Vector:
+    return np.concatenate([np.asarray(part) for part in parts])  # type: ignore[attr-defined]
+
+
+def _check_temperature(name: str, column: str, values: Vector) -> None:
+    middle = float(np.median(values))
+    if np.ptp(values) == 0.0:
+        raise DataError(f"{name}: {column} = {middle:g} in every row: a dead sensor, or a column of another meaning")
+    low, high = float(values.min()), float(values.max())
+    air = column == "at_degc"
+    if 250.0 <= low and high <= 420.0:
+        raise DataError(f"{name}: {column} runs from {low:.1f} to {high:.1f}: kelvin? expected °C")
+    if high - low > 2000.0 or abs(middle) > 1000.0:
+        raise DataError(f"{name}: {column} runs from {low:g} to {high:g}: thousandths of a degree? expected °C")
+    if air and middle > HOTTEST_AIR_DEGC:
+        raise DataError(
+            f"{name}: {column} is {middle:.1f} in the middle: °F (that would be {(middle - 32) / 1.8:.1f} °C)? "
+            "expected an ambient in °C"
+        )
+    if air and np.ptp(values) < 0.2 and abs(middle) < 0.2:
+        raise DataError(f"{name}: {column} is {middle:.4g} in the middle: thousands of degrees? expected °C")
+    if not MACHINE_DEGC[0] <= middle <= MACHINE_DEGC[1]:
+        raise DataError(f"{name}: {column} is {middle:.1f} in the middle, expected °C from {MACHINE_DEGC[0]:g} to "
+                        f"{MACHINE_DEGC[1]:g}")  # fmt: skip
+
+
+def _check_pair(name: str, t_q: Vector, at: Vector) -> None:
+    """Tell where one of the two temperatures is in another unit: they start within some kelvin of each other."""
+    coldest = float(np.quantile(t_q - at, 0.02))
+    as_celsius = float(np.quantile((t_q - 32.0) / 1.8 - at, 0.02))
+    if coldest > 25.0 and abs(as_celsius) < 10.0:
+        raise DataError(
+            f"{name}: t_q_degc never comes closer than {coldest:.0f} K to at_degc: t_q_degc in °F? expected °C"
+        )
+    if abs(float(np.median(t_q))) < 0.2 and abs(float(np.median(at))) > 2.0:
+        raise DataError(f"{name}: t_q_degc is {np.median(t_q):.4g} in the middle, at_degc {np.median(at):.4g}: "
+                        "thousands of degrees? expected °C")  # fmt: skip
+    if np.allclose(t_q, at):
+        raise DataError(f"{name}: t_q_degc and at_degc are the same in every row, expected two sensors")
+
+
+def _check_deformation(name: str, y: Vector) -> None:
+    known = y[~np.isnan(y)]
+    if known.size < (1.0 - MISSING_SHARE) * y.size:
+        raise DataError(f"{name}: y_um is missing in {y.size - known.size} of {y.size} samples, expected at least half")
+    spread = float(np.ptp(known))
+    if spread == 0.0:
+        raise DataError(f"{name}: y_um = {known[0]:g} in every row: a dead probe, or a column of another meaning")
+    low, high = DEFORMATION_UM
+    if spread < low:
+        raise DataError(
+            f"{name}: y_um moves by {spread:.3g} in all: millimetres? expected µm, at least {low:g} of them"
+        )
+    if spread > high:
+        raise DataError(f"{name}: y_um moves by {spread:.4g} in all: nanometres? expected µm, at most {high:g} of them")
+    if spread < 4.0 * noise_std(known):
+        raise DataError(f"{name}: y_um moves by {spread:.3g} µm and its noise alone is {noise_std(known):.2g} µm: "
+                        "no deformation in it to make a model from")  # fmt: skip
+
+
+def _check_heat(name: str, runs: Sequence[Run]) -> None:
+    heats = [run.heat_w for run in runs if run.heat_w is not None]
+    if not heats:
+        raise DataError(f"{name}: no column heat_w; without it only a direct model can be made (--kind direct)")
+    heat = np.concatenate(heats)
+    if np.ptp(heat) == 0.0:
+        raise DataError(f"{name}: heat_w = {heat[0]:g} in every row, expected at least one step of the heat")
+    difference = np.concatenate([run.difference_k for run in runs if run.heat_w is not None])
+    ratio = float(np.ptp(difference) / np.ptp(heat))
+    low, high = HEAT_K_PER_W
+    if ratio > high:
+        raise DataError(f"{name}: heat_w spans {np.ptp(heat):.3g} while T_Q - AT spans {np.ptp(difference):.3g} K: "
+                        "kilowatts? expected W")  # fmt: skip
+    if ratio < low:
+        raise DataError(f"{name}: heat_w spans {np.ptp(heat):.4g} while T_Q - AT spans {np.ptp(difference):.3g} K: "
+                        "milliwatts? expected W")  # fmt: skip
+    if float(np.ptp(difference)) < 6.0 * noise_std(difference):
+        raise DataError(f"{name}: T_Q - AT moves by {np.ptp(difference):.2g} K while the heat changes by "
+                        f"{np.ptp(heat):.3g} W: is t_q_degc near the heat source?")  # fmt: skip

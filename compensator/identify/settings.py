@@ -1,0 +1,66 @@
+"""What a calibration is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from compensator.errors import DataError
+
+Method = Literal["I", "II", "III", "IV"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What a calibration is asked for.
+
+    Parameters
+    ----------
+    kind : {"auto", "heat", "direct"}
+        With a TTF, or from T_Q − AT straight to the deformation; `auto` takes a TTF where the heat is known.
+    method : {"I", "II", "III", "IV"}
+        Where the TDTF comes from: given, first order (I); an ETVE (II); the end of an ETVE (III); fitted beside
+        the DTF with a common denominator (IV). I to III subtract the ambient's share before the DTF is fitted.
+    ttf : tuple of int
+        nb, nf, nk of the TTF.
+    order : tuple of int, optional
+        nf, nb of the DTF, nb of the TDTF; chosen on folds where it is not given.
+    drive : {"ttf", "known"}
+        Heat that the DTF is fitted with: from T_Q through the TTF, as the service will have it, or the known one.
+    given_tdtf : tuple of float, optional
+        Gain, µm/K, and time constant, min, of method I.
+    etve_end_h : float
+        How much of the ETVE's end method III takes, h.
+    folds : int
+        Number of blocks that take turns at being held out.
+    max_order : int
+        Largest number of modes tried.
+    """
+
+    kind: Literal["auto", "heat", "direct"] = "auto"
+    method: Method = "IV"
+    ttf: tuple[int, int, int] = (2, 2, 0)
+    order: tuple[int, int, int] | None = None
+    drive: Literal["ttf", "known"] = "ttf"
+    given_tdtf: tuple[float, float] | None = None
+    etve_end_h: float = 6.0
+    folds: int = 5
+    max_order: int = 4
+
+    def __post_init__(self) -> None:
+        nb, nf, nk = self.ttf
+        if nk != 0:
+            raise DataError(f"TTF structure nb {nb}, nf {nf}, nk {nk}: nk must be 0, or its inverse needs the future")
+        if nb < 1 or nf < 1 or nb > nf + 1:
+            raise DataError(f"TTF structure nb {nb}, nf {nf}, nk {nk}: expected nf >= 1 and nb from 1 to nf + 1")
+        if self.order is not None and (self.order[0] < 1 or min(self.order[1:]) < 1 or max(self.order) > 8):
+            raise DataError(f"order {self.order}: expected nf, nb of DTF, nb of TDTF, each from 1 to 8")
+        if (self.method == "I") != (self.given_tdtf is not None):
+            raise DataError(
+                "method I, and only that, needs a given TDTF: its gain in µm/K and its time constant in min"
+            )
+        if self.given_tdtf is not None and self.given_tdtf[1] <= 0.0:
+            raise DataError(f"given TDTF: time constant {self.given_tdtf[1]:g} min, expected a number above 0")
+        if self.folds < 2 or self.max_order < 1 or self.etve_end_h <= 0.0:
+            raise DataError(f"folds {self.folds}, max order {self.max_order}, ETVE end {self.etve_end_h:g} h: "
+                            "expected at least 2, at least 1 and above 0")  # fmt: skip

@@ -1,0 +1,125 @@
+"""A calibration in figures and in words: what the terminal, the JSON and the model file say of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from compensator.identify.calibration import Calibration
+from compensator.identify.criticism import Criticism
+
+
+def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
+    """Return everything that was found, as numbers and words.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What came out.
+    criticism : Criticism
+        The critical view of it.
+    """
+    model = calibration.model
+    result: dict[str, Any] = {
+        "kind": model.kind,
+        "method": calibration.settings.method,
+        "paths": {
+            path.name: {
+                "unit": path.unit,
+                "gain": {"value": path.gain, "std": path.gain_std},
+                "tau_min": [
+                    {"value": t, "std": s} for t, s in zip(path.taus_min, path.taus_std_min, strict=True)
+                ],
+                "structure": str(fit.fit.structure) if fit.fit else "given",
+            }
+            for path, fit in zip(criticism.paths, calibration.paths, strict=True)
+        },
+        "parts": [
+            {
+                "name": part.name, "role": part.role, "samples": int(part.y_um.size),
+                "fit_pct": part.model.fit_pct, "rms_um": part.model.rms_um,
+                "peak_to_peak_um": part.model.peak_to_peak_um,
+                "no_compensation_rms_um": part.nothing.rms_um, "persistence_rms_um": part.persistence.rms_um,
+            }
+            for part in calibration.parts
+        ],
+        "folds_rms_um": calibration.folds_rms_um,
+        "noise": dict(calibration.noise),
+        "warnings": list(criticism.warnings),
+        "remarks": list(calibration.remarks),
+    }  # fmt: skip
+    temperature = calibration.temperature
+    if temperature is not None:
+        result["ttf"] = {
+            "fit_pct": calibration.ttf_fit_pct, "held_out_rms_k": temperature.held_out_k,
+            "inverse_noise_gain_w_per_k": temperature.noise_gain_w_per_k,
+        }  # fmt: skip
+    return result
+
+
+def verdict(calibration: Calibration) -> str:
+    """Return one sentence: how good the model is on data that took no part."""
+    held_out = [part for part in calibration.parts if part.role == "held out"]
+    if held_out:
+        worst = max(held_out, key=lambda part: part.model.rms_um)
+        return (
+            f"On data that took no part in the fit: {worst.model.rms_um:.2f} µm rms "
+            f"({worst.nothing.rms_um:.1f} without compensation), fit {worst.model.fit_pct:.1f} %"
+            + (f", worst of {len(held_out)}" if len(held_out) > 1 else "") + "."
+        )  # fmt: skip
+    fitted = calibration.parts[0]
+    return (
+        f"On blocks of time held out in turn: {calibration.folds_rms_um:.2f} µm rms in free run "
+        f"({fitted.nothing.rms_um:.1f} without compensation). No separate run judged it; name one with --validate."
+    )
+
+
+def text(calibration: Calibration, criticism: Criticism) -> str:
+    """Return the summary for the terminal."""
+    model = calibration.model
+    what = (
+        "TTF, DTF, TDTF: heat from the temperatures"
+        if model.kind == "heat"
+        else "direct: from T_Q − AT straight to the deformation, no heat known"
+    )
+    lines = [f"model {model.name} ({what}; method {calibration.settings.method})", "", verdict(calibration), ""]
+    for path, fit in zip(criticism.paths, calibration.paths, strict=True):
+        unit = path.unit.replace("um", "µm")
+        gain = _with_std(path.gain, path.gain_std)
+        taus = ", ".join(_with_std(t, s) for t, s in zip(path.taus_min, path.taus_std_min, strict=True))
+        structure = str(fit.fit.structure) if fit.fit else "given"
+        lines.append(f"{path.name:<5} gain {gain} {unit}; time constants {taus} min; {structure}")
+    if calibration.temperature is not None:
+        lines.append(
+            f"TTF   fit {calibration.ttf_fit_pct:.2f} %; its inverse is stable and makes "
+            f"{calibration.temperature.noise_gain_w_per_k:.0f} W of 1 K of noise"
+        )
+    lines += ["", *_table(calibration)]
+    for title, words in (("warnings", criticism.warnings), ("remarks", calibration.remarks)):
+        if words:
+            lines += ["", f"{title}:", *(f"- {word}" for word in words)]
+    return "\n".join(lines)
+
+
+def _with_std(value: float, std: float) -> str:
+    if std == 0.0:
+        return f"{value:.4g}"
+    return f"{value:.4g} ± {std:.2g}"
+
+
+def _table(calibration: Calibration) -> list[str]:
+    rows = [["data", "part", "h", "fit %", "rms µm", "p-p µm", "no comp. µm", "persistence µm"]]
+    period_h = calibration.model.period_s / 3600.0
+    rows += [
+        [
+            part.name, part.role, f"{part.y_um.size * period_h:.1f}", f"{part.model.fit_pct:.2f}",
+            f"{part.model.rms_um:.2f}", f"{part.model.peak_to_peak_um:.2f}", f"{part.nothing.rms_um:.2f}",
+            f"{part.persistence.rms_um:.2f}",
+        ]
+        for part in calibration.parts
+    ]  # fmt: skip
+    rows.append(["folds", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  ".join(cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
+        for row in rows
+    ]  # fmt: skip

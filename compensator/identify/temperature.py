@@ -1,0 +1,124 @@
+"""The TTF: from the known heat to T_Q − AT, with an inverse that can run in a service."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from compensator.errors import DataError, ModelError
+from compensator.identify.choice import fit, held_out_errors
+from compensator.identify.output_error import OutputErrorFit, Segment, Structure
+from compensator.identify.rest import settle_starts
+from compensator.identify.runs import Run
+from compensator.model.thermal_model import check_inverse
+from compensator.model.transfer_function import SampledTransferFunction
+
+Vector = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TemperatureFit:
+    """A TTF and what is to be known about its inverse.
+
+    Parameters
+    ----------
+    fit : OutputErrorFit
+        Of heat to T_Q − AT.
+    segments : tuple of Segment
+        What it was fitted to.
+    held_out_k : float
+        Root mean square of the free-run error on held-out folds, K.
+    noise_gain_w_per_k : float
+        Standard deviation of the inverse's output for white noise of 1 K on T_Q − AT, W/K.
+    remark : str
+        What had to be changed to make the inverse usable; empty where nothing.
+    """
+
+    fit: OutputErrorFit
+    segments: tuple[Segment, ...]
+    held_out_k: float
+    noise_gain_w_per_k: float
+    remark: str
+
+    @property
+    def function(self) -> SampledTransferFunction:
+        """The TTF."""
+        return self.fit.function()
+
+    def heat(self, difference_k: Vector) -> Vector:
+        """Return the heat that the inverse makes of T_Q − AT, from rest, W."""
+        f = self.function
+        return np.asarray(lfilter(f.a, f.b, difference_k))
+
+
+def fit_temperature(
+    runs: Sequence[Run],
+    used: Sequence[npt.NDArray[np.bool_]],
+    ttf: tuple[int, int, int],
+    *,
+    period_s: float,
+    folds: int,
+) -> TemperatureFit:
+    """Fit a TTF whose inverse is causal, stable and does not ring.
+
+    Where the structure asked for leads to an inverse that cannot run, the numerator is shortened term by term
+    until it can: a single term always can, and what that costs is seen in the fit.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Those with known heat are used.
+    used : sequence of array of bool
+        Samples of each run that take part.
+    ttf : tuple of int
+        nb, nf, nk.
+    period_s : float
+        Sample period, s.
+    folds : int
+        Blocks for the held-out error.
+
+    Raises
+    ------
+    DataError
+        If no numerator gives a usable inverse.
+    """
+    free = [
+        Segment.of(run.heat_w, run.difference_k, mask)
+        for run, mask in zip(runs, used, strict=True)
+        if run.heat_w is not None
+    ]
+    terms, order, _ = ttf
+    remark = ""
+    for nb in range(terms, 0, -1):
+        structure = Structure(order=order, terms=(nb,))
+        segments = settle_starts(free, structure, period_s, folds)
+        result = fit(segments, structure, period_s)
+        function = result.function()
+        try:
+            check_inverse("the TTF", function)
+        except ModelError as error:
+            remark = f"TTF with nb {terms}: {error}; fitted with nb {nb - 1} instead"
+            continue
+        errors = np.concatenate(held_out_errors(segments, structure, period_s, folds))
+        return TemperatureFit(
+            fit=result, segments=tuple(segments), held_out_k=float(np.sqrt(np.mean(errors**2))),
+            noise_gain_w_per_k=noise_gain(function), remark=remark,
+        )  # fmt: skip
+    raise DataError(f"no usable inverse: {remark}. Is t_q_degc near the heat source, and heat_w its heat?")
+
+
+def noise_gain(function: SampledTransferFunction) -> float:
+    """Return the standard deviation of the inverse's output for white noise of 1 at its input.
+
+    Examples
+    --------
+    >>> round(noise_gain(SampledTransferFunction(b=(0.5,), a=(1.0,), period_s=60.0)), 6)
+    2.0
+    """
+    impulse = np.zeros(5000)
+    impulse[0] = 1.0
+    return float(np.linalg.norm(lfilter(function.a, function.b, impulse)))
