@@ -33,7 +33,9 @@ _NEEDED = ("t_q_degc", "at_degc", "y_um")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the command's arguments."""
     parser.add_argument("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
-    parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html beside it")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html beside it"
+    )
     parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME",
                         help="role of a column of another name, such as t_q_degc=t5_degc")  # fmt: skip
     parser.add_argument("--name", help="name of the model (default: that of the file)")
@@ -109,7 +111,9 @@ def finished(calibration: Calibration, criticism: Criticism) -> Any:
     import dataclasses
 
     found = figures(calibration, criticism)
-    kept = {key: found[key] for key in ("method", "parts", "folds_rms_um", "warnings", "remarks", "ttf") if key in found}
+    kept = {
+        key: found[key] for key in ("method", "parts", "folds_rms_um", "warnings", "remarks", "ttf") if key in found
+    }
     return dataclasses.replace(calibration.model, provenance={**calibration.model.provenance, **kept})
 
 

@@ -188,7 +188,9 @@ def _given(tdtf: tuple[float, float], period_s: float) -> PathFit:
     return PathFit(name="TDTF", fit=None, column=0, function=function)
 
 
-def _from_etve(etve: Sequence[Run], settings: Settings, period_s: float, told: Told) -> tuple[PathFit, tuple[Candidate, ...]]:
+def _from_etve(
+    etve: Sequence[Run], settings: Settings, period_s: float, told: Told
+) -> tuple[PathFit, tuple[Candidate, ...]]:
     if not etve:
         raise DataError(f"method {settings.method} needs an ETVE (a run without any heat source): name it with --etve")
     data = []
