@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from compensator import __version__
+from compensator.commands.arguments import identify as add_identify
 from compensator.errors import CompensatorError, UsageError
 from drivers.errors import DriverError
 
@@ -84,6 +85,8 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument(
         "--column", action="append", default=[], metavar="ROLE=NAME", help="role of a column of another name"
     )
+    example = "compensator identify run.csv --validate other.csv --out model.toml"
+    add_identify(_command(commands, "identify", _identify, "a model from measured runs", example))
     export = _command(
         commands, "export", _export, "a recording as a table", "compensator export day.mcap --out day.csv"
     )
@@ -186,23 +189,13 @@ def _probe(arguments: argparse.Namespace) -> int:
     return 0 if all(row["quality"] == "good" for row in rows) else 1
 
 
-def _roles(pairs: Sequence[str]) -> dict[str, str]:
-    roles = {}
-    for pair in pairs:
-        role, equals, name = pair.partition("=")
-        if not equals or not role or not name:
-            raise UsageError(f"--column {pair}: expected ROLE=NAME, such as t_q_degc=t5_degc")
-        roles[role] = name
-    return roles
-
-
 def _simulate(arguments: argparse.Namespace) -> int:
     from compensator.model.model_file import load_model
     from compensator.simulation import csv_rows, scores, simulate
-    from compensator.tables import load_data, require
+    from compensator.tables import load_data, require, roles_of
 
     model = load_model(arguments.model)
-    data = load_data(arguments.data, model.period_s, _roles(arguments.column))
+    data = load_data(arguments.data, model.period_s, roles_of(arguments.column))
     for remark in data.remarks:
         log.warning("%s", remark)
     for record in data.records:
@@ -222,6 +215,14 @@ def _simulate(arguments: argparse.Namespace) -> int:
         result |= {"fit_pct": score.fit_pct, "rms_um": score.rms_um, "peak_to_peak_um": score.peak_to_peak_um}
         text += f"\nfit {score.fit_pct:.2f} %, residual {score.rms_um:.3f} µm rms"
         text += f", {score.peak_to_peak_um:.2f} µm peak to peak"
+    _print(arguments, result, text)
+    return 0
+
+
+def _identify(arguments: argparse.Namespace) -> int:
+    from compensator.commands.identify import run
+
+    result, text = run(arguments)
     _print(arguments, result, text)
     return 0
 

@@ -26,7 +26,7 @@ from rich.progress import Progress
 from compensator.clock import NS, VirtualClock
 from compensator.config import Zenoh
 from compensator.messages import Offset, number
-from compensator.report.page import Figure, Line, Page, write_page
+from compensator.report.page import Block, Figure, Line, Page, Table, write_page
 from compensator.service.compensation import Outcome
 from compensator.service.composition import run_service
 from compensator.service.publisher import session_config
@@ -93,17 +93,15 @@ def run_demo(out: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], str
         Figures, and the table as text.
     """
     results = {}
-    figures = []
+    figures: list[Figure] = []
     for name in MACHINES:
         day = run_day(out / name, machine=name, hours=hours, seed=seed)
         results[name] = _figures(day)
         figures += _pictures(name, day)
     page = out / "report.html"
     table = _table(results)
-    write_page(
-        page,
-        Page(title="A simulated day, compensated", verdict=_verdict(results), table=table, figures=figures),
-    )
+    blocks: list[Block] = [*figures, Table(head=table[0], rows=table[1:])]
+    write_page(page, Page(title="A simulated day, compensated", verdict=_verdict(results), blocks=blocks))
     text = "\n".join(
         "  ".join(f"{cell:>{width}}" for cell, width in zip(row, _widths(table), strict=True)) for row in table
     )

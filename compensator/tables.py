@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from compensator.errors import DataError
+from compensator.errors import DataError, UsageError
 from compensator.messages import Sample, number
 from compensator.recording import decode, read_messages
 
@@ -75,6 +75,28 @@ def load_data(path: Path, period_s: float, roles: Mapping[str, str] | None = Non
     t_s, columns = _read_mcap(path) if path.suffix == ".mcap" else _read_csv(path)
     columns = _with_roles(path, columns, roles or {})
     return _gridded(path, t_s, columns, period_s)
+
+
+def roles_of(pairs: Sequence[str]) -> dict[str, str]:
+    """Take `--column ROLE=NAME` apart.
+
+    Raises
+    ------
+    UsageError
+        If one of them is no such pair.
+
+    Examples
+    --------
+    >>> roles_of(["t_q_degc=t5_degc"])
+    {'t_q_degc': 't5_degc'}
+    """
+    roles = {}
+    for pair in pairs:
+        role, equals, name = pair.partition("=")
+        if not equals or not role or not name:
+            raise UsageError(f"--column {pair}: expected ROLE=NAME, such as t_q_degc=t5_degc")
+        roles[role] = name
+    return roles
 
 
 def _with_roles(path: Path, columns: dict[str, Vector], roles: Mapping[str, str]) -> dict[str, Vector]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import hashlib
 import logging
 import sys
@@ -21,44 +22,14 @@ from compensator.identify.settings import Settings
 from compensator.identify.summary import figures, text
 from compensator.model.model_file import load_model
 from compensator.model.model_writer import write_model
-from compensator.tables import load_data, require
+from compensator.model.thermal_model import ThermalModel
+from compensator.tables import load_data, require, roles_of
 
 log = logging.getLogger("compensator")
 
 #: Sample period of the models made, s: the service's.
 PERIOD_S = 60.0
 _NEEDED = ("t_q_degc", "at_degc", "y_um")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the command's arguments."""
-    parser.add_argument("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html beside it"
-    )
-    parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME",
-                        help="role of a column of another name, such as t_q_degc=t5_degc")  # fmt: skip
-    parser.add_argument("--name", help="name of the model (default: that of the file)")
-    parser.add_argument("--kind", choices=("auto", "heat", "direct"), default="auto",
-                        help="with a TTF, or from T_Q - AT straight to y (default: heat where heat_w is known)")  # fmt: skip
-    parser.add_argument("--method", choices=("I", "II", "III", "IV"), default="IV",
-                        help="TDTF given (I), from a whole ETVE (II), from its end (III), with the DTF at once (IV)")  # fmt: skip
-    parser.add_argument("--tdtf", type=float, nargs=2, metavar=("UM_PER_K", "MIN"),
-                        help="method I: gain and time constant of the first-order TDTF")  # fmt: skip
-    parser.add_argument("--etve", type=Path, action="append", default=[], metavar="DATA",
-                        help="methods II and III: a run without any heat source")  # fmt: skip
-    parser.add_argument("--etve-end-h", type=float, default=6.0, metavar="H", help="method III: length of the end (6)")
-    parser.add_argument("--ttf", type=int, nargs=3, default=(2, 2, 0), metavar=("NB", "NF", "NK"),
-                        help="structure of the TTF (2 2 0)")  # fmt: skip
-    parser.add_argument("--order", type=int, nargs=3, metavar=("NF", "NB_DTF", "NB_TDTF"),
-                        help="structure of DTF and TDTF (default: chosen on held-out folds)")  # fmt: skip
-    parser.add_argument("--drive", choices=("ttf", "known"), default="ttf",
-                        help="heat that the DTF is fitted with: from T_Q as in the service, or the known one")  # fmt: skip
-    parser.add_argument("--folds", type=int, default=5, help="blocks of time held out in turn (5)")
-    parser.add_argument("--fit-until", type=float, metavar="H", help="fit up to this hour, judge on the rest")
-    parser.add_argument("--validate", type=Path, action="append", default=[], metavar="DATA",
-                        help="a run that only judges; may be repeated")  # fmt: skip
-    parser.add_argument("--reference", metavar="MODEL", help="another model to put the coefficients beside")
 
 
 def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -75,6 +46,10 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         given_tdtf=tuple(arguments.tdtf) if arguments.tdtf else None, etve_end_h=arguments.etve_end_h,
         folds=arguments.folds,
     )  # fmt: skip
+    taken = {path.resolve() for path in (*arguments.data, *arguments.etve)}
+    for path in arguments.validate:
+        if path.resolve() in taken:
+            raise UsageError(f"--validate {path}: takes part in the fit, expected a run that does not")
     roles = roles_of(arguments.column)
     remarks: list[str] = []
     runs = read_runs(arguments.data, roles, remarks)
@@ -106,32 +81,13 @@ def write(
     return result, f"{text(calibration, criticism)}\n\nmodel: {out}\npage: {page}"
 
 
-def finished(calibration: Calibration, criticism: Criticism) -> Any:
+def finished(calibration: Calibration, criticism: Criticism) -> ThermalModel:
     """Return the model with what was found about it in its provenance."""
-    import dataclasses
-
     found = figures(calibration, criticism)
     kept = {
         key: found[key] for key in ("method", "parts", "folds_rms_um", "warnings", "remarks", "ttf") if key in found
     }
-    return dataclasses.replace(calibration.model, provenance={**calibration.model.provenance, **kept})
-
-
-def roles_of(pairs: Sequence[str]) -> dict[str, str]:
-    """Take `--column ROLE=NAME` apart.
-
-    Raises
-    ------
-    UsageError
-        If one of them is no such pair.
-    """
-    roles = {}
-    for pair in pairs:
-        role, equals, name = pair.partition("=")
-        if not equals or not role or not name:
-            raise UsageError(f"--column {pair}: expected ROLE=NAME, such as t_q_degc=t5_degc")
-        roles[role] = name
-    return roles
+    return dataclasses.replace(calibration.model, provenance=dict(calibration.model.provenance) | kept)
 
 
 def read_runs(paths: Sequence[Path], roles: Mapping[str, str], remarks: list[str]) -> list[Run]:

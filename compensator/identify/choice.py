@@ -20,7 +20,6 @@ from compensator.errors import DataError
 from compensator.identify.arx import starts
 from compensator.identify.output_error import OutputErrorFit, Segment, Structure, fit_output_error
 
-
 #: Is told how many steps of how many are done.
 Told = Callable[[int, int], None]
 
@@ -63,16 +62,15 @@ def fit(
 
 
 def folds_of(segments: Sequence[Segment], count: int) -> Iterator[list[Segment]]:
-    """Yield the segments with one block after another hidden from the fit."""
-    sizes = [segment.y.size for segment in segments]
-    edges = np.linspace(0, sum(sizes), count + 1).astype(int)
-    begin = np.cumsum([0, *sizes[:-1]])
+    """Yield the segments with one block after another of the samples used hidden from the fit."""
+    order = np.cumsum(np.concatenate([segment.used for segment in segments])) - 1
+    edges = np.linspace(0, order[-1] + 1, count + 1).astype(int)
+    parts = np.split(order, np.cumsum([segment.y.size for segment in segments])[:-1])
     for low, high in pairwise(edges.tolist()):
-        hidden = []
-        for start, segment in zip(begin, segments, strict=True):
-            at = start + np.arange(segment.y.size)
-            hidden.append(dataclasses.replace(segment, used=segment.used & ~((at >= low) & (at < high))))
-        yield hidden
+        yield [
+            dataclasses.replace(segment, used=segment.used & ~((at >= low) & (at < high)))
+            for segment, at in zip(segments, parts, strict=True)
+        ]
 
 
 def held_out_errors(

@@ -91,7 +91,7 @@ def _standard_errors(path: Path, keys: list[str]) -> dict[str, float]:
     covariance = np.array(path.covariance)
     sampled = path.sampled
     values = np.array([*sampled.b, *sampled.a[1:]])
-    steps = 1e-4 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    steps = 1e-7 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     gradient = np.zeros((len(keys), values.size))
     for i, step in enumerate(steps):
         if step == 0.0:

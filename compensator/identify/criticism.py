@@ -106,7 +106,7 @@ def view_path(path: PathFit, unit: str, period_s: float) -> PathView:
     """
     function = path.function
     poles = function.poles()
-    slowest = _slowest_min(poles, period_s)
+    slowest = max(function.time_constants_min(), default=period_s / 60.0)
     n = int(np.clip(5.0 * slowest / (period_s / 60.0), 60, 6000))
     t_min: Vector = np.arange(n, dtype=np.float64) * period_s / 60.0
     step, std = np.asarray(function.response(np.ones(n))), np.zeros(n)
@@ -126,12 +126,6 @@ def view_path(path: PathFit, unit: str, period_s: float) -> PathView:
         poles=poles, zeros=function.zeros(), gain=gain, gain_std=gain_std, taus_min=taus,
         taus_std_min=tuple(path.fit.taus_std_min.tolist()) if path.fit else (0.0,) * len(taus),
     )  # fmt: skip
-
-
-def _slowest_min(poles: npt.NDArray[np.complex128], period_s: float) -> float:
-    if poles.size == 0:
-        return period_s / 60.0
-    return float(-period_s / 60.0 / np.log(min(float(np.max(np.abs(poles))), 1.0 - 1e-9)))
 
 
 def view_residual(name: str, residuals: Sequence[Vector], inputs: dict[str, Sequence[Vector]]) -> ResidualView:

@@ -253,9 +253,10 @@ def pole_slopes(poles: Vector, taus_min: Vector, period_s: float) -> Vector:
 
 def _through(poles: Vector, u: Matrix) -> Matrix:
     """Filter by G; section by section, because the expanded polynomial of slow poles loses its digits."""
+    out = u
     for p in poles:
-        u = np.asarray(lfilter([1.0 - p], [1.0, -p], u, axis=-1), dtype=np.float64)
-    return u
+        out = lfilter([1.0 - p], [1.0, -p], out, axis=-1)
+    return np.asarray(out, dtype=np.float64)
 
 
 def _difference(u: Matrix) -> Matrix:
@@ -370,14 +371,15 @@ class _Problem:
         """Return ∂ŷ / ∂ log τ at fixed amplitudes on the samples used."""
         slopes = pole_slopes(self.poles, self.taus, self.period_s)
         parts = zip(self.outputs(), self.segments, strict=True)
-        tables = [_sensitivities(out, self.poles, slopes)[segment.used] for out, segment in parts]
+        tables: list[Matrix] = [_sensitivities(out, self.poles, slopes)[segment.used] for out, segment in parts]
         prior = np.zeros((self.y.size - self.count, self.poles.size))
-        return np.asarray(np.concatenate([*tables, prior]))
+        stacked: Matrix = np.concatenate([*tables, prior])
+        return stacked
 
     def fun(self, log_taus: Vector) -> Vector:
         """Return the projected residual."""
         self.solve(log_taus)
-        return self.residual
+        return np.asarray(self.residual)
 
     def jac(self, log_taus: Vector) -> Matrix:
         """Return Kaufman's Jacobian of the projected residual."""
@@ -492,7 +494,7 @@ def _covariance(problem: _Problem, sigma: float) -> Matrix:
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
     _, s, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    inverse = vt.T / np.maximum(s, 1e-12 * s[0]) / scale[:, None]
+    inverse = vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None]
     return np.asarray(sigma**2 * inverse @ inverse.T)
 
 

@@ -73,7 +73,7 @@ def _check_temperature(name: str, column: str, values: Vector) -> None:
         raise DataError(f"{name}: {column} = {middle:g} in every row: a dead sensor, or a column of another meaning")
     low, high = float(values.min()), float(values.max())
     air = column == "at_degc"
-    if 250.0 <= low and high <= 420.0:
+    if low >= 250.0 and high <= 420.0:
         raise DataError(f"{name}: {column} runs from {low:.1f} to {high:.1f}: kelvin? expected °C")
     if high - low > 2000.0 or abs(middle) > 1000.0:
         raise DataError(f"{name}: {column} runs from {low:g} to {high:g}: thousandths of a degree? expected °C")

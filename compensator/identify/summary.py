@@ -84,8 +84,8 @@ def text(calibration: Calibration, criticism: Criticism) -> str:
     lines = [f"model {model.name} ({what}; method {calibration.settings.method})", "", verdict(calibration), ""]
     for path, fit in zip(criticism.paths, calibration.paths, strict=True):
         unit = path.unit.replace("um", "µm")
-        gain = _with_std(path.gain, path.gain_std)
-        taus = ", ".join(_with_std(t, s) for t, s in zip(path.taus_min, path.taus_std_min, strict=True))
+        gain = with_std(path.gain, path.gain_std)
+        taus = ", ".join(with_std(t, s) for t, s in zip(path.taus_min, path.taus_std_min, strict=True))
         structure = str(fit.fit.structure) if fit.fit else "given"
         lines.append(f"{path.name:<5} gain {gain} {unit}; time constants {taus} min; {structure}")
     if calibration.temperature is not None:
@@ -100,10 +100,17 @@ def text(calibration: Calibration, criticism: Criticism) -> str:
     return "\n".join(lines)
 
 
-def _with_std(value: float, std: float) -> str:
+def with_std(value: float, std: float) -> str:
+    """Return a value with its standard error, or with what stands for one.
+
+    Examples
+    --------
+    >>> with_std(1.0182, 0.0021), with_std(10.0, 0.0), with_std(169.0, 3e5)
+    ('1.018 ± 0.0021', '10', '169 (not determined)')
+    """
     if std == 0.0:
         return f"{value:.4g}"
-    return f"{value:.4g} ± {std:.2g}"
+    return f"{value:.4g} (not determined)" if std > 10.0 * abs(value) else f"{value:.4g} ± {std:.2g}"
 
 
 def _table(calibration: Calibration) -> list[str]:
@@ -119,7 +126,4 @@ def _table(calibration: Calibration) -> list[str]:
     ]  # fmt: skip
     rows.append(["folds", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""])
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [
-        "  ".join(cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
-        for row in rows
-    ]  # fmt: skip
+    return ["  ".join(f"{c:{'<' if i < 2 else '>'}{widths[i]}}" for i, c in enumerate(row)) for row in rows]

@@ -132,8 +132,7 @@ def _path(where: str, path: Path, purpose: str, extra: Mapping[str, Any]) -> Ite
     std = _gain_std(path)
     if std is not None:
         gain += f" +- {std:.2g}"
-    poles = [p for p in function.poles() if 0.0 < abs(p) < 1.0]
-    taus = ", ".join(f"{-function.period_s / 60.0 / math.log(abs(p)):.4g}" for p in sorted(poles, key=abs))
+    taus = ", ".join(f"{tau:.4g}" for tau in function.time_constants_min() if tau > 0.0)
     yield f"# {purpose}. Gain at rest {gain} {path.unit}; time constants {taus or 'none'} min."
     yield f"[{where}]"
     table: dict[str, Any] = {**extra, "unit": path.unit}
@@ -175,7 +174,7 @@ def _string(text: str) -> str:
     return json.dumps(text.encode("utf-8", "replace").decode("utf-8"), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _value(key: str, value: Any) -> str:  # noqa: PLR0911  one return for each kind of value
+def _value(key: str, value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (float, np.floating)):

@@ -103,6 +103,15 @@ class SampledTransferFunction:
         """Return the zeros in the z plane."""
         return np.roots(self.b).astype(np.complex128)
 
+    def time_constants_min(self) -> list[float]:
+        """Return the time constants of Tustin's continuous image, ascending, min; 0 for a pole that has none.
+
+        *τ = T/2 · (1 + p) / (1 − p)* with the magnitude of each pole.
+        """
+        half = self.period_s / 120.0
+        sizes = np.abs(self.poles())
+        return sorted(float(half * (1.0 + p) / (1.0 - p)) if 0.0 < p < 1.0 else 0.0 for p in sizes)
+
     def is_stable(self) -> bool:
         """Tell whether every pole lies inside the unit circle."""
         return bool(np.all(np.abs(self.poles()) < 1.0))

@@ -1,85 +1,91 @@
-"""A self-contained HTML page: verdict first, then the pictures that carry it, then the table.
+"""A self-contained HTML page: verdict first, then the picture that carries it, then tables, then details to open.
 
-Pictures are drawn by matplotlib as SVG; their colours are replaced by CSS variables, so that one page serves a
-light and a dark screen and paper.
+Nothing is loaded from anywhere, no script runs. Pictures are SVG whose colours are CSS variables, so that one
+page serves a light and a dark screen and paper.
 """
 
 from __future__ import annotations
 
 import html
-import io
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-import matplotlib as mpl
-import numpy as np
-import numpy.typing as npt
-from matplotlib.figure import Figure as Canvas
+from compensator.report.figure import Figure, Line, Marks, Span, Stems, svg
 
-#: Drawn colour → CSS variable. Line colours are from the Okabe–Ito set, told apart by the colour-blind.
-_COLOURS = {
-    "#010101": "--ink",
-    "#020202": "--grid",
-    "#030303": "--line-0",
-    "#040404": "--line-1",
-    "#050505": "--line-2",
-}
-_DASHES = ("-", "--", ":")
-#: More points than this do not fit on a screen.
-_POINTS = 1500
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A curve with its name."""
-
-    name: str
-    x: npt.NDArray[np.float64]
-    y: npt.NDArray[np.float64]
+Tone = Literal["good", "warn", "bad"]
+_TONE_WORDS: dict[Tone, str] = {"good": "✓ good", "warn": "⚠ mind", "bad": "✗ no"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Figure:
-    """A picture with units on both axes."""
+class Row:
+    """Pictures side by side where there is room."""
+
+    figures: tuple[Figure, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A table with a header row; the first column is text, the others numbers."""
+
+    title: str = ""
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Words:
+    """Sentences; a `warning` is marked as one."""
 
     title: str
-    x_label: str
-    y_label: str
-    lines: tuple[Line, ...]
+    lines: Sequence[str]
+    kind: Literal["warning", "plain"] = "plain"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Details:
+    """Something to open."""
+
+    title: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Section:
+    """Blocks below a heading."""
+
+    title: str
+    blocks: Sequence[Block]
+
+
+Block = Figure | Row | Table | Words | Details | Section
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Page:
-    """A page: title, verdict, table with a header row, pictures."""
+    """A page.
+
+    Parameters
+    ----------
+    title, verdict : str
+        What it is about, and the one sentence to take away.
+    blocks : sequence of Block
+        What follows, in order.
+    tone : {"good", "warn", "bad"}
+        Shown beside the verdict as colour and as a word.
+    """
 
     title: str
     verdict: str
-    table: Sequence[Sequence[str]]
-    figures: Sequence[Figure]
+    blocks: Sequence[Block] = field(default_factory=tuple)
+    tone: Tone = "good"
 
 
-_STYLE = """
-:root { --paper: #ffffff; --ink: #1c1c1c; --grid: #d0d0d0; --line-0: #d55e00; --line-1: #0072b2; --line-2: #009e73; }
-@media (prefers-color-scheme: dark) {
-  :root { --paper: #16181c; --ink: #e8e8e8; --grid: #44484f; --line-0: #f0903c; --line-1: #6cb8ee; --line-2: #3fc79a; }
-}
-@media print {
-  :root { --paper: #ffffff; --ink: #000000; --grid: #d0d0d0; --line-0: #d55e00; --line-1: #0072b2; --line-2: #009e73; }
-}
-body { background: var(--paper); color: var(--ink); font: 16px/1.5 system-ui, sans-serif; margin: 0 auto;
-  max-width: 60rem; padding: 1rem; }
-h1 { font-size: 1.5rem; } .verdict { font-size: 1.2rem; font-weight: 600; }
-figure { margin: 1.5rem 0; } figcaption { font-weight: 600; } svg { width: 100%; height: auto; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; }
-th, td { padding: .25rem .75rem; text-align: right; border-bottom: 1px solid var(--grid); white-space: nowrap; }
-th:first-child, td:first-child, td:nth-child(2) { text-align: left; }
-"""
-
-
-def write_page(path: Path, page: Page) -> None:
+def write_page(path: Path, page: Page) -> Path:
     """Write a page.
 
     Parameters
@@ -88,49 +94,80 @@ def write_page(path: Path, page: Page) -> None:
         The HTML file.
     page : Page
         What stands on it.
+
+    Returns
+    -------
+    pathlib.Path
+        The same path.
     """
-    head, *rows = page.table
-    table = "".join(f'<th scope="col">{html.escape(cell)}</th>' for cell in head)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    figures = "".join(
-        f"<figure><figcaption>{html.escape(f.title)}</figcaption>{_svg(f)}</figure>" for f in page.figures
-    )
+    style = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
     title = html.escape(page.title)
-    text = (
+    numbers = count(1)
+    body = "".join(_block(block, numbers, 2) for block in page.blocks)
+    path.write_text(
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style></head><body>'
-        f'<main><h1>{title}</h1><p class="verdict">{html.escape(page.verdict)}</p>'
-        f'<div class="scroll"><table><thead><tr>{table}</tr></thead><tbody>{body}</tbody></table></div>{figures}</main>'
-        "</body></html>"
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style></head><body>'
+        f'<main><h1>{title}</h1><p class="verdict {page.tone}"><b>{_TONE_WORDS[page.tone]}</b>'
+        f"{html.escape(page.verdict)}</p>{body}</main></body></html>",
+        encoding="utf-8",
     )
-    path.write_text(text, encoding="utf-8")
+    return path
 
 
-def _svg(figure: Figure) -> str:
-    style: dict[Any, Any] = {
-        "svg.fonttype": "none", "svg.hashsalt": figure.title, "font.family": "sans-serif", "font.size": 10,
-        "text.color": "#010101", "axes.labelcolor": "#010101", "axes.edgecolor": "#010101",
-        "xtick.color": "#010101", "ytick.color": "#010101", "grid.color": "#020202", "figure.facecolor": "none",
-        "axes.facecolor": "none", "legend.framealpha": 0.0,
-    }  # fmt: skip
-    with mpl.rc_context(style):
-        canvas = Canvas(figsize=(9, 3.4), layout="constrained")
-        axes = canvas.subplots()
-        for i, line in enumerate(figure.lines):
-            step = max(1, line.x.size // _POINTS)
-            axes.plot(line.x[::step], line.y[::step], _DASHES[i % 3], color=list(_COLOURS)[2 + i % 3],
-                      label=line.name, linewidth=1.5)  # fmt: skip
-        axes.set_xlabel(figure.x_label)
-        axes.set_ylabel(figure.y_label)
-        axes.grid(visible=True)
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
-        buffer = io.StringIO()
-        canvas.savefig(buffer, format="svg", metadata={"Date": None})
-    svg = buffer.getvalue()
-    svg = svg[svg.index("<svg") :]
-    for colour, variable in _COLOURS.items():
-        svg = svg.replace(colour, f"var({variable})")
-    # Two pictures on one page must not share identifiers.
-    prefix = re.sub(r"\W+", "-", figure.title.lower())
-    svg = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{prefix}-", svg)
-    return svg.replace("<svg ", f'<svg role="img" aria-label="{html.escape(figure.title)}" ', 1)
+def _figure(figure: Figure, numbers: Iterator[int], width: float) -> str:
+    note = f"<p>{html.escape(figure.note)}</p>" if figure.note else ""
+    picture = svg(figure, f"f{next(numbers)}", width)
+    return f"<figure><figcaption>{html.escape(figure.title)}</figcaption>{picture}{note}</figure>"
+
+
+def _block(block: Block, numbers: Iterator[int], level: int) -> str:
+    if isinstance(block, Figure):
+        return _figure(block, numbers, 9.0)
+    if isinstance(block, Row):
+        return f'<div class="row">{"".join(_figure(figure, numbers, 4.8) for figure in block.figures)}</div>'
+    if isinstance(block, Table):
+        return _table(block, level)
+    heading = html.escape(block.title)
+    if isinstance(block, Words):
+        items = "".join(f"<li>{html.escape(line)}</li>" for line in block.lines)
+        return f'<div class="words {block.kind}"><h{level}>{heading}</h{level}><ul>{items}</ul></div>'
+    inner = "".join(_block(part, numbers, level + 1) for part in block.blocks)
+    if isinstance(block, Details):
+        return f"<details><summary>{heading}</summary>{inner}</details>"
+    return f"<section><h{level}>{heading}</h{level}>{inner}</section>"
+
+
+def _table(table: Table, level: int) -> str:
+    head = "".join(f'<th scope="col">{html.escape(cell)}</th>' for cell in table.head)
+    rows = "".join(
+        "<tr>"
+        + "".join(
+            f'<th scope="row">{html.escape(cell)}</th>' if i == 0 else f"<td>{html.escape(cell)}</td>"
+            for i, cell in enumerate(row)
+        )
+        + "</tr>"
+        for row in table.rows
+    )
+    title = f"<h{level}>{html.escape(table.title)}</h{level}>" if table.title else ""
+    note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
+    return (
+        f'{title}<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>{note}"
+    )
+
+
+__all__ = [
+    "Block",
+    "Details",
+    "Figure",
+    "Line",
+    "Marks",
+    "Page",
+    "Row",
+    "Section",
+    "Span",
+    "Stems",
+    "Table",
+    "Words",
+    "write_page",
+]

@@ -1,0 +1,34 @@
+"""Arguments of the larger commands; apart from them, so that asking for help loads no numbers."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def identify(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `identify`."""
+    add = parser.add_argument
+    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
+    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html comes beside it")
+    add("--column", action="append", default=[], metavar="ROLE=NAME", help="role of a column of another name")
+    add("--name", help="name of the model (default: that of the file)")
+    words = "with a TTF, or from T_Q - AT straight to y (default: with one where heat_w is known)"
+    add("--kind", choices=("auto", "heat", "direct"), default="auto", help=words)
+    words = "TDTF given (I), from a whole ETVE (II), from its end (III), at once with the DTF (IV, the default)"
+    add("--method", choices=("I", "II", "III", "IV"), default="IV", help=words)
+    words = "method I: gain and time constant of the first-order TDTF"
+    add("--tdtf", type=float, nargs=2, metavar=("UM_PER_K", "MIN"), help=words)
+    words = "methods II and III: a run without any heat source"
+    add("--etve", type=Path, action="append", default=[], metavar="DATA", help=words)
+    add("--etve-end-h", type=float, default=6.0, metavar="H", help="method III: length of the end, h (6)")
+    add("--ttf", type=int, nargs=3, default=(2, 2, 0), metavar=("NB", "NF", "NK"), help="structure of the TTF (2 2 0)")
+    words = "structure of DTF and TDTF (default: chosen on held-out folds)"
+    add("--order", type=int, nargs=3, metavar=("NF", "NB_DTF", "NB_TDTF"), help=words)
+    words = "heat that the DTF is fitted with: from T_Q as in the service (default), or the known one"
+    add("--drive", choices=("ttf", "known"), default="ttf", help=words)
+    add("--folds", type=int, default=5, help="blocks of time held out in turn (5)")
+    add("--fit-until", type=float, metavar="H", help="fit up to this hour, judge on the rest")
+    words = "a run that only judges; may be repeated"
+    add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
+    add("--reference", metavar="MODEL", help="another model to put the coefficients beside")

@@ -1,0 +1,264 @@
+"""The page of a calibration: for the engineer who has to sign it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.identify.calibration import Calibration, Part
+from compensator.identify.choice import Candidate
+from compensator.identify.comparison import Row as Comparison
+from compensator.identify.criticism import LAGS, Criticism, PathView, ResidualView
+from compensator.identify.summary import verdict, with_std
+from compensator.model.thermal_model import ThermalModel
+from compensator.report.page import (
+    Block,
+    Details,
+    Figure,
+    Line,
+    Marks,
+    Page,
+    Row,
+    Section,
+    Span,
+    Stems,
+    Table,
+    Tone,
+    Words,
+    write_page,
+)
+
+Vector = npt.NDArray[np.float64]
+
+
+def write_report(
+    path: Path, calibration: Calibration, criticism: Criticism, model: ThermalModel, comparison: Sequence[Comparison]
+) -> Path:
+    """Write the page.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The HTML file.
+    calibration : Calibration
+        What came out.
+    criticism : Criticism
+        The critical view of it.
+    model : ThermalModel
+        As written, with its hash.
+    comparison : sequence of Comparison
+        Coefficients beside another model's; may be empty.
+    """
+    blocks: list[Block] = [_prediction(calibration), _residuals(calibration), _errors(calibration)]
+    if criticism.warnings:
+        blocks.append(Words(title="Warnings", lines=criticism.warnings, kind="warning"))
+    if comparison:
+        blocks.append(_compared(comparison))
+    blocks += [*_parameters(calibration, criticism), *(_path_section(view) for view in criticism.paths)]
+    blocks.append(Section(title="What the residual still knows", blocks=[_still(view) for view in criticism.residuals]))
+    blocks.append(_choice(calibration))
+    blocks.append(_provenance(calibration, model))
+    page = Page(
+        title=f"Calibration: {model.name}", verdict=verdict(calibration), blocks=blocks, tone=_tone(calibration)
+    )
+    return write_page(path, page)
+
+
+def _tone(calibration: Calibration) -> Tone:
+    held_out = [part.model.rms_um / part.nothing.rms_um for part in calibration.parts if part.role == "held out"]
+    share = max(held_out) if held_out else calibration.folds_rms_um / calibration.parts[0].nothing.rms_um
+    if share >= 1.0:
+        return "bad"
+    return "good" if share < 0.1 else "warn"
+
+
+def _joined(parts: Sequence[Part]) -> tuple[Vector, Vector, Vector, tuple[Span, ...]]:
+    """Lay the parts one after another on a time axis in hours, with a gap between files, and mark what was held out."""
+    t: list[Vector] = []
+    y: list[Vector] = []
+    predicted: list[Vector] = []
+    spans: list[Span] = []
+    shift, last_name = 0.0, ""
+    for part in parts:
+        hours = part.t_s / 3600.0
+        if t and part.name != last_name:
+            shift = t[-1][-1] + 0.5 - hours[0]
+            gap = np.array([np.nan])
+            t.append(np.array([t[-1][-1]]))
+            y.append(gap)
+            predicted.append(gap)
+        last_name = part.name
+        t.append(hours + shift)
+        y.append(part.y_um)
+        predicted.append(part.y_pred_um)
+        if part.role == "held out":
+            spans.append(Span("held out" if not spans else "", float(t[-1][0]), float(t[-1][-1])))
+    return np.concatenate(t), np.concatenate(y), np.concatenate(predicted), tuple(spans)
+
+
+def _prediction(calibration: Calibration) -> Figure:
+    t, y, predicted, spans = _joined(calibration.parts)
+    return Figure(
+        title="Measured and predicted deformation, free run from T_Q and AT", x_label="time, h", y_label="Y, µm",
+        lines=(Line("measured", t, y), Line("predicted", t, predicted)), spans=spans,
+        note="Nothing measured of Y is fed back. Shaded: took no part in fitting or choosing.",
+    )  # fmt: skip
+
+
+def _residuals(calibration: Calibration) -> Figure:
+    t, y, predicted, spans = _joined(calibration.parts)
+    return Figure(title="Residual, measured − predicted", x_label="time, h", y_label="residual, µm",
+                  lines=(Line("residual", t, y - predicted),), spans=spans, height=2.6)  # fmt: skip
+
+
+def _errors(calibration: Calibration) -> Table:
+    hours = calibration.model.period_s / 3600.0
+    rows = [
+        [
+            part.name, part.role, f"{part.y_um.size * hours:.1f}", f"{part.model.fit_pct:.2f}",
+            f"{part.model.rms_um:.2f}", f"{part.model.peak_to_peak_um:.2f}", f"{part.nothing.rms_um:.2f}",
+            f"{part.persistence.rms_um:.2f}",
+        ]
+        for part in calibration.parts
+    ]  # fmt: skip
+    rows.append(
+        ["blocks of the fitted data, in turn", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""]
+    )
+    return Table(
+        title="Errors in free run",
+        head=["data", "part", "h", "fit %", "rms µm", "peak to peak µm", "uncompensated µm", "persistence µm"],
+        rows=rows,
+        note="Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖). Persistence holds the last value before the part. A run "
+        "that was not fitted is zeroed on its first hour.",
+    )  # fmt: skip
+
+
+def _parameters(calibration: Calibration, criticism: Criticism) -> list[Block]:
+    main, coefficients = [], []
+    for view, path in zip(criticism.paths, calibration.paths, strict=True):
+        unit = view.unit.replace("um", "µm")
+        main.append([f"{view.name}: gain at rest", with_std(view.gain, view.gain_std), unit])
+        main += [
+            [f"{view.name}: time constant", with_std(t, s), "min"]
+            for t, s in zip(view.taus_min, view.taus_std_min, strict=True)
+        ]
+        values = [*path.function.b, *path.function.a[1:]]
+        stds = np.zeros(len(values))
+        if path.fit is not None:
+            stds = np.sqrt(np.diag(path.fit.coefficient_covariance(path.column)))
+        names = [f"b{i}" for i in range(len(path.function.b))] + [f"a{i}" for i in range(1, len(path.function.a))]
+        coefficients += [
+            [f"{view.name}: {name}", with_std(value, std)]
+            for name, value, std in zip(names, values, stds.tolist(), strict=True)
+        ]
+    if calibration.temperature is not None:
+        main.append(["inverse TTF: noise of 1 K becomes", f"{calibration.temperature.noise_gain_w_per_k:.1f}", "W"])
+        main.append(["TTF: fit in free run from the known heat", f"{calibration.ttf_fit_pct:.2f}", "%"])
+    return [
+        Table(
+            title="Parameters and their standard errors", head=["parameter", "value", "unit"], rows=main,
+            note="One standard error. Where the residual is not white, its low-frequency power is counted in.",
+        ),
+        Details(title="Coefficients of 1/z", blocks=[Table(head=["coefficient", "value"], rows=coefficients)]),
+    ]  # fmt: skip
+
+
+def _path_section(view: PathView) -> Block:
+    unit = view.unit.replace("um", "µm")
+    hours = view.t_min / 60.0
+    band = (view.step - 2 * view.step_std, view.step + 2 * view.step_std)
+    zeros = tuple([Marks("zeros", view.zeros.real, view.zeros.imag, "o")] if view.zeros.size else [])
+    step = Figure(
+        title=f"{view.name}: step response", x_label="time, h", y_label=unit,
+        lines=(Line("step, ± 2 standard errors", hours, view.step, band),), limits=(view.gain,), height=3.2,
+        note=f"Settles at {with_std(view.gain, view.gain_std)} {unit} (dashed).",
+    )  # fmt: skip
+    impulse = Figure(title=f"{view.name}: impulse response", x_label="time, h", y_label=f"{unit} per sample",
+                     lines=(Line("impulse", hours, view.impulse),), height=3.2)  # fmt: skip
+    bode = (
+        Figure(title=f"{view.name}: magnitude", x_label="frequency, 1/h", y_label=unit, x_log=True, y_log=True,
+               lines=(Line("magnitude", view.frequency_per_h, view.magnitude),), height=3.2),
+        Figure(title=f"{view.name}: phase", x_label="frequency, 1/h", y_label="degrees", x_log=True,
+               lines=(Line("phase", view.frequency_per_h, view.phase_deg),), height=3.2),
+    )  # fmt: skip
+    plane = Figure(
+        title=f"{view.name}: poles and zeros, z plane", x_label="real part", y_label="imaginary part", unit_circle=True,
+        marks=(Marks("poles", view.poles.real, view.poles.imag, "x"), *zeros), height=3.2,
+    )  # fmt: skip
+    return Section(
+        title=f"{view.name}",
+        blocks=[
+            Row(figures=(step, plane)),
+            Details(title=f"{view.name}: impulse response and Bode diagram", blocks=[Row(figures=(impulse, *bode))]),
+        ],
+    )
+
+
+def _still(view: ResidualView) -> Block:
+    lags = np.arange(1, view.autocorrelation.size + 1, dtype=np.float64)
+    own = Figure(
+        title=f"{view.name}: autocorrelation of the residual", x_label="lag, samples", y_label="correlation",
+        stems=(Stems("residual", lags, view.autocorrelation),), limits=(-view.limit, view.limit), height=3.0,
+        note=f"Dashed: 99 % of white noise. Chance of so much in white noise: {view.white_chance:.2g}.",
+    )  # fmt: skip
+    both = np.arange(-LAGS, LAGS + 1, dtype=np.float64)
+    cross = tuple(
+        Figure(
+            title=f"{view.name}: correlation of the residual with {name}", x_label="lag, samples",
+            y_label="correlation", stems=(Stems(name, both, values),), limits=(-limit, limit), height=3.0,
+        )
+        for name, (values, limit) in view.cross.items()
+    )  # fmt: skip
+    return Row(figures=(own, *cross))
+
+
+def _choice(calibration: Calibration) -> Block:
+    def table(title: str, candidates: Sequence[Candidate]) -> Table:
+        return Table(
+            title=title, head=["structure", "held-out rms, µm", "worst block, µm", ""],
+            rows=[
+                [str(c.structure), f"{c.rms:.3f}", f"{max(c.fold_rms):.3f}",
+                 "chosen" if c.chosen else "" if c.supported else "not determined by the data"]
+                for c in candidates
+            ],
+            note="The simplest whose held-out error is not worse than the best one's by more than its standard error.",
+        )  # fmt: skip
+
+    blocks = [
+        table("DTF and TDTF" if calibration.settings.method == "IV" else "DTF", calibration.deformation.candidates)
+    ]
+    if calibration.deformation.etve_candidates:
+        blocks.append(table("TDTF, on the ETVE", calibration.deformation.etve_candidates))
+    return Details(title="How the order was chosen", blocks=blocks)
+
+
+def _compared(rows: Sequence[Comparison]) -> Table:
+    return Table(
+        title="Beside the reference model",
+        head=["path and figure", "identified", "standard error", "reference", "difference / standard error"],
+        rows=[
+            [f"{r.path}: {r.figure}", f"{r.found:.4g}", f"{r.std:.2g}", f"{r.reference:.4g}", f"{r.deviations:+.1f}"]
+            for r in rows
+        ],
+        note="Functions of s (1/min), highest denominator coefficient 1.",
+    )  # fmt: skip
+
+
+def _provenance(calibration: Calibration, model: ThermalModel) -> Block:
+    rows = [["model", model.name], ["kind", model.kind], ["method", calibration.settings.method],
+            ["SHA-256 of the model file", model.sha256]]  # fmt: skip
+    for entry in model.provenance.get("data", []):
+        rows.append([f"{entry['role']}: {entry['file']}", entry["sha256"]])
+    for name, (low, high) in model.validity.items():
+        rows.append([f"valid for {name}", f"{low:g} to {high:g}"])
+    for name, value in calibration.noise.items():
+        rows.append([f"noise of a sample, {name}", f"{value:.3g}"])
+    for i, segment in enumerate(calibration.deformation.segments):
+        rows.append([f"{calibration.runs[i].name} starts", "at rest" if segment.rest else "from a fitted state"])
+    blocks: list[Block] = [Table(head=["", ""], rows=rows)]
+    if calibration.remarks:
+        blocks.append(Words(title="Remarks on the data", lines=calibration.remarks))
+    return Details(title="Data, ranges, provenance", blocks=blocks)
