@@ -62,9 +62,9 @@ class Wired:
         )
 
     def _tables(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        host = {"host": "127.0.0.1", "timeout_s": 0.05}
+        host = {"host": "127.0.0.1", "timeout_s": 0.15}
         lines = [
-            {"name": "a", "protocol": "modbus-rtu", "port": str(self.rtu.port), "timeout_s": 0.05},
+            {"name": "a", "protocol": "modbus-rtu", "port": str(self.rtu.port), "timeout_s": 0.15},
             {"name": "b", "protocol": "modbus-tcp", "tcp_port": self.tcp.port, **host},
             {"name": "c", "protocol": "capancdt", "data_port": self.capa.data_port,
              "command_port": self.capa.command_port, **host},
@@ -132,12 +132,16 @@ async def test_a_fault_is_missing_never_a_number_and_heals(
         bad = [o.sample.channels[channel] for o in outcomes[41:47]]
         assert all(c.quality != "good" and c.count == 0 and math.isnan(number(c.mean)) for c in bad), bad
         if channel == "y_um":
-            assert all(o.offset.state == "ok" for o in outcomes[41:47])
+            assert all(o.offset.state == "ok" for o in outcomes[41:47]), [
+                (o.offset.state, o.offset.reasons, {n: (c.quality, c.errors) for n, c in o.sample.channels.items()})
+                for o in outcomes[41:47]
+            ]
             assert all(math.isnan(number(o.estimate.residual_um)) for o in outcomes[41:47])
         else:
             assert all(o.offset.state in ("degraded", "hold") for o in outcomes[41:47])
             assert all(not math.isnan(number(o.offset.y_offset_um)) for o in outcomes[41:47])
         offsets = [number(o.offset.y_offset_um) for o in outcomes]
-        assert all(abs(b - a) <= 8.0 + 1e-9 for a, b in itertools.pairwise(offsets))
+        jumps = [i for i, (a, b) in enumerate(itertools.pairwise(offsets)) if not abs(b - a) <= 8.0 + 1e-9]
+        assert not jumps, [outcomes[i + 1].offset for i in jumps[:2]]
         times = [o.offset.time_utc_ns for o in outcomes]
         assert all(b - a == 60_000_000_000 for a, b in itertools.pairwise(times))
