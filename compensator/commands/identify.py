@@ -9,6 +9,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,45 @@ PERIOD_S = 60.0
 _NEEDED = ("t_q_degc", "at_degc", "y_um")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """What is to be made of which files.
+
+    Parameters
+    ----------
+    data, etve, validate : sequence of pathlib.Path
+        Files of the fit, of the test without heat source, and those that only judge.
+    out : pathlib.Path
+        The model file.
+    name : str
+        Name of the model.
+    settings : Settings
+        Kind, method, orders.
+    columns : sequence of str
+        `ROLE=NAME` pairs.
+    fit_until_h : float, optional
+        Fit up to this hour.
+    reference : str, optional
+        A model to put the coefficients beside.
+    """
+
+    data: Sequence[Path]
+    out: Path
+    name: str
+    settings: Settings
+    etve: Sequence[Path] = ()
+    validate: Sequence[Path] = ()
+    columns: Sequence[str] = ()
+    fit_until_h: float | None = None
+    reference: str | None = None
+
+    def __post_init__(self) -> None:
+        taken = {path.resolve() for path in (*self.data, *self.etve)}
+        for path in self.validate:
+            if path.resolve() in taken:
+                raise UsageError(f"--validate {path}: takes part in the fit, expected a run that does not")
+
+
 def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     """Run the command; return its result and its text.
 
@@ -40,28 +80,38 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     CompensatorError
         If the data or the settings allow no model.
     """
+    given = arguments
     settings = Settings(
-        kind=arguments.kind, method=arguments.method, ttf=tuple(arguments.ttf),
-        order=tuple(arguments.order) if arguments.order else None, drive=arguments.drive,
-        given_tdtf=tuple(arguments.tdtf) if arguments.tdtf else None, etve_end_h=arguments.etve_end_h,
-        folds=arguments.folds,
+        kind=given.kind, method=given.method, ttf=tuple(given.ttf), order=tuple(given.order) if given.order else None,
+        drive=given.drive, given_tdtf=tuple(given.tdtf) if given.tdtf else None, etve_end_h=given.etve_end_h,
+        folds=given.folds,
     )  # fmt: skip
-    taken = {path.resolve() for path in (*arguments.data, *arguments.etve)}
-    for path in arguments.validate:
-        if path.resolve() in taken:
-            raise UsageError(f"--validate {path}: takes part in the fit, expected a run that does not")
-    roles = roles_of(arguments.column)
+    request = Request(
+        data=given.data, out=given.out, name=given.name or given.out.stem, settings=settings, etve=given.etve,
+        validate=given.validate, columns=given.column, fit_until_h=given.fit_until, reference=given.reference,
+    )  # fmt: skip
+    return identify(request)
+
+
+def identify(request: Request) -> tuple[dict[str, Any], str]:
+    """Make a model of files, write it and its page; return the result and its text.
+
+    Raises
+    ------
+    CompensatorError
+        If the data or the settings allow no model.
+    """
+    roles = roles_of(request.columns)
     remarks: list[str] = []
-    runs = read_runs(arguments.data, roles, remarks)
-    etve, validation = (read_runs(paths, roles, remarks) for paths in (arguments.etve, arguments.validate))
+    runs = read_runs(request.data, roles, remarks)
+    etve, validation = (read_runs(paths, roles, remarks) for paths in (request.etve, request.validate))
     with progress("fitting") as told:
         calibration = calibrate(
-            runs, settings, period_s=PERIOD_S, name=arguments.name or arguments.out.stem, etve=etve,
-            validation=validation, fit_until_s=None if arguments.fit_until is None else arguments.fit_until * 3600.0,
-            provenance=provenance(arguments), remarks=remarks, told=told,
+            runs, request.settings, period_s=PERIOD_S, name=request.name, etve=etve, validation=validation,
+            fit_until_s=None if request.fit_until_h is None else request.fit_until_h * 3600.0,
+            provenance=provenance(request), remarks=remarks, told=told,
         )  # fmt: skip
-    criticism = criticise(calibration)
-    return write(calibration, criticism, arguments.out, reference=arguments.reference)
+    return write(calibration, criticise(calibration), request.out, reference=request.reference)
 
 
 def write(
@@ -104,21 +154,22 @@ def read_runs(paths: Sequence[Path], roles: Mapping[str, str], remarks: list[str
     return runs
 
 
-def provenance(arguments: argparse.Namespace) -> dict[str, Any]:
+def provenance(request: Request) -> dict[str, Any]:
     """Return where the model comes from: every file with its hash, and what was asked for."""
-    asked = {
-        "kind": arguments.kind, "method": arguments.method, "ttf": list(arguments.ttf), "drive": arguments.drive,
-        "folds": arguments.folds, "columns": list(arguments.column),
-    }  # fmt: skip
-    for key in ("order", "tdtf", "fit_until"):
-        if getattr(arguments, key) is not None:
-            asked[key] = getattr(arguments, key)
-    groups = (("fit", arguments.data), ("etve", arguments.etve), ("validation", arguments.validate))
+    settings = {
+        field.name: getattr(request.settings, field.name)
+        for field in dataclasses.fields(request.settings)
+        if getattr(request.settings, field.name) is not None
+    }
+    if request.fit_until_h is not None:
+        settings["fit_until_h"] = request.fit_until_h
+    groups = (("fit", request.data), ("etve", request.etve), ("validation", request.validate))
     files = [
         {"role": role, "file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
         for role, paths in groups
         for path in paths
     ]
+    asked = {**settings, "columns": list(request.columns)}
     return {"source": f"compensator {__version__} identify", "data": files, "asked": asked}
 
 
