@@ -135,7 +135,7 @@ def calibrate(
     period_s : float
         Sample period, s.
     name : str
-        Name of the model, and of the data in messages.
+        Name of the model.
     fit_until_s : float, optional
         Only samples before this time take part; the rest is held out.
     etve, validation : sequence of Run
@@ -158,10 +158,11 @@ def calibrate(
         If no model can come from this data, with the reason.
     """
     kind = _kind(runs, settings)
-    screen(name, runs, period_s, needs_heat=kind == "heat")
+    data = ", ".join(dict.fromkeys(run.name for run in runs)) or name
+    screen(data, runs, period_s, needs_heat=kind == "heat")
     used = [_mask(run, fit_until_s) for run in runs]
     if sum(int(mask.sum()) for mask in used) * period_s < 7200.0:
-        raise DataError(f"{name}: less than 2 h of samples left for the fit")
+        raise DataError(f"{data}: less than 2 h of samples left for the fit")
     temperature = None
     if kind == "heat":
         temperature = fit_temperature(runs, _until(runs, fit_until_s), settings.ttf, period_s=period_s,

@@ -22,6 +22,8 @@ HOTTEST_AIR_DEGC = 50.0
 MACHINE_DEGC = (-30.0, 150.0)
 #: Deformations of a machine tool's spindle lie in here, peak to peak, µm.
 DEFORMATION_UM = (0.5, 3000.0)
+#: A signal whose standard deviation is less than this times its noise's holds nothing else.
+NOISE_ALONE = 1.5
 #: K per W at rest of anything that is a spindle; a thousandfold beyond is a wrong unit.
 HEAT_K_PER_W = (0.0005, 20.0)
 
@@ -118,7 +120,7 @@ def _check_deformation(name: str, y: Vector) -> None:
         )
     if spread > high:
         raise DataError(f"{name}: y_um moves by {spread:.4g} in all: nanometres? expected µm, at most {high:g} of them")
-    if spread < 4.0 * noise_std(known):
+    if float(np.std(known)) < NOISE_ALONE * noise_std(known):
         raise DataError(f"{name}: y_um moves by {spread:.3g} µm and its noise alone is {noise_std(known):.2g} µm: "
                         "no deformation in it to make a model from")  # fmt: skip
 
@@ -139,6 +141,6 @@ def _check_heat(name: str, runs: Sequence[Run]) -> None:
     if ratio < low:
         raise DataError(f"{name}: heat_w spans {np.ptp(heat):.4g} while T_Q - AT spans {np.ptp(difference):.3g} K: "
                         "milliwatts? expected W")  # fmt: skip
-    if float(np.ptp(difference)) < 6.0 * noise_std(difference):
+    if float(np.std(difference)) < NOISE_ALONE * noise_std(difference):
         raise DataError(f"{name}: T_Q - AT moves by {np.ptp(difference):.2g} K while the heat changes by "
                         f"{np.ptp(heat):.3g} W: is t_q_degc near the heat source?")  # fmt: skip

@@ -1,0 +1,140 @@
+"""`input`: a measured channel acts on Y that the model does not know of.
+
+y += Σ_i gain_i · L(τ_i) · [f(c(t − d)) − f(c at the start)],   f(c) = c, c² or |c|
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from compensator.model.effects.base import Effect, Signals, register
+from compensator.model.effects.hypothesis import (
+    Free,
+    Hypothesis,
+    Matrix,
+    Setting,
+    Vector,
+    Waves,
+    late,
+    lowpass,
+    proposes,
+    shown,
+)
+from compensator.model.effects.stream import Delay, Lag
+from compensator.model.effects.table import Table
+
+CURVES = ("linear", "square", "abs")
+_STREAM: Mapping[str, Callable[[float], float]] = {"linear": lambda c: c, "square": lambda c: c * c, "abs": abs}
+_BATCH: Mapping[str, Callable[[Vector], Vector]] = {"linear": lambda c: c, "square": np.square, "abs": np.abs}
+
+
+@register("input")
+class InputEffect:
+    """The streaming side."""
+
+    kind = "input"
+
+    def __init__(self, table: Mapping[str, Any], period_s: float) -> None:
+        keys = Table("input", table, ("channel", "curve", "tau_min", "gain", "delay_min"))
+        self.channels = (keys.text("channel"),)
+        self._curve = _STREAM[keys.text("curve", CURVES)]
+        taus, self._gains = keys.numbers("tau_min", 0.0, 1e5), keys.numbers("gain")
+        period_min = period_s / 60.0
+        self._lags = [Lag(tau, period_min) for tau in taus]
+        self._delay = Delay(keys.number("delay_min", 0.0, 1440.0), period_min)
+        self._start = math.nan
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], period_s: float) -> Effect:
+        """Make the effect from its table in the model file."""
+        return cls(table, period_s)
+
+    def step(self, signals: Signals) -> float:
+        """Advance by one sample; nothing acts before the channel was seen."""
+        value = signals.channels.get(self.channels[0], math.nan)
+        if math.isnan(value):
+            return 0.0
+        curved = self._curve(value)
+        if math.isnan(self._start):
+            self._start = curved
+        delayed = self._delay.step(curved - self._start)
+        total = 0.0
+        for lag, gain in zip(self._lags, self._gains, strict=True):
+            total += gain * lag.step(delayed)
+        return total
+
+    def snapshot(self) -> tuple[float, ...]:
+        """Return the state."""
+        return (self._start, *self._delay.state, *(value for lag in self._lags for value in lag.state))
+
+    def restore(self, state: tuple[float, ...]) -> None:
+        """Take a state back."""
+        n = len(self._delay.state)
+        self._start, self._delay.state = state[0], tuple(state[1 : n + 1])
+        for i, lag in enumerate(self._lags):
+            lag.state = tuple(state[n + 1 + 2 * i : n + 3 + 2 * i])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputHypothesis(Hypothesis):
+    """The side of a whole record."""
+
+    kind: ClassVar[str] = "input"
+    curve: str = "linear"
+
+    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+        """Return the channel behind each lag."""
+        named = dict(zip((f.name for f in self.free), values, strict=True))
+        curved = _BATCH[self.curve](waves.channels[self.channel])
+        moved = curved - curved[0]
+        delay = named.get("delay_min", 0.0)
+        if delay:
+            moved = late(moved, delay, waves.period_min)
+        taus = [value for name, value in named.items() if name.startswith("tau")]
+        return np.column_stack([lowpass(moved, tau, waves.period_min) for tau in taus])
+
+    def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
+        """Return the table that the engine runs."""
+        named = dict(zip((f.name for f in self.free), values, strict=True))
+        taus = [value for name, value in named.items() if name.startswith("tau")]
+        return {"channel": self.channel, "curve": self.curve, "tau_min": taus, "gain": list(amplitudes),
+                "delay_min": named.get("delay_min", 0.0)}  # fmt: skip
+
+    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
+        """Say what acts."""
+        taus = [shown(v) for n, v in named.items() if n.startswith("tau")]
+        curve = {"linear": "", "square": " (its square)", "abs": " (its size)"}[self.curve]
+        delay = f", {shown(named['delay_min'])} min late" if "delay_min" in named else ""
+        return (
+            f"The channel {self.channel}{curve} moves Y by {rms_um:.2g} µm rms with a lag of {' and '.join(taus)} "
+            f"min{delay}. The model has no such input; feed the channel in."
+        )
+
+
+@proposes
+def propose(setting: Setting) -> Iterator[Hypothesis]:
+    """Propose every channel that moves: one lag, one lag and a delay, two lags, and the curves."""
+    tau = setting.tau()
+    one = (tau,)
+    two = (setting.tau("tau_1_min"), setting.tau("tau_2_min"))
+    delay = Free(name="delay_min", low=0.0, high=60.0, grid=(2.0, 5.0, 10.0, 20.0, 40.0), log=False)
+    for channel in setting.channels:
+        unit = unit_of(channel)
+        yield InputHypothesis(channel=channel, form="lag", free=one, amplitudes=(f"gain_um_per_{unit}",))
+        yield InputHypothesis(channel=channel, form="lag and delay", free=(tau, delay),
+                              amplitudes=(f"gain_um_per_{unit}",))  # fmt: skip
+        yield InputHypothesis(channel=channel, form="two lags", free=two,
+                              amplitudes=(f"gain_1_um_per_{unit}", f"gain_2_um_per_{unit}"))  # fmt: skip
+        yield InputHypothesis(channel=channel, form="square", curve="square", free=one,
+                              amplitudes=(f"gain_um_per_{unit}2",))  # fmt: skip
+
+
+def unit_of(channel: str) -> str:
+    """Return the unit that a channel's name carries; a temperature's gain is per kelvin."""
+    unit = channel.rsplit("_", 1)[-1] if "_" in channel else "unit"
+    return {"degc": "k"}.get(unit, unit)

@@ -1,0 +1,99 @@
+"""`compensator identify` as its user runs it."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensator.cli import main
+from compensator.demo import write_table
+from compensator.model.model_file import load_model
+from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W, published
+
+SPINDLE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
+
+
+def table(path, heat_w, seed, **changes):
+    heat, ambient, difference, y, _, _ = published(heat_w, seed)
+    at = 21.0 + ambient
+    columns = {
+        "t_s": np.arange(heat.size) * 60.0,
+        "t_q_degc": at + difference,
+        "at_degc": at,
+        "y_um": y,
+        "heat_w": heat,
+    }
+    write_table(path, columns | changes)
+    return path
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    return table(tmp_path / "run.csv", CALIBRATION_W, 1)
+
+
+def test_model_page_and_summary(tmp_path, calibration, capsys):
+    other = table(tmp_path / "other.csv", VALIDATION_W, 2)
+    out = tmp_path / "out" / "model.toml"
+    arguments = ["identify", str(calibration), "--validate", str(other), "--out", str(out), "--order", "3", "3", "2"]
+    assert main([*arguments, "--reference", "quill"]) == 0
+    printed = capsys.readouterr().out
+    assert "time constants" in printed
+    assert "other.csv  held out" in printed
+    model = load_model(out)
+    assert model.ttf.in_s().dc_gain == pytest.approx(0.2512, rel=0.01)
+    assert model.provenance["data"][0]["sha256"] == hashlib.sha256(calibration.read_bytes()).hexdigest()
+    assert model.dtf.covariance is not None
+    assert model.validity["heat_w"][1] > 90.0
+    page = (out.parent / "report.html").read_text(encoding="utf-8")
+    for words in ("step response", "poles and zeros", "autocorrelation", "Beside the reference model", model.sha256):
+        assert words in page
+    assert main(["simulate", str(other), "--model", str(out), "--out", str(tmp_path / "s.csv"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["fit_pct"] > 90.0
+
+
+def test_json_and_a_direct_model_where_nobody_knows_the_heat(tmp_path, capsys):
+    heat, ambient, difference, y, _, _ = published(CALIBRATION_W, 1)
+    columns = {
+        "t_s": np.arange(heat.size) * 60.0,
+        "warm": 21.0 + ambient + difference,
+        "air": 21.0 + ambient,
+        "y_um": y,
+    }
+    write_table(tmp_path / "run.csv", columns)
+    out = tmp_path / "model.toml"
+    names = ["--column", "t_q_degc=warm", "--column", "at_degc=air"]
+    assert main(["identify", str(tmp_path / "run.csv"), *names, "--out", str(out), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["kind"] == "direct"
+    assert set(result["paths"]) == {"DTF", "TDTF"}
+    assert load_model(out).kind == "direct"
+    assert result["model_sha256"] == load_model(out).sha256
+
+
+def test_bad_data_gives_one_line_and_no_model(tmp_path, capsys):
+    bad = table(tmp_path / "bad.csv", CALIBRATION_W, 1, y_um=np.zeros(720))
+    out = tmp_path / "model.toml"
+    assert main(["identify", str(bad), "--out", str(out)]) == 2
+    assert not out.exists()
+    said = capsys.readouterr().err
+    assert "bad.csv" in said
+    assert said.count("\n") == 1
+
+
+def test_a_run_cannot_judge_what_it_made(tmp_path, calibration):
+    arguments = ["identify", str(calibration), "--validate", str(calibration), "--out", str(tmp_path / "m.toml")]
+    assert main(arguments) == 2
+
+
+@pytest.mark.skipif(not SPINDLE.exists(), reason="the measured spindle is not here")
+def test_the_measured_spindle(tmp_path, capsys):
+    roles = {"t_q_degc": "t5_degc", "at_degc": "t16_degc", "y_um": "ch3_um"}
+    columns = [word for role, name in roles.items() for word in ("--column", f"{role}={name}")]
+    arguments = ["identify", str(SPINDLE), *columns, "--fit-until", "20", "--out", str(tmp_path / "m.toml"), "--json"]
+    assert main(arguments) == 0
+    fitted, held_out = json.loads(capsys.readouterr().out)["parts"]
+    assert (fitted["samples"], held_out["samples"]) == (1200, 720)
+    assert held_out["rms_um"] < held_out["persistence_rms_um"] < held_out["no_compensation_rms_um"]

@@ -1,0 +1,120 @@
+"""Data that no model can come from is refused with its reason; runs are put right before."""
+
+import numpy as np
+import pytest
+
+from compensator.errors import DataError
+from compensator.identify.runs import noise_std, runs_of, without_wild
+from compensator.identify.screening import screen
+from compensator.tables import Record
+from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
+
+
+def columns(n=720):
+    heat, ambient, difference, y, _, _ = published(CALIBRATION_W, 1)
+    at = 21.0 + ambient
+    return {"t_q_degc": (at + difference)[:n], "at_degc": at[:n], "y_um": y[:n], "heat_w": heat[:n].copy()}
+
+
+def fahrenheit(values):
+    return values * 1.8 + 32.0
+
+
+def spoil(name):
+    c = columns()
+    change = {
+        "heat constant": lambda: c.update(heat_w=np.full(720, 90.0)),
+        "T_Q constant": lambda: c.update(t_q_degc=np.full(720, 25.0)),
+        "y constant": lambda: c.update(y_um=np.zeros(720)),
+        "y in mm": lambda: c.update(y_um=c["y_um"] / 1000.0),
+        "y in nm": lambda: c.update(y_um=c["y_um"] * 1000.0),
+        "heat in kW": lambda: c.update(heat_w=c["heat_w"] / 1000.0),
+        "heat in mW": lambda: c.update(heat_w=c["heat_w"] * 1000.0),
+        "AT in F": lambda: c.update(at_degc=fahrenheit(c["at_degc"])),
+        "both in F": lambda: c.update(at_degc=fahrenheit(c["at_degc"]), t_q_degc=fahrenheit(c["t_q_degc"])),
+        "T_Q in F": lambda: c.update(t_q_degc=fahrenheit(c["t_q_degc"])),
+        "kelvin": lambda: c.update(at_degc=c["at_degc"] + 273.15, t_q_degc=c["t_q_degc"] + 273.15),
+        "millidegrees": lambda: c.update(t_q_degc=c["t_q_degc"] * 1000.0),
+        "kilodegrees": lambda: c.update(at_degc=c["at_degc"] / 1000.0),
+        "y missing": lambda: c["y_um"].__setitem__(slice(0, 500), np.nan),
+        "one sensor twice": lambda: c.update(t_q_degc=c["at_degc"]),
+        "y is noise": lambda: c.update(y_um=np.random.default_rng(0).normal(0, 0.5, 720)),
+        "T_Q far away": lambda: c.update(t_q_degc=c["at_degc"] + np.random.default_rng(1).normal(0, 0.1, 720)),
+    }  # fmt: skip
+    change[name]()
+    return c
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("heat constant", "heat_w = 90 in every row"), ("T_Q constant", "t_q_degc = 25 in every row"),
+        ("y constant", "y_um = 0 in every row"), ("y in mm", "millimetres"), ("y in nm", "nanometres"),
+        ("heat in kW", "kilowatts"), ("heat in mW", "milliwatts"), ("AT in F", "°F"), ("both in F", "°F"),
+        ("T_Q in F", "°F"), ("kelvin", "kelvin"), ("millidegrees", "thousandths"), ("kilodegrees", "thousands"),
+        ("y missing", "y_um is missing"), ("one sensor twice", "the same in every row"), ("y is noise", "noise"),
+        ("T_Q far away", "near the heat source"),
+    ],
+)  # fmt: skip
+def test_bad_data(name, words):
+    with pytest.raises(DataError, match=words):
+        screen("bad.csv", runs_from(spoil(name)), 60.0, needs_heat=True)
+
+
+def test_too_short():
+    with pytest.raises(DataError, match="at least 120 min"):
+        screen("short.csv", runs_from(columns(100)), 60.0, needs_heat=True)
+
+
+def test_good_data_passes():
+    screen("good.csv", runs_from(columns()), 60.0, needs_heat=True)
+
+
+def test_a_short_gap_is_bridged_and_a_long_one_splits():
+    c = columns()
+    c["t_q_degc"][100:130] = np.nan
+    c["at_degc"][300:400] = np.nan
+    runs = runs_from(c)
+    assert [run.t_s.size for run in runs] == [300, 320]
+    assert np.isfinite(runs[0].difference_k).all()
+    assert runs[0].difference_k[115] == pytest.approx(
+        (runs[0].difference_k[99] + runs[0].difference_k[130]) / 2, abs=0.3
+    )
+
+
+def test_a_gap_in_y_stays_a_gap():
+    c = columns()
+    c["y_um"][50:60] = np.nan
+    assert np.isnan(runs_from(c)[0].y_um[50:60]).all()
+
+
+def test_a_wild_reading_goes_and_a_step_stays():
+    rng = np.random.default_rng(0)
+    values = rng.normal(0.0, 0.05, 400)
+    values[200:] += 5.0
+    values[77] += 4.0
+    cleaned, count = without_wild(values)
+    assert count == 1
+    assert np.isnan(cleaned[77])
+    assert np.isnan(cleaned).sum() == 1
+
+
+def test_remarks_name_the_column():
+    c = columns()
+    c["y_um"][400] += 60.0
+    said = [remark for _, remarks in runs_of("day.csv", Record(np.arange(720) * 60.0, c)) for remark in remarks]
+    assert said == ["day.csv: y_um: 1 wild single reading(s) left out"]
+
+
+def test_noise_is_told_apart_from_steps_and_converter_steps():
+    rng = np.random.default_rng(2)
+    noise = rng.normal(0.0, 0.04, 3000)
+    steps = np.repeat([0.0, 10.0, -5.0, 20.0, 3.0], 600)
+    assert noise_std(noise + steps) == pytest.approx(0.04, rel=0.1)
+    coarse = np.round(np.linspace(0, 3, 3000) / 0.02) * 0.02
+    assert 0.0 < noise_std(coarse) < 0.02
+
+
+def test_the_reference_is_the_mean_of_the_rest():
+    run = runs_from(columns())[0]
+    assert abs(np.mean(run.difference_k[:30])) < 1e-9
