@@ -356,7 +356,7 @@ class _Warnings:
         t_low, t_high = self.calibration.model.validity["t_q_degc"]
         return (
             f"Valid for AT from {low:.0f} to {high:.0f} °C and T_Q from {t_low:.0f} to {t_high:.0f} °C (what was seen, "
-            "and a third more); outside, the service says degraded."
+            "and a third more); outside, the service holds."
         )
 
     def _pairs(self) -> list[tuple[Run, npt.NDArray[np.bool_]]]:

@@ -116,7 +116,7 @@ def _lines(model: ThermalModel) -> Iterator[str]:
         "at_walk_std_k": estimator.at_walk_std_k,
     })  # fmt: skip
     if model.validity:
-        yield from ("", "# Ranges that the model is trusted in; outside them the service says degraded.", "[validity]")
+        yield from ("", "# Ranges that the model is trusted in; outside them the service holds.", "[validity]")
         yield from _pairs({key: list(bounds) for key, bounds in model.validity.items()})
     yield from ("", "# Standard deviation of the model's own error in y.", "[uncertainty]")
     yield from _pairs({"y_std_um": model.y_std_um})
