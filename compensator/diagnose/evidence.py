@@ -1,0 +1,192 @@
+"""The residual of a model over measured runs, with its nuisances, as the search wants it.
+
+    residual = measured − free run of the base model = Σ effects + nuisances + noise
+
+Nuisances are what every record has and nobody is to blame for: its zero and its unknown initial state. They are
+projected out of everything before anything is compared, so that they are never mistaken for an effect.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from compensator.errors import DataError
+from compensator.identify.output_error import low_frequency_ratio
+from compensator.identify.runs import Run, noise_std
+from compensator.model.effects.hypothesis import Setting, Waves
+from compensator.model.engine import Engine
+from compensator.model.thermal_model import ThermalModel
+from compensator.model.transfer_function import SampledTransferFunction
+
+Vector = npt.NDArray[np.float64]
+Matrix = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+#: An initial state moves y by no more than about this many times its spread, with the weight of one sample.
+STATE_PRIOR = 1e-3
+#: A channel whose span is less than this many of its noise deviations does not move.
+MOVES = 8.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """Residuals and signals of some runs.
+
+    Parameters
+    ----------
+    runs : tuple of Run
+        Measured data.
+    waves : tuple of Waves
+        Signals of the base model on each run.
+    residual : numpy.ndarray, shape (n,)
+        Of all runs, one after another, µm; 0 where it is not used.
+    used : numpy.ndarray of bool, shape (n,)
+        Samples that take part.
+    basis : numpy.ndarray, shape (n, m)
+        Orthonormal columns that the nuisances span on the samples used.
+    setting : Setting
+        What proposals may build on.
+    """
+
+    runs: tuple[Run, ...]
+    waves: tuple[Waves, ...]
+    residual: Vector
+    used: Mask
+    basis: Matrix
+    setting: Setting
+
+    @property
+    def count(self) -> int:
+        """Number of samples used."""
+        return int(self.used.sum())
+
+    def without_nuisances(self, columns: Matrix) -> Matrix:
+        """Project the nuisances out of columns, which are zero where samples are not used."""
+        return np.asarray(columns - self.basis @ (self.basis.T @ columns))
+
+    def hidden(self, mask: Mask) -> Evidence:
+        """Return the evidence without some of its samples."""
+        used = self.used & ~mask
+        return gathered(self.runs, self.waves, np.where(self.used, self.residual, np.nan), used, self.setting)
+
+    def parts(self, values: Vector) -> list[Vector]:
+        """Cut a signal of all runs into one for each run, samples used only."""
+        cuts = np.cumsum([wave.size for wave in self.waves])[:-1]
+        pairs = zip(np.split(values, cuts), np.split(self.used, cuts), strict=True)
+        return [v[u] for v, u in pairs]
+
+    def colour(self, values: Vector) -> float:
+        """Return how much more power a residual has at low frequencies than white noise of its variance."""
+        return max(1.0, low_frequency_ratio(self.parts(values)))
+
+
+def waves_of(model: ThermalModel, run: Run) -> Waves:
+    """Run the base model's paths over a run, the heat by the plain inverse: without lag, and linear."""
+    drive = run.difference_k
+    if model.ttf is not None:
+        drive = np.asarray(lfilter(model.ttf.sampled.a, model.ttf.sampled.b, drive))
+    tdtf = model.tdtf.sampled if model.tdtf else SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=model.period_s)
+    return Waves(
+        period_min=model.period_s / 60.0, drive=drive, ambient_k=run.ambient_k,
+        y_dtf_um=model.dtf.sampled.response(drive), y_tdtf_um=tdtf.response(run.ambient_k),
+        channels={name: values for name, values in run.channels.items() if np.isfinite(values).all()},
+        dtf=model.dtf.sampled, tdtf=tdtf,
+    )  # fmt: skip
+
+
+def effects_of(model: ThermalModel, run: Run) -> Vector:
+    """Return what the effects that the model already has add, µm."""
+    if not model.effects:
+        return np.zeros(run.t_s.size)
+    exact = dataclasses.replace(model, estimator=dataclasses.replace(model.estimator, method="inverse"))
+    engine = Engine(exact)
+    engine.set_reference(*run.reference)
+    return np.array([sum(e.y_effects_um) for e in engine.run(run.t_q_degc, run.at_degc, run.channels)])
+
+
+def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
+    """Form the residual of a model over runs.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        The base model.
+    runs : sequence of Run
+        Measured data with y.
+
+    Raises
+    ------
+    DataError
+        If there is no y in it.
+    """
+    waves = [waves_of(model, run) for run in runs]
+    parts = [
+        run.y_um - wave.y_dtf_um - wave.y_tdtf_um - effects_of(model, run)
+        for run, wave in zip(runs, waves, strict=True)
+    ]
+    residual = np.concatenate(parts)
+    used = np.isfinite(residual)
+    if used.sum() < 60:
+        raise DataError(f"{int(used.sum())} samples with y_um, expected at least 60")
+    return gathered(runs, waves, residual, used, _setting(model, runs, waves))
+
+
+def gathered(
+    runs: Sequence[Run], waves: Sequence[Waves], residual: Vector, used: Mask, setting: Setting
+) -> Evidence:  # fmt: skip
+    """Put runs and their residual together with the basis of their nuisances."""
+    blocks = [_nuisances(wave, setting) for wave in waves]
+    sizes = [wave.size for wave in waves]
+    table = np.zeros((sum(sizes), sum(block.shape[1] for block in blocks)))
+    row = column = 0
+    for block in blocks:
+        table[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    table[~used] = 0.0
+    u, s, _ = np.linalg.svd(table, full_matrices=False)
+    basis = u[:, s > STATE_PRIOR * s[0]]
+    return Evidence(
+        runs=tuple(runs), waves=tuple(waves), residual=np.where(used, residual, 0.0), used=used, basis=basis,
+        setting=setting,
+    )  # fmt: skip
+
+
+def _nuisances(wave: Waves, setting: Setting) -> Matrix:
+    """Return a constant and the decay of every mode, each of size 1."""
+    minutes = np.arange(wave.size) * wave.period_min
+    taus: list[float] = []
+    for tau in sorted({round(t, 1) for values in setting.taus_min.values() for t in values}):
+        if tau > 3.0 * wave.period_min and (not taus or tau > 1.3 * taus[-1]):
+            taus.append(tau)
+    return np.column_stack([np.ones(wave.size), *(np.exp(-minutes / tau) for tau in taus)])
+
+
+def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -> Setting:
+    common = [name for name in waves[0].channels if all(name in wave.channels for wave in waves)]
+    moving = {}
+    for name in common:
+        values = np.concatenate([wave.channels[name] for wave in waves])
+        if np.ptp(values) > MOVES * noise_std(values) and np.ptp(values) > 0.0:
+            moving[name] = float(np.ptp(values))
+    paths = {"DTF": model.dtf, "TDTF": model.tdtf}
+    return Setting(
+        channels=tuple(moving), has_ambient=model.tdtf is not None, has_ttf=model.ttf is not None,
+        minutes=max(wave.size for wave in waves) * waves[0].period_min, period_min=waves[0].period_min,
+        sizes_um={
+            "DTF": max(float(np.ptp(wave.y_dtf_um)) for wave in waves),
+            "TDTF": max(float(np.ptp(wave.y_tdtf_um)) for wave in waves),
+        },
+        taus_min={
+            name: tuple(t for t in path.sampled.time_constants_min() if t > 0.0)
+            for name, path in paths.items()
+            if path is not None
+        },
+        spans=moving,
+        functions={name: (path.sampled.b, path.sampled.a) for name, path in paths.items() if path is not None},
+    )  # fmt: skip
