@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from compensator import __version__
+from compensator.commands.arguments import diagnose as add_diagnose
 from compensator.commands.arguments import identify as add_identify
 from compensator.errors import CompensatorError, UsageError
 from drivers.errors import DriverError
@@ -87,6 +88,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     example = "compensator identify run.csv --validate other.csv --out model.toml"
     add_identify(_command(commands, "identify", _identify, "a model from measured runs", example))
+    example = "compensator diagnose day.mcap --model model.toml --out diagnosis"
+    add_diagnose(_command(commands, "diagnose", _diagnose, "what a model lacks, from measured data", example))
     export = _command(
         commands, "export", _export, "a recording as a table", "compensator export day.mcap --out day.csv"
     )
@@ -221,6 +224,14 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 def _identify(arguments: argparse.Namespace) -> int:
     from compensator.commands.identify import run
+
+    result, text = run(arguments)
+    _print(arguments, result, text)
+    return 0
+
+
+def _diagnose(arguments: argparse.Namespace) -> int:
+    from compensator.commands.diagnose import run
 
     result, text = run(arguments)
     _print(arguments, result, text)

@@ -32,3 +32,12 @@ def identify(parser: argparse.ArgumentParser) -> None:
     words = "a run that only judges; may be repeated"
     add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
     add("--reference", metavar="MODEL", help="another model to put the coefficients beside")
+
+
+def diagnose(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `diagnose`."""
+    add = parser.add_argument
+    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
+    add("--model", required=True, help="a model file, or quill")
+    add("--out", type=Path, required=True, metavar="DIR", help="diagnosis.json, model.toml and report.html come there")
+    add("--column", action="append", default=[], metavar="ROLE=NAME", help="role of a column of another name")

@@ -140,11 +140,13 @@ def finished(calibration: Calibration, criticism: Criticism) -> ThermalModel:
     return dataclasses.replace(calibration.model, provenance=dict(calibration.model.provenance) | kept)
 
 
-def read_runs(paths: Sequence[Path], roles: Mapping[str, str], remarks: list[str]) -> list[Run]:
+def read_runs(
+    paths: Sequence[Path], roles: Mapping[str, str], remarks: list[str], *, period_s: float = PERIOD_S
+) -> list[Run]:
     """Read tables and recordings into runs; what had to be put right is added to the remarks."""
     runs = []
     for path in paths:
-        data = load_data(path, PERIOD_S, roles)
+        data = load_data(path, period_s, roles)
         remarks += data.remarks
         for record in data.records:
             require(path, record, _NEEDED)

@@ -48,6 +48,8 @@ class Evidence:
         Of all runs, one after another, µm; 0 where it is not used.
     used : numpy.ndarray of bool, shape (n,)
         Samples that take part.
+    nuisances : numpy.ndarray, shape (n, k)
+        A constant and the decay of every mode, of each run, on every sample.
     basis : numpy.ndarray, shape (n, m)
         Orthonormal columns that the nuisances span on the samples used.
     setting : Setting
@@ -58,6 +60,7 @@ class Evidence:
     waves: tuple[Waves, ...]
     residual: Vector
     used: Mask
+    nuisances: Matrix
     basis: Matrix
     setting: Setting
 
@@ -74,6 +77,21 @@ class Evidence:
         """Return the evidence without some of its samples."""
         used = self.used & ~mask
         return gathered(self.runs, self.waves, np.where(self.used, self.residual, np.nan), used, self.setting)
+
+    def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
+        """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
+
+        Parameters
+        ----------
+        raw, effects : numpy.ndarray, shape (n,)
+            Residual of the base model, and what is taken off it, µm.
+        at_rest : bool
+            Whether only the zero of each run is unknown, and not its initial state.
+        """
+        open_ = raw - effects
+        table = self.nuisances[:, :: self.nuisances.shape[1] // len(self.waves)] if at_rest else self.nuisances
+        coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
+        return np.asarray(open_ - table @ coefficients)
 
     def parts(self, values: Vector) -> list[Vector]:
         """Cut a signal of all runs into one for each run, samples used only."""
@@ -148,11 +166,11 @@ def gathered(
     for block in blocks:
         table[row : row + block.shape[0], column : column + block.shape[1]] = block
         row, column = row + block.shape[0], column + block.shape[1]
-    table[~used] = 0.0
-    u, s, _ = np.linalg.svd(table, full_matrices=False)
+    seen = np.where(used[:, None], table, 0.0)
+    u, s, _ = np.linalg.svd(seen, full_matrices=False)
     basis = u[:, s > STATE_PRIOR * s[0]]
     return Evidence(
-        runs=tuple(runs), waves=tuple(waves), residual=np.where(used, residual, 0.0), used=used, basis=basis,
+        runs=tuple(runs), waves=tuple(waves), residual=np.where(used, residual, 0.0), used=used, nuisances=table, basis=basis,
         setting=setting,
     )  # fmt: skip
 
@@ -169,11 +187,13 @@ def _nuisances(wave: Waves, setting: Setting) -> Matrix:
 
 def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -> Setting:
     common = [name for name in waves[0].channels if all(name in wave.channels for wave in waves)]
-    moving = {}
+    moving, zeroed = {}, set()
     for name in common:
         values = np.concatenate([wave.channels[name] for wave in waves])
         if np.ptp(values) > MOVES * noise_std(values) and np.ptp(values) > 0.0:
             moving[name] = float(np.ptp(values))
+            if np.min(np.abs(values)) < 0.05 * np.ptp(values):
+                zeroed.add(name)
     paths = {"DTF": model.dtf, "TDTF": model.tdtf}
     return Setting(
         channels=tuple(moving), has_ambient=model.tdtf is not None, has_ttf=model.ttf is not None,
@@ -187,6 +207,6 @@ def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -
             for name, path in paths.items()
             if path is not None
         },
-        spans=moving,
+        spans=moving, zeroed=frozenset(zeroed),
         functions={name: (path.sampled.b, path.sampled.a) for name, path in paths.items() if path is not None},
     )  # fmt: skip

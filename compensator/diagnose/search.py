@@ -22,16 +22,17 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.joint import Joint, Part, columns_of, fit_joint
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, proposals
+from compensator.model.effects.unobserved import Unobserved
 
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
 
 #: Most effects looked for.
 MOST = 4
-#: Hypotheses that are fitted after each scan.
-POLISHED = 14
-#: Least share of the sum of squares that an effect must take: less is of no use to anybody.
-WORTH = 0.02
+#: Hypotheses that are fitted after each scan, and where something stands already.
+POLISHED, EXCHANGED = 12, 6
+#: A residual with less colour than this is noise, and no hidden source is looked for in it.
+CLEAN = 1.3
 
 Told = Callable[[int, int], None]
 
@@ -92,25 +93,48 @@ class Search:
         self.places = len({hypothesis.place for hypothesis in self.hypotheses}) + 1
         self._grids: dict[int, list[tuple[tuple[float, ...], Matrix]]] = {}
 
-    def run(self) -> Found:
-        """Search."""
+    def run(self, *, hidden: bool = True) -> Found:
+        """Search: what the inputs explain first, then whether a source that no channel shows explains it better.
+
+        Parameters
+        ----------
+        hidden : bool
+            Whether a hidden source is looked for.
+        """
         before = fit_joint(self.evidence, [])
-        path = [before]
-        tried: list[list[Tried]] = []
-        while len(path) <= MOST:
-            step = self._add(path[-1])
-            if not step or step[0].joint.cost > (1.0 - WORTH) * path[-1].cost:
-                break
-            better = self._improved(step[0].joint)
-            if self.score(better, 1.0) >= self.score(path[-1], 1.0):
-                break
-            path.append(better)
-            tried.append(step)
-        colour = self.evidence.colour(path[-1].residual)
-        best = min(path, key=lambda joint: self.score(joint, colour))
-        best = self._thinned(best, colour)
+        path = self._forward([before])
+        coloured = hidden and self.evidence.colour(path[-1].residual) > CLEAN
+        others = self._with_hidden(path) if coloured else []
+        ends = [path[-1], *others]
+        last = min(ends, key=lambda joint: self.score(joint, 1.0))
+        colour = self.evidence.colour(last.residual)
+        best = self._thinned(min([*path, *others], key=lambda joint: self.score(joint, colour)), colour)
         rivals = tuple(self._rivals(best, i) for i in range(len(best.parts)))
         return Found(before=before, joint=best, colour=colour, rivals=rivals, places=self.places)
+
+    def _forward(self, path: list[Joint]) -> list[Joint]:
+        """Add one effect after another while each is worth it."""
+        while len(path) <= MOST:
+            last = path[-1]
+            step = [t for t in self._add(last) if t.joint.cost < (1.0 - t.part.hypothesis.worth) * last.cost]
+            if not step:
+                break
+            better = self._improved(step[0].joint)
+            if self.score(better, 1.0) >= self.score(last, 1.0):
+                break
+            path.append(better)
+        return path
+
+    def _with_hidden(self, path: Sequence[Joint]) -> list[Joint]:
+        """Return fits with a hidden source beside what was found before it, or instead of it."""
+        found = []
+        for base in path[:3]:
+            hidden = switchings(self.evidence, base.residual)
+            if hidden is not None:
+                starts = [(part.hypothesis, part.values) for part in base.parts]
+                found.append(fit_joint(self.evidence, [*starts, hidden]))
+        found.sort(key=lambda joint: self.score(joint, 1.0))
+        return [self._improved(joint) for joint in found[:1]]
 
     def score(self, joint: Joint, colour: float) -> float:
         """Return *J*."""
@@ -127,20 +151,13 @@ class Search:
         base = fit_joint(self.evidence, starts) if without is not None else joint
         taken = {part.hypothesis.place for part in kept}
         candidates = [h for h in self.hypotheses if h.place not in taken]
-        ranked = sorted(self._scan(base, candidates), key=lambda item: item[0])[:POLISHED]
+        most = POLISHED if without is None else EXCHANGED
+        ranked = sorted(self._scan(base, candidates), key=lambda item: item[0])[:most]
         found = []
-        for _, hypothesis, values in [*ranked, *self._switched(base, taken)]:
+        for _, hypothesis, values in ranked:
             fitted = fit_joint(self.evidence, [*starts, (hypothesis, values)])
             found.append(Tried(joint=fitted, index=len(starts), score=self.score(fitted, 1.0)))
         return sorted(found, key=lambda item: item.score)
-
-    def _switched(
-        self, base: Joint, taken: set[tuple[str, str, str]]
-    ) -> list[tuple[float, Hypothesis, tuple[float, ...]]]:
-        if ("unobserved", "", "") in taken:
-            return []
-        hypothesis = switchings(self.evidence, base.residual)
-        return [] if hypothesis is None else [(0.0, hypothesis[0], hypothesis[1])]
 
     def _scan(self, base: Joint, candidates: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis, tuple[float, ...]]]:
         """Rank hypotheses by what their best grid point would take off the residual."""
@@ -182,13 +199,24 @@ class Search:
             return joint
         for _ in range(2):
             changed = False
-            for i in range(len(joint.parts)):
-                others = self._add(joint, without=i)
+            for i, part in enumerate(joint.parts):
+                others = (
+                    self._hidden_again(joint, i) if isinstance(part.hypothesis, Unobserved) else self._add(joint, i)
+                )
                 if others and others[0].score < self.score(joint, 1.0) - 1e-6:
                     joint, changed = others[0].joint, True
             if not changed:
                 break
         return joint
+
+    def _hidden_again(self, joint: Joint, index: int) -> list[Tried]:
+        """Look for the hidden source again, the other effects being what they are now."""
+        kept = [(p.hypothesis, p.values) for i, p in enumerate(joint.parts) if i != index]
+        hidden = switchings(self.evidence, fit_joint(self.evidence, kept).residual)
+        if hidden is None:
+            return []
+        fitted = fit_joint(self.evidence, [*kept[:index], hidden, *kept[index:]])
+        return [Tried(joint=fitted, index=index, score=self.score(fitted, 1.0))]
 
     def _thinned(self, joint: Joint, colour: float) -> Joint:
         """Leave out every effect that is not worth its parameters."""
@@ -197,15 +225,16 @@ class Search:
                 fit_joint(self.evidence, [(p.hypothesis, p.values) for k, p in enumerate(joint.parts) if k != i])
                 for i in range(len(joint.parts))
             ]
-            best = min(fewer, key=lambda j: self.score(j, colour))
-            small = joint.cost > (1.0 - WORTH) * best.cost
-            if self.score(best, colour) > self.score(joint, colour) and not small:
+            out = min(range(len(fewer)), key=lambda i: self.score(fewer[i], colour))
+            small = joint.cost > (1.0 - joint.parts[out].hypothesis.worth) * fewer[out].cost
+            if self.score(fewer[out], colour) > self.score(joint, colour) and not small:
                 return joint
-            joint = best
+            joint = fewer[out]
         return joint
 
     def _rivals(self, joint: Joint, index: int) -> tuple[Tried, ...]:
-        return tuple(self._add(joint, without=index))
+        others = self._add(joint, without=index)
+        return tuple(t for t in others if t.part.hypothesis.place != joint.parts[index].hypothesis.place)
 
 
 def _taken(x: Matrix, residual: Vector) -> float:

@@ -13,9 +13,12 @@ from compensator.model.effects.unobserved import Unobserved
 
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
+Time = tuple[int, float]
 
 #: Most switchings looked for.
-MOST = 16
+MOST = 32
+#: The lag is no longer than this share of the record: a longer one is a ramp.
+LONGEST_SHARE = 0.15
 #: Points of time that are tried in a record.
 POINTS = 240
 
@@ -36,56 +39,71 @@ def switchings(evidence: Evidence, residual: Vector) -> tuple[Unobserved, tuple[
         A hypothesis with its times, and where the search of its lag begins.
     """
     tau = evidence.setting.tau()
-    best: tuple[float, float, list[int]] | None = None
-    where = _times(evidence)
-    for lag in tau.grid[::2]:
-        table = _steps(evidence, where, lag)
-        score, chosen = _pursue(table, residual, evidence.count)
-        if chosen and (best is None or score < best[0]):
-            best = (score, lag, chosen)
+    high = max(evidence.setting.minutes * LONGEST_SHARE, 2.0 * tau.low)
+    lags = [float(lag) for lag in np.geomspace(tau.low, high, 7)]
+    grid = _grid(evidence)
+    rough = []
+    for lag in lags:
+        score, chosen = _pursue(_steps(evidence, grid, lag), residual, evidence.count)
+        if chosen:
+            rough.append((score, lag))
+    best: tuple[float, float, list[Time]] | None = None
+    for _, lag in sorted(rough)[:2]:
+        score, times = _carefully(evidence, residual, grid, lag)
+        if times and (best is None or score < best[0]):
+            best = (score, lag, times)
     if best is None:
         return None
-    times = tuple(sorted(where[i] for i in best[2]))
+    found = tuple(sorted(best[2]))
     hypothesis = Unobserved(
-        form="switched", free=(Free(name="tau_min", low=tau.low, high=tau.high, grid=()),),
-        amplitudes=tuple(f"size_{i}_um" for i in range(1, len(times) + 1)), times=times,
+        form="switched", free=(Free(name="tau_min", low=tau.low, high=high, grid=()),),
+        amplitudes=tuple(f"size_{i}_um" for i in range(1, len(found) + 1)), times=found,
         order=tuple(id(wave) for wave in evidence.waves),
     )  # fmt: skip
     return hypothesis, (best[1],)
 
 
-def _times(evidence: Evidence) -> list[tuple[int, float]]:
+def _grid(evidence: Evidence) -> list[Time]:
     result = []
     for record, wave in enumerate(evidence.waves):
-        stride = max(1, wave.size // POINTS)
-        result += [(record, float(k * wave.period_min)) for k in range(2, wave.size - 2, stride)]
+        result += [(record, float(k * wave.period_min)) for k in range(2, wave.size - 2, _stride(wave.size))]
     return result
 
 
-def _steps(evidence: Evidence, where: list[tuple[int, float]], lag: float) -> Matrix:
+def _stride(size: int) -> int:
+    return max(1, size // POINTS)
+
+
+def _steps(evidence: Evidence, where: list[Time], lag: float) -> Matrix:
     """Return one column for each time: a step behind the lag, of norm 1, nuisances taken out."""
     sizes = [wave.size for wave in evidence.waves]
     begin = np.cumsum([0, *sizes[:-1]])
     period = evidence.setting.period_min
-    shapes = [lowpass(np.concatenate(([0.0], np.ones(size))), lag, period)[1:] for size in sizes]
+    longest = max(sizes)
+    shape = lowpass(np.concatenate(([0.0], np.ones(longest + 1))), lag, period)[1:]
     table = np.zeros((sum(sizes), len(where)))
     for column, (record, at) in enumerate(where):
-        first = round(at / period)
-        table[begin[record] + first : begin[record] + sizes[record], column] = shapes[record][: sizes[record] - first]
+        first = int(at / period)
+        part = at / period - first
+        room = sizes[record] - first
+        step = shape[:room].copy()
+        # Between two samples, a step is as much of the one before as of the one after.
+        step[1:] = (1.0 - part) * shape[1:room] + part * shape[: room - 1]
+        step[0] *= 1.0 - part
+        table[begin[record] + first : begin[record] + sizes[record], column] = step
     table[~evidence.used] = 0.0
     table = evidence.without_nuisances(table)
     norm = np.linalg.norm(table, axis=0)
     norm[norm < 1e-9] = np.inf
-    return table / norm
+    return np.asarray(table / norm)
 
 
 def _pursue(table: Matrix, residual: Vector, count: int) -> tuple[float, list[int]]:
     """Take the best step, refit, and go on while each is worth its two parameters (orthogonal matching pursuit)."""
     chosen: list[int] = []
-    left, score = residual, count * math.log(float(residual @ residual) + 1e-12)
-    first = score
-    q = np.zeros((residual.size, 0))
     best: list[int] = []
+    left, score = residual, _score(residual, 0, count)
+    q = np.zeros((residual.size, 0))
     while len(chosen) < MOST:
         match = np.abs(table.T @ left)
         match[chosen] = 0.0
@@ -97,9 +115,63 @@ def _pursue(table: Matrix, residual: Vector, count: int) -> tuple[float, list[in
         q = np.column_stack((q, column / norm))
         chosen.append(i)
         left = residual - q @ (q.T @ residual)
-        now = count * math.log(float(left @ left) + 1e-12) + (1 + 2 * len(chosen)) * math.log(count)
+        now = _score(left, len(chosen), count)
         if now < score:
             score, best = now, list(chosen)
         elif len(chosen) > len(best) + 2:
             break
-    return (score, best) if score < first else (first, [])
+    return score, best
+
+
+def _score(left: Vector, steps: int, count: int) -> float:
+    return count * math.log(float(left @ left) + 1e-12) + (1 + 2 * steps) * math.log(count)
+
+
+def _carefully(evidence: Evidence, residual: Vector, grid: list[Time], lag: float) -> tuple[float, list[Time]]:
+    """Pursue again, each time moved to where it belongs before the next one is looked for."""
+    table = _steps(evidence, grid, lag)
+    times: list[Time] = []
+    best: tuple[float, list[Time]] = (_score(residual, 0, evidence.count), [])
+    left, worse = residual, 0
+    while len(times) < MOST and worse < 2:
+        times.append(grid[int(np.argmax(np.abs(table.T @ left)))])
+        times = _moved(evidence, residual, times, lag, last_only=len(times) % 4 != 0)
+        left = _left(evidence, residual, times, lag)
+        now = _score(left, len(times), evidence.count)
+        worse = 0 if now < best[0] else worse + 1
+        if worse == 0:
+            best = (now, list(times))
+    score, times = best
+    times = _moved(evidence, residual, times, lag, last_only=False) if times else times
+    while len(times) > 1:
+        fewer = [times[:k] + times[k + 1 :] for k in range(len(times))]
+        scores = [_score(_left(evidence, residual, some, lag), len(some), evidence.count) for some in fewer]
+        score = _score(_left(evidence, residual, times, lag), len(times), evidence.count)
+        if min(scores) >= score:
+            break
+        times = fewer[int(np.argmin(scores))]
+    return score, times
+
+
+def _left(evidence: Evidence, residual: Vector, times: list[Time], lag: float) -> Vector:
+    q = np.linalg.qr(_steps(evidence, times, lag))[0]
+    return np.asarray(residual - q @ (q.T @ residual))
+
+
+def _moved(evidence: Evidence, residual: Vector, times: list[Time], lag: float, *, last_only: bool) -> list[Time]:
+    """Move one time after another by half samples, all sizes refitted, to where it takes the most."""
+    period = evidence.setting.period_min
+    times = list(times)
+    for k in range(len(times) - 1 if last_only else 0, len(times)):
+        record, at = times[k]
+        reach = _stride(evidence.waves[record].size)
+        last = (evidence.waves[record].size - 3) * period
+        near = [(record, min(max(at + d * period, 2 * period), last)) for d in np.arange(-reach, reach + 0.25, 0.5)]
+        others = _steps(evidence, times[:k] + times[k + 1 :], lag)
+        q = np.linalg.qr(others)[0]
+        trial = _steps(evidence, near, lag)
+        trial = trial - q @ (q.T @ trial)
+        size = np.einsum("ij,ij->j", trial, trial)
+        gain = (trial.T @ (residual - q @ (q.T @ residual))) ** 2 / np.maximum(size, 1e-9)
+        times[k] = near[int(np.argmax(gain))]
+    return list(dict.fromkeys(times))

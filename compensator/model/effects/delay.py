@@ -27,6 +27,9 @@ from compensator.model.effects.hypothesis import (
 from compensator.model.effects.stream import Delay, Lag
 from compensator.model.effects.table import Table
 
+#: Samples that a path is run on beyond a record's end.
+AHEAD = 64
+
 
 @register("delay")
 class DelayEffect:
@@ -97,8 +100,12 @@ class LateSensor(LatePath):
         """Return what the share would have been at once, less what it is."""
         named = dict(zip((f.name for f in self.free), values, strict=True))
         share = waves.share(self.path)
-        early = late(share, -named.get("delay_min", 0.0), waves.period_min)
-        return np.asarray(early + named.get("lag_min", 0.0) * np.gradient(early, waves.period_min) - share)
+        # Beyond the record's end the path goes on with its drive as it is.
+        drive = waves.source(self.path)
+        longer = waves.function(self.path).response(np.concatenate((drive, np.full(AHEAD, drive[-1]))))
+        early = late(longer, -named.get("delay_min", 0.0), waves.period_min)
+        early = early + named.get("lag_min", 0.0) * np.gradient(early, waves.period_min)
+        return np.asarray(early[: share.size] - share)
 
     def explain(self, named: Mapping[str, float], rms_um: float) -> str:
         """Say what is late, and what to do about it."""

@@ -104,6 +104,8 @@ class Hypothesis:
 
     kind: ClassVar[str] = ""
     deployable: ClassVar[bool] = True
+    #: Least share of the residual's sum of squares that it must take: less is of no use to anybody.
+    worth: ClassVar[float] = 0.05
     path: str = ""
     channel: str = ""
     form: str = ""
@@ -163,6 +165,8 @@ class Setting:
         Time constants of each path, min.
     spans : mapping of str to float
         Span of each channel, in its unit.
+    zeroed : frozenset of str
+        Channels with a zero of their own: they come near 0 and go far from it.
     functions : mapping of str to (tuple of float, tuple of float)
         Coefficients b and a of each path.
     """
@@ -175,6 +179,7 @@ class Setting:
     sizes_um: Mapping[str, float]
     taus_min: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     spans: Mapping[str, float] = field(default_factory=dict)
+    zeroed: frozenset[str] = frozenset()
     functions: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
 
     @property

@@ -4,7 +4,8 @@ share    y += change · c · y_path
 drive    y += change · G · (c · drive)
 speed    y += change · c · (L(τ) − 1) · y_path
 
-with c the channel's change from its start, in units of its own span.
+with c the channel in units of its own span: as it is where it has a zero of its own (a speed, a flow), as its
+change from the start where it has none (a temperature).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from compensator.model.effects.table import Table
 from compensator.model.transfer_function import SampledTransferFunction
 
 FORMS = ("share", "drive", "speed")
+ORIGINS = ("start", "zero")
 
 
 @register("scheduled")
@@ -32,7 +34,7 @@ class ScheduledEffect:
     kind = "scheduled"
 
     def __init__(self, table: Mapping[str, Any], period_s: float) -> None:
-        keys = Table("scheduled", table, ("path", "channel", "change", "span", "tau_min", "b", "a"))
+        keys = Table("scheduled", table, ("path", "channel", "change", "span", "origin", "tau_min", "b", "a"))
         self.channels = (keys.text("channel"),)
         self._tdtf = keys.text("path", ("DTF", "TDTF")) == "TDTF"
         self._form = keys.text("form", FORMS)
@@ -43,7 +45,7 @@ class ScheduledEffect:
             self._inner = Function(function)
         elif self._form == "speed":
             self._inner = Lag(keys.number("tau_min", 0.0, 1e5), period_s / 60.0)
-        self._start = math.nan
+        self._start = 0.0 if keys.text("origin", ORIGINS) == "zero" else math.nan
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], period_s: float) -> Effect:
@@ -81,33 +83,35 @@ class ScheduledHypothesis(Hypothesis):
     """The side of a whole record."""
 
     kind: ClassVar[str] = "scheduled"
+    law: str = "share"
+    origin: str = "start"
     span: float = 1.0
     function: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
     def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
         """Return the path's share, drive or lag, times the channel."""
         channel = waves.channels[self.channel]
-        c = (channel - channel[0]) / self.span
+        c = (channel - (channel[0] if self.origin == "start" else 0.0)) / self.span
         share = waves.share(self.path)
-        if self.form == "share":
+        if self.law == "share":
             return np.asarray(c * share)[:, None]
-        if self.form == "drive":
+        if self.law == "drive":
             return waves.function(self.path).response(c * waves.source(self.path))[:, None]
         return np.asarray(c * (lowpass(share, values[0], waves.period_min) - share))[:, None]
 
     def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
         """Return the table that the engine runs."""
         extra: dict[str, Any] = {}
-        if self.form == "drive":
+        if self.law == "drive":
             extra = {"b": list(self.function[0]), "a": list(self.function[1])}
-        elif self.form == "speed":
+        elif self.law == "speed":
             extra = {"tau_min": values[0]}
-        return {"path": self.path, "channel": self.channel, "form": self.form, "change": amplitudes[0],
-                "span": self.span, **extra}  # fmt: skip
+        place = {"path": self.path, "channel": self.channel, "form": self.law, "origin": self.origin}
+        return {**place, "change": amplitudes[0], "span": self.span, **extra}
 
     def explain(self, named: Mapping[str, float], rms_um: float) -> str:
         """Say what changes what."""
-        what = "speed" if self.form == "speed" else "strength"
+        what = "speed" if self.law == "speed" else "strength"
         return (
             f"The {what} of the {self.path} changes with {self.channel}, by {shown(100.0 * named['change'])} % over "
             f"the channel's span of {shown(self.span)} ({rms_um:.2g} µm rms): more or less of the heat goes another "
@@ -120,9 +124,10 @@ def propose(setting: Setting) -> Iterator[Hypothesis]:
     """Propose every channel that moves on every path."""
     for channel in setting.channels:
         for path in setting.paths:
-            for form in FORMS:
-                free = (setting.tau(),) if form == "speed" else ()
-                yield ScheduledHypothesis(
-                    path=path, channel=channel, form=form, free=free, amplitudes=("change",),
-                    span=setting.spans.get(channel, 1.0), function=setting.functions.get(path, ((), ())),
-                )  # fmt: skip
+            for law in FORMS:
+                for origin in ORIGINS if channel in setting.zeroed else ORIGINS[:1]:
+                    yield ScheduledHypothesis(
+                        path=path, channel=channel, form=f"{law} from {origin}", law=law, origin=origin,
+                        free=(setting.tau(),) if law == "speed" else (), amplitudes=("change",),
+                        span=setting.spans.get(channel, 1.0), function=setting.functions.get(path, ((), ())),
+                    )  # fmt: skip

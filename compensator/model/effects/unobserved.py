@@ -31,6 +31,8 @@ class Unobserved(Hypothesis):
 
     kind: ClassVar[str] = "unobserved"
     deployable: ClassVar[bool] = False
+    # So free a form finds something in every residual.
+    worth: ClassVar[float] = 0.15
     times: tuple[tuple[int, float], ...] = ()
     order: tuple[int, ...] = ()
 
@@ -42,11 +44,11 @@ class Unobserved(Hypothesis):
     def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
         """Return each switching behind the lag; zero in other records than its own."""
         record = self.order.index(id(waves)) if id(waves) in self.order else 0
-        minutes = np.arange(waves.size) * waves.period_min
+        minutes = np.arange(waves.size, dtype=np.float64) * waves.period_min
         columns = []
         for where, at in self.times:
-            step = np.clip((minutes - at) / waves.period_min + 1.0, 0.0, 1.0) if where == record else 0.0 * minutes
-            columns.append(lowpass(step, values[0], waves.period_min))
+            step = np.clip((minutes - at) / waves.period_min + 1.0, 0.0, 1.0) * float(where == record)
+            columns.append(lowpass(np.asarray(step), values[0], waves.period_min))
         return np.column_stack(columns)
 
     def explain(self, named: Mapping[str, float], rms_um: float) -> str:

@@ -1,0 +1,66 @@
+"""`compensator diagnose`: from a model and measured data to what the model lacks."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from compensator import __version__
+from compensator.commands.identify import progress, read_runs
+from compensator.diagnose.diagnosis import Diagnosis, diagnose
+from compensator.diagnose.summary import figures, text
+from compensator.model.model_file import load_model
+from compensator.model.model_writer import write_model
+from compensator.report.diagnosis import write_report
+from compensator.tables import roles_of
+
+
+def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    """Run the command; return its result and its text.
+
+    Raises
+    ------
+    CompensatorError
+        If the data or the model cannot be read, or there is too little.
+    """
+    return diagnose_files(arguments.data, arguments.model, arguments.out, columns=arguments.column)
+
+
+def diagnose_files(
+    data: Sequence[Path], model: str | Path, out: Path, *, columns: Sequence[str] = ()
+) -> tuple[dict[str, Any], str]:
+    """Diagnose files and write `diagnosis.json`, `model.toml` and `report.html` into a folder."""
+    base = load_model(model)
+    remarks: list[str] = []
+    runs = read_runs(data, roles_of(columns), remarks, period_s=base.period_s)
+    with progress("searching") as told:
+        diagnosis = diagnose(base, runs, told=told)
+    return write(diagnosis, base.sha256, data, out, remarks)
+
+
+def write(
+    diagnosis: Diagnosis, base_sha256: str, data: Sequence[Path], out: Path, remarks: Sequence[str]
+) -> tuple[dict[str, Any], str]:
+    """Write what was found; return it and its text."""
+    out.mkdir(parents=True, exist_ok=True)
+    found = figures(diagnosis)
+    provenance = dict(diagnosis.model.provenance) | {
+        "diagnosis": {
+            "source": f"compensator {__version__} diagnose", "base_model_sha256": base_sha256,
+            "data": [{"file": p.name, "sha256": hashlib.sha256(p.read_bytes()).hexdigest()} for p in data],
+            "verdict": diagnosis.verdict,
+            "held_out_rms_um": {"before": diagnosis.before.rms_um, "after": diagnosis.after.rms_um},
+        }
+    }  # fmt: skip
+    model = write_model(out / "model.toml", dataclasses.replace(diagnosis.model, provenance=provenance))
+    (out / "diagnosis.json").write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    page = write_report(out / "report.html", diagnosis, model, remarks)
+    files = {"model": str(out / "model.toml"), "model_sha256": model.sha256, "report": str(page)}
+    words = [text(diagnosis), *([f"remarks: {'; '.join(remarks)}"] if remarks else []),
+             f"model: {files['model']}\npage: {page}"]  # fmt: skip
+    return {**found, **files}, "\n\n".join(words)

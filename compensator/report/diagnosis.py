@@ -1,0 +1,124 @@
+"""The page of a diagnosis: what the model lacks, in one picture, and what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.diagnose.diagnosis import Diagnosis, Effect
+from compensator.diagnose.summary import name, verdict
+from compensator.identify.summary import with_std
+from compensator.model.thermal_model import ThermalModel
+from compensator.report.page import Block, Details, Figure, Line, Page, Section, Table, Tone, Words, write_page
+
+Vector = npt.NDArray[np.float64]
+
+_TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
+
+
+def write_report(path: Path, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Path:
+    """Write the page.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The HTML file.
+    diagnosis : Diagnosis
+        What was found.
+    model : ThermalModel
+        As written, with its hash.
+    remarks : sequence of str
+        What reading the data had to put right.
+    """
+    t = _hours(diagnosis)
+    blocks: list[Block] = [_before_and_after(t, diagnosis), _errors(diagnosis)]
+    blocks += [_effect(t, effect) for effect in diagnosis.effects]
+    if diagnosis.warnings:
+        blocks.append(Words(title="Warnings", lines=diagnosis.warnings, kind="warning"))
+    if diagnosis.tried:
+        blocks.append(_ranking(diagnosis))
+    blocks.append(_details(t, diagnosis, model, remarks))
+    title = f"Diagnosis: what {model.name} lacks"
+    return write_page(
+        path, Page(title=title, verdict=verdict(diagnosis), blocks=blocks, tone=_TONES[diagnosis.verdict])
+    )
+
+
+def _hours(diagnosis: Diagnosis) -> Vector:
+    """Return a time axis in hours, the runs one after another."""
+    period_h = diagnosis.model.period_s / 3600.0
+    return np.asarray(np.arange(diagnosis.residual_before.size) * period_h)
+
+
+def _before_and_after(t: Vector, diagnosis: Diagnosis) -> Figure:
+    found = " and ".join(name(effect) for effect in diagnosis.effects) or "nothing to add"
+    return Figure(
+        title="Error that the compensation leaves, before and after", x_label="time, h", y_label="residual, µm",
+        lines=(
+            Line("before", t, diagnosis.held_out_before), Line(f"after: {found}", t, diagnosis.held_out_after),
+        ),
+        note="Measured − predicted, on the same scale. Every block is shown by a search that did not see it.",
+    )  # fmt: skip
+
+
+def _errors(diagnosis: Diagnosis) -> Table:
+    rows = [
+        [label, f"{s.rms_um:.2f}", f"{s.peak_to_peak_um:.1f}", f"{s.fit_pct:.2f}"]
+        for label, s in (("first model", diagnosis.before), ("extended model", diagnosis.after))
+    ]
+    rows.append(["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""])
+    return Table(
+        title="Errors on held-out data", head=["", "rms µm", "peak to peak µm", "fit %"], rows=rows,
+        note=f"Measured so: {diagnosis.held_out}.",
+    )  # fmt: skip
+
+
+def _effect(t: Vector, effect: Effect) -> Section:
+    rows = [[key, with_std(value, effect.std[key])] for key, value in effect.part.named.items()]
+    rows.append(["residual without it, µm rms", f"{effect.rms_before_um:.3f}"])
+    rows.append(["residual with it, µm rms", f"{effect.rms_after_um:.3f}"])
+    deploy = "Runs in the service." if effect.deployable else "Cannot be deployed; the extended model leaves it out."
+    blocks: list[Block] = [
+        Words(title="In words", lines=[effect.explanation, deploy]),
+        Figure(title=f"What it adds: {name(effect)}", x_label="time, h", y_label="Y, µm",
+               lines=(Line("effect", t, effect.wave),), height=2.6),
+        Table(head=["parameter", "value ± standard error"], rows=rows),
+    ]  # fmt: skip
+    if effect.rivals:
+        blocks.append(
+            Words(
+                title="Nearly as good",
+                lines=[
+                    f"{' '.join(w for w in r.part.hypothesis.place if w)}: leaves {r.rms_after_um:.2f} µm rms. "
+                    f"{r.how_to_tell_apart}"
+                    for r in effect.rivals
+                ],
+            )
+        )
+    return Section(title=name(effect), blocks=blocks)
+
+
+def _ranking(diagnosis: Diagnosis) -> Details:
+    chosen = diagnosis.effects[0]
+    rows = [[name(chosen), f"{chosen.rms_after_um:.3f}", "chosen"]]
+    rows += [[label, f"{rms:.3f}", ""] for label, rms in diagnosis.tried]
+    return Details(
+        title="What was tried in place of the largest effect, and how it ranked",
+        blocks=[Table(head=["explanation", "leaves µm rms", ""], rows=rows)],
+    )
+
+
+def _details(t: Vector, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Details:
+    rows = [["extended model, SHA-256", model.sha256]]
+    rows += [[f"data: {d['file']}", d["sha256"]] for d in model.provenance.get("diagnosis", {}).get("data", [])]
+    figure = Figure(
+        title="Residual of the fit to everything", x_label="time, h", y_label="residual, µm",
+        lines=(Line("before", t, diagnosis.residual_before), Line("after", t, diagnosis.residual_after)), height=2.6,
+    )  # fmt: skip
+    blocks: list[Block] = [figure, Table(head=["", ""], rows=rows)]
+    if remarks:
+        blocks.append(Words(title="Remarks on the data", lines=remarks))
+    return Details(title="Residual of the fit, files", blocks=blocks)
