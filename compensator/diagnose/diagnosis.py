@@ -7,19 +7,17 @@ again without it, and what that finds is applied to the block.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.joint import Joint, Part, response, standard_errors
+from compensator.diagnose.joint import Part, response, standard_errors, summed
 from compensator.diagnose.search import Found, Search, Tried
-from compensator.identify.runs import Run, noise_std
+from compensator.identify.runs import Run
 from compensator.model.effects.unobserved import Unobserved
 from compensator.model.thermal_model import EffectTable, ThermalModel
 from compensator.simulation import Scores, scores
@@ -32,8 +30,6 @@ Told = Callable[[int, int], None]
 FOLDS = 3
 #: What is left counts as noise up to this many times its level.
 NOISE_TIMES = 1.5
-#: A run counts as started at rest while a fitted initial state does not take more than this off what is left.
-REST_TIMES = 1.1
 #: Another explanation is a rival while it leaves no more than this many times as much.
 RIVAL_TIMES = 1.2
 
@@ -150,17 +146,16 @@ def diagnose(model: ThermalModel, runs: Sequence[Run], *, told: Told = _silent) 
     """
     evidence = evidence_of(model, runs)
     told(0, FOLDS + 1)
-    found = Search(evidence).run()
-    folds = _held_out(evidence, evidence.residual, found, told)
-    before, after = (np.where(evidence.used, values, np.nan) for values in folds)
-    floor = noise_floor(model, runs)
+    found, before, after = _searched(evidence, told)
+    helps = _rms(after) <= _rms(before)
+    floor = evidence.noise_um
     effects = _effects(evidence, found)
     extended = dataclasses.replace(
-        model, effects=(*model.effects, *(_table(e) for e in effects if e.deployable)), sha256=""
+        model, effects=(*model.effects, *(_table(e) for e in effects if e.deployable and helps)), sha256=""
     )
     y = np.concatenate([run.y_um for run in runs])
     return Diagnosis(
-        verdict=_verdict(model, evidence, found, floor), effects=effects,
+        verdict=_verdict(evidence, found), effects=effects,
         before=scores(y, y - before), after=scores(y, y - after),
         held_out=f"each of {FOLDS} blocks of time predicted after choosing and fitting on the others; zero and initial "
         "state from the others, too",
@@ -174,35 +169,42 @@ def diagnose(model: ThermalModel, runs: Sequence[Run], *, told: Told = _silent) 
 # ---------------------------------------------------------------------------- held out
 
 
-def _held_out(evidence: Evidence, raw: Vector, found: Found, told: Told) -> tuple[Vector, Vector]:
-    """Return the residual before and after on every block, each by a search that did not see it."""
-    at = np.flatnonzero(evidence.used)
-    edges = np.linspace(0, at.size, FOLDS + 1).astype(int)
-    before, after = np.full(raw.size, np.nan), np.full(raw.size, np.nan)
+def _searched(evidence: Evidence, told: Told) -> tuple[Found, Vector, Vector]:
+    """Search, and again more carefully where what was found does not hold on blocks that were held out."""
+    found = Search(evidence).run()
+    before, after = _held_out(evidence, found, told, Search.run)
+    if _rms(after) <= _rms(before):
+        return found, before, after
+    general = Search(evidence).run_by_folds()
+    by_folds = _held_out(evidence, general, told, lambda search, **_: search.run_by_folds())
+    if general.joint.parts and _rms(by_folds[1]) < _rms(by_folds[0]):
+        return general, *by_folds
+    return found, before, after
+
+
+def _rms(values: Vector) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def _held_out(evidence: Evidence, found: Found, told: Told, run: Callable[..., Found]) -> tuple[Vector, Vector]:
+    """Return the residual before and after on every block, each by a search that did not see it.
+
+    Whether a run's initial state is taken as unknown or as rest is what serves the first model better.
+    """
+    raw, nothing = evidence.residual, np.zeros(evidence.used.size)
     hidden = [isinstance(part.hypothesis, Unobserved) for part in found.joint.parts]
-    effects = _sum(evidence, found.joint)
-    free, rest = (evidence.left(raw, effects, at_rest=r)[evidence.used] for r in (False, True))
-    at_rest = bool(rest @ rest < REST_TIMES * (free @ free))
-    for done, (low, high) in enumerate(itertools.pairwise(edges.tolist()), start=1):
+    before = {rest: np.full(raw.size, np.nan) for rest in (True, False)}
+    after = {rest: np.full(raw.size, np.nan) for rest in (True, False)}
+    for done, block in enumerate(evidence.blocks(FOLDS), start=1):
         told(done, FOLDS + 1)
-        block = np.zeros(raw.size, dtype=bool)
-        block[at[low:high]] = True
         seen = evidence.hidden(block)
-        before[block] = seen.left(raw, np.zeros(raw.size), at_rest=at_rest)[block]
-        if hidden and all(hidden):
-            # Nobody knows what a hidden source does in a block that was not seen.
-            after[block] = before[block]
-        else:
-            joint = Search(seen).run(hidden=any(hidden)).joint
-            after[block] = seen.left(raw, _sum(seen, joint), at_rest=at_rest)[block]
-    return before, after
-
-
-def _sum(evidence: Evidence, joint: Joint) -> Vector:
-    total = np.zeros(evidence.used.size)
-    for part in joint.parts:
-        total += response(evidence, part)
-    return total
+        # Nobody knows what a hidden source does in a block that was not seen.
+        effects = nothing if hidden and all(hidden) else summed(seen, run(Search(seen), hidden=any(hidden)).joint)
+        for rest in (True, False):
+            before[rest][block] = seen.left(raw, nothing, at_rest=rest)[block]
+            after[rest][block] = seen.left(raw, effects, at_rest=rest)[block]
+    best = min((True, False), key=lambda rest: _rms(before[rest]))
+    return before[best], after[best]
 
 
 # ---------------------------------------------------------------------------- what was found
@@ -275,24 +277,24 @@ def _tried(found: Found, evidence: Evidence) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(best.items(), key=lambda item: item[1]))
 
 
-def _verdict(model: ThermalModel, evidence: Evidence, found: Found, floor: float) -> Verdict:
-    rms = float(np.sqrt(found.joint.cost / evidence.count))
-    allowed = NOISE_TIMES * float(np.hypot(floor, 0.0 if found.joint.parts else model.y_std_um))
-    if not found.joint.parts:
-        return "adequate" if rms <= max(allowed, floor * NOISE_TIMES) else "unexplained"
-    if all(isinstance(part.hypothesis, Unobserved) for part in found.joint.parts):
+def _verdict(evidence: Evidence, found: Found) -> Verdict:
+    parts = found.joint.parts
+    clean = found.joint.cost < NOISE_TIMES**2 * (evidence.count * evidence.noise_um**2 + evidence.allowance)
+    if not parts:
+        return "adequate" if clean else "unexplained"
+    hidden = [isinstance(part.hypothesis, Unobserved) for part in parts]
+    if all(hidden):
         return "unexplained"
-    hidden = any(isinstance(part.hypothesis, Unobserved) for part in found.joint.parts)
-    return "partly_explained" if hidden or rms > allowed else "explained"
+    return "explained" if clean and not any(hidden) else "partly_explained"
 
 
 def _warnings(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[str, ...]:
     words = []
-    rms_before, rms_after = (float(np.sqrt(np.nanmean(v**2))) for v in (before, after))
+    rms_before, rms_after = _rms(before), _rms(after)
     if effects and rms_after > rms_before:
         words.append(
-            f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms): record "
-            "longer before the model is taken over."
+            f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so the "
+            "model was left as it is: record longer, with more change in the inputs."
         )
     for effect in effects:
         loose = [name for name, std in effect.std.items() if std > abs(effect.part.named[name]) > 0.0]
@@ -310,20 +312,3 @@ def _table(effect: Effect) -> EffectTable:
     return EffectTable(
         kind=part.hypothesis.kind, table={**table, "std": effect.std, "explanation": effect.explanation}
     )  # fmt: skip
-
-
-def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:
-    """Return what the sensors' noise alone makes of the residual, µm.
-
-    White noise of the probe, and that of both thermocouples through the model.
-    """
-    noise = {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc", "y_um")}
-    impulse = np.zeros(3000)
-    impulse[0] = 1.0
-    drive = impulse
-    if model.ttf is not None:
-        drive = np.asarray(lfilter(model.ttf.sampled.a, model.ttf.sampled.b, impulse))
-    by_t_q = model.dtf.sampled.response(drive)
-    by_at = -by_t_q + (model.tdtf.sampled.response(impulse) if model.tdtf else 0.0)
-    parts = (noise["y_um"], noise["t_q_degc"] * np.linalg.norm(by_t_q), noise["at_degc"] * np.linalg.norm(by_at))
-    return float(np.sqrt(sum(part**2 for part in parts)))

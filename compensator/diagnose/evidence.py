@@ -9,7 +9,8 @@ projected out of everything before anything is compared, so that they are never 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,12 @@ Mask = npt.NDArray[np.bool_]
 
 #: An initial state moves y by no more than about this many times its spread, with the weight of one sample.
 STATE_PRIOR = 1e-3
+#: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
+OWN_SHARE = 0.02
+#: Below this many times the base model's own error nothing is looked for.
+OWN_TIMES = 2.0
+#: A sum of squares up to this many times that of noise and own error is noise.
+CLEAN_TIMES = 1.3
 #: A channel whose span is less than this many of its noise deviations does not move.
 MOVES = 8.0
 
@@ -54,6 +61,10 @@ class Evidence:
         Orthonormal columns that the nuisances span on the samples used.
     setting : Setting
         What proposals may build on.
+    noise_um : float
+        What the sensors' noise alone makes of the residual, µm.
+    own_error_um : float
+        What the base model's own error is known to be, from its calibration, µm; 0 where nobody knows.
     """
 
     runs: tuple[Run, ...]
@@ -63,6 +74,8 @@ class Evidence:
     nuisances: Matrix
     basis: Matrix
     setting: Setting
+    noise_um: float
+    own_error_um: float
 
     @property
     def count(self) -> int:
@@ -73,10 +86,30 @@ class Evidence:
         """Project the nuisances out of columns, which are zero where samples are not used."""
         return np.asarray(columns - self.basis @ (self.basis.T @ columns))
 
+    @property
+    def allowance(self) -> float:
+        """Sum of squares that the base model's own error may leave, µm²: nothing is looked for below it."""
+        return self.count * (OWN_TIMES * self.own_error_um) ** 2
+
+    def blocks(self, count: int) -> Iterator[Mask]:
+        """Yield masks of blocks of time with equally many of the samples used."""
+        at = np.flatnonzero(self.used)
+        for low, high in itertools.pairwise(np.linspace(0, at.size, count + 1).astype(int).tolist()):
+            block = np.zeros(self.used.size, dtype=bool)
+            block[at[low:high]] = True
+            yield block
+
+    def is_noise(self, cost: float) -> bool:
+        """Tell whether a sum of squares is no more than noise and own error."""
+        return cost < CLEAN_TIMES * (self.count * self.noise_um**2 + self.allowance)
+
     def hidden(self, mask: Mask) -> Evidence:
         """Return the evidence without some of its samples."""
         used = self.used & ~mask
-        return gathered(self.runs, self.waves, np.where(self.used, self.residual, np.nan), used, self.setting)
+        values = np.where(self.used, self.residual, np.nan)
+        return gathered(
+            self.runs, self.waves, values, used, self.setting, noise_um=self.noise_um, own_error_um=self.own_error_um
+        )
 
     def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
         """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
@@ -152,11 +185,19 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     used = np.isfinite(residual)
     if used.sum() < 60:
         raise DataError(f"{int(used.sum())} samples with y_um, expected at least 60")
-    return gathered(runs, waves, residual, used, _setting(model, runs, waves))
+    noise_um = noise_floor(model, runs)
+    folds = model.provenance.get("folds_rms_um", 0.0)
+    own = float(np.sqrt(max(float(folds) ** 2 - noise_um**2, 0.0))) if isinstance(folds, float) else 0.0
+    # A calibration that misses by more than this has not merely an error of its own, it lacks something.
+    own = min(own, OWN_SHARE * float(np.nanstd(np.concatenate([run.y_um for run in runs]))))
+    return gathered(
+        runs, waves, residual, used, _setting(model, runs, waves), noise_um=noise_um, own_error_um=own
+    )  # fmt: skip
 
 
 def gathered(
-    runs: Sequence[Run], waves: Sequence[Waves], residual: Vector, used: Mask, setting: Setting
+    runs: Sequence[Run], waves: Sequence[Waves], residual: Vector, used: Mask, setting: Setting, *, noise_um: float,
+    own_error_um: float,
 ) -> Evidence:  # fmt: skip
     """Put runs and their residual together with the basis of their nuisances."""
     blocks = [_nuisances(wave, setting) for wave in waves]
@@ -170,8 +211,8 @@ def gathered(
     u, s, _ = np.linalg.svd(seen, full_matrices=False)
     basis = u[:, s > STATE_PRIOR * s[0]]
     return Evidence(
-        runs=tuple(runs), waves=tuple(waves), residual=np.where(used, residual, 0.0), used=used, nuisances=table, basis=basis,
-        setting=setting,
+        runs=tuple(runs), waves=tuple(waves), residual=np.where(used, residual, 0.0), used=used, nuisances=table,
+        basis=basis, setting=setting, noise_um=noise_um, own_error_um=own_error_um,
     )  # fmt: skip
 
 
@@ -210,3 +251,20 @@ def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -
         spans=moving, zeroed=frozenset(zeroed),
         functions={name: (path.sampled.b, path.sampled.a) for name, path in paths.items() if path is not None},
     )  # fmt: skip
+
+
+def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:
+    """Return what the sensors' noise alone makes of the residual, µm.
+
+    White noise of the probe, and that of both thermocouples through the model.
+    """
+    noise = {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc", "y_um")}
+    impulse = np.zeros(3000)
+    impulse[0] = 1.0
+    drive = impulse
+    if model.ttf is not None:
+        drive = np.asarray(lfilter(model.ttf.sampled.a, model.ttf.sampled.b, impulse))
+    by_t_q = model.dtf.sampled.response(drive)
+    by_at = -by_t_q + (model.tdtf.sampled.response(impulse) if model.tdtf else 0.0)
+    parts = (noise["y_um"], noise["t_q_degc"] * np.linalg.norm(by_t_q), noise["at_degc"] * np.linalg.norm(by_at))
+    return float(np.sqrt(sum(part**2 for part in parts)))

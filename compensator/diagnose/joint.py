@@ -75,6 +75,14 @@ def response(evidence: Evidence, part: Part) -> Vector:
     return np.concatenate(pieces)
 
 
+def summed(evidence: Evidence, joint: Joint) -> Vector:
+    """Return what all effects add to y on every sample, µm."""
+    total = np.zeros(evidence.used.size)
+    for part in joint.parts:
+        total += response(evidence, part)
+    return total
+
+
 def columns_of(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> tuple[Matrix, Vector | None]:
     """Return columns and fixed part on the samples used, nuisances taken out."""
     columns = np.concatenate([hypothesis.columns(wave, values) for wave in evidence.waves])

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.joint import Joint, Part, columns_of, fit_joint
+from compensator.diagnose.evidence import Evidence, Mask
+from compensator.diagnose.joint import Joint, Part, columns_of, fit_joint, summed
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, proposals
 from compensator.model.effects.unobserved import Unobserved
@@ -31,6 +31,8 @@ Matrix = npt.NDArray[np.float64]
 MOST = 4
 #: Hypotheses that are fitted after each scan, and where something stands already.
 POLISHED, EXCHANGED = 12, 6
+#: Blocks of the slower search, and the share of the held-out error that an effect must take there.
+BLOCKS, GENERAL = 4, 0.1
 #: A residual with less colour than this is noise, and no hidden source is looked for in it.
 CLEAN = 1.3
 
@@ -103,9 +105,10 @@ class Search:
         """
         before = fit_joint(self.evidence, [])
         path = self._forward([before])
-        coloured = hidden and self.evidence.colour(path[-1].residual) > CLEAN
+        last = path[-1]
+        coloured = hidden and not self.evidence.is_noise(last.cost) and self.evidence.colour(last.residual) > CLEAN
         others = self._with_hidden(path) if coloured else []
-        ends = [path[-1], *others]
+        ends = [last, *others]
         last = min(ends, key=lambda joint: self.score(joint, 1.0))
         colour = self.evidence.colour(last.residual)
         best = self._thinned(min([*path, *others], key=lambda joint: self.score(joint, colour)), colour)
@@ -116,7 +119,9 @@ class Search:
         """Add one effect after another while each is worth it."""
         while len(path) <= MOST:
             last = path[-1]
-            step = [t for t in self._add(last) if t.joint.cost < (1.0 - t.part.hypothesis.worth) * last.cost]
+            if self.evidence.is_noise(last.cost) and self.evidence.colour(last.residual) < CLEAN:
+                break
+            step = [t for t in self._add(last) if self._is_worth(t.part.hypothesis, last, t.joint)]
             if not step:
                 break
             better = self._improved(step[0].joint)
@@ -136,11 +141,53 @@ class Search:
         found.sort(key=lambda joint: self.score(joint, 1.0))
         return [self._improved(joint) for joint in found[:1]]
 
+    def _is_worth(self, hypothesis: Hypothesis, without: Joint, joint: Joint) -> bool:
+        """Tell whether an effect takes enough to be of use, the base model's own error counted as still there."""
+        allowance = self.evidence.allowance
+        return joint.cost + allowance < (1.0 - hypothesis.worth) * (without.cost + allowance)
+
+    def run_by_folds(self) -> Found:
+        """Search by the error on blocks of time that are held out in turn, among what can be deployed.
+
+        For data whose base model is far off: there a count of samples says nothing about chance, because what is
+        left is no noise. Slower, and blind to events that happen once.
+        """
+        before = fit_joint(self.evidence, [])
+        blocks = [(block, self.evidence.hidden(block)) for block in self.evidence.blocks(BLOCKS)]
+        joint, error = before, self._held_out(before, blocks)
+        places = [h for h in self.hypotheses if h.deployable and len(h.free) <= 1]
+        while len(joint.parts) < MOST:
+            taken = {part.hypothesis.place for part in joint.parts}
+            starts = [(part.hypothesis, part.values) for part in joint.parts]
+            ranked = sorted(self._scan(joint, [h for h in places if h.place not in taken]), key=lambda item: item[0])
+            tried = []
+            for _, hypothesis, values in ranked[:POLISHED]:
+                fitted = fit_joint(self.evidence, [*starts, (hypothesis, values)], evaluations=10)
+                tried.append((self._held_out(fitted, blocks), fitted))
+            if not tried:
+                break
+            best, fitted = min(tried, key=lambda item: item[0])
+            if best > (1.0 - GENERAL) * error:
+                break
+            joint, error = fitted, best
+        rivals = tuple(self._rivals(joint, i) for i in range(len(joint.parts)))
+        colour = self.evidence.colour(joint.residual)
+        return Found(before=before, joint=joint, colour=colour, rivals=rivals, places=self.places)
+
+    def _held_out(self, joint: Joint, blocks: Sequence[tuple[Mask, Evidence]]) -> float:
+        """Return the mean square on blocks, each by a fit to the others that starts from the fit to all."""
+        total = 0.0
+        starts = [(part.hypothesis, part.values) for part in joint.parts]
+        for block, seen in blocks:
+            effects = summed(seen, fit_joint(seen, starts, evaluations=5))
+            total += float(np.sum(seen.left(self.evidence.residual, effects, at_rest=True)[block] ** 2))
+        return total / self.evidence.count
+
     def score(self, joint: Joint, colour: float) -> float:
         """Return *J*."""
         count = self.evidence.count / colour
         penalty = joint.parameters * math.log(max(count, 2.0)) + 2.0 * len(joint.parts) * math.log(self.places)
-        return count * math.log(max(joint.cost, 1e-12)) + penalty
+        return count * math.log(max(joint.cost + self.evidence.allowance, 1e-12)) + penalty
 
     # ------------------------------------------------------------------ steps
 
@@ -226,7 +273,7 @@ class Search:
                 for i in range(len(joint.parts))
             ]
             out = min(range(len(fewer)), key=lambda i: self.score(fewer[i], colour))
-            small = joint.cost > (1.0 - joint.parts[out].hypothesis.worth) * fewer[out].cost
+            small = not self._is_worth(joint.parts[out].hypothesis, fewer[out], joint)
             if self.score(fewer[out], colour) > self.score(joint, colour) and not small:
                 return joint
             joint = fewer[out]

@@ -19,6 +19,8 @@ Time = tuple[int, float]
 MOST = 32
 #: The lag is no longer than this share of the record: a longer one is a ramp.
 LONGEST_SHARE = 0.15
+#: Least share of a step's norm that must be left once nuisances and hidden samples are out of it.
+SEEN_SHARE = 0.05
 #: Points of time that are tried in a record.
 POINTS = 240
 
@@ -44,7 +46,7 @@ def switchings(evidence: Evidence, residual: Vector) -> tuple[Unobserved, tuple[
     grid = _grid(evidence)
     rough = []
     for lag in lags:
-        score, chosen = _pursue(_steps(evidence, grid, lag), residual, evidence.count)
+        score, chosen = _pursue(_steps(evidence, grid, lag), residual, evidence.count, evidence.allowance)
         if chosen:
             rough.append((score, lag))
     best: tuple[float, float, list[Time]] | None = None
@@ -91,18 +93,20 @@ def _steps(evidence: Evidence, where: list[Time], lag: float) -> Matrix:
         step[1:] = (1.0 - part) * shape[1:room] + part * shape[: room - 1]
         step[0] *= 1.0 - part
         table[begin[record] + first : begin[record] + sizes[record], column] = step
+    whole = np.linalg.norm(table, axis=0)
     table[~evidence.used] = 0.0
     table = evidence.without_nuisances(table)
     norm = np.linalg.norm(table, axis=0)
-    norm[norm < 1e-9] = np.inf
+    # A step that is hardly seen may have any size: leave it out.
+    norm[norm < SEEN_SHARE * whole + 1e-9] = np.inf
     return np.asarray(table / norm)
 
 
-def _pursue(table: Matrix, residual: Vector, count: int) -> tuple[float, list[int]]:
+def _pursue(table: Matrix, residual: Vector, count: int, allowance: float) -> tuple[float, list[int]]:
     """Take the best step, refit, and go on while each is worth its two parameters (orthogonal matching pursuit)."""
     chosen: list[int] = []
     best: list[int] = []
-    left, score = residual, _score(residual, 0, count)
+    left, score = residual, _score(residual, 0, count, allowance)
     q = np.zeros((residual.size, 0))
     while len(chosen) < MOST:
         match = np.abs(table.T @ left)
@@ -115,7 +119,7 @@ def _pursue(table: Matrix, residual: Vector, count: int) -> tuple[float, list[in
         q = np.column_stack((q, column / norm))
         chosen.append(i)
         left = residual - q @ (q.T @ residual)
-        now = _score(left, len(chosen), count)
+        now = _score(left, len(chosen), count, allowance)
         if now < score:
             score, best = now, list(chosen)
         elif len(chosen) > len(best) + 2:
@@ -123,21 +127,21 @@ def _pursue(table: Matrix, residual: Vector, count: int) -> tuple[float, list[in
     return score, best
 
 
-def _score(left: Vector, steps: int, count: int) -> float:
-    return count * math.log(float(left @ left) + 1e-12) + (1 + 2 * steps) * math.log(count)
+def _score(left: Vector, steps: int, count: int, allowance: float) -> float:
+    return count * math.log(float(left @ left) + allowance + 1e-12) + (1 + 2 * steps) * math.log(count)
 
 
 def _carefully(evidence: Evidence, residual: Vector, grid: list[Time], lag: float) -> tuple[float, list[Time]]:
     """Pursue again, each time moved to where it belongs before the next one is looked for."""
     table = _steps(evidence, grid, lag)
     times: list[Time] = []
-    best: tuple[float, list[Time]] = (_score(residual, 0, evidence.count), [])
+    best: tuple[float, list[Time]] = (_score(residual, 0, evidence.count, evidence.allowance), [])
     left, worse = residual, 0
     while len(times) < MOST and worse < 2:
         times.append(grid[int(np.argmax(np.abs(table.T @ left)))])
         times = _moved(evidence, residual, times, lag, last_only=len(times) % 4 != 0)
         left = _left(evidence, residual, times, lag)
-        now = _score(left, len(times), evidence.count)
+        now = _score(left, len(times), evidence.count, evidence.allowance)
         worse = 0 if now < best[0] else worse + 1
         if worse == 0:
             best = (now, list(times))
@@ -145,8 +149,11 @@ def _carefully(evidence: Evidence, residual: Vector, grid: list[Time], lag: floa
     times = _moved(evidence, residual, times, lag, last_only=False) if times else times
     while len(times) > 1:
         fewer = [times[:k] + times[k + 1 :] for k in range(len(times))]
-        scores = [_score(_left(evidence, residual, some, lag), len(some), evidence.count) for some in fewer]
-        score = _score(_left(evidence, residual, times, lag), len(times), evidence.count)
+        scores = [
+            _score(_left(evidence, residual, some, lag), len(some), evidence.count, evidence.allowance)
+            for some in fewer
+        ]
+        score = _score(_left(evidence, residual, times, lag), len(times), evidence.count, evidence.allowance)
         if min(scores) >= score:
             break
         times = fewer[int(np.argmin(scores))]
