@@ -280,8 +280,19 @@ class Search:
         return joint
 
     def _rivals(self, joint: Joint, index: int) -> tuple[Tried, ...]:
-        others = self._add(joint, without=index)
-        return tuple(t for t in others if t.part.hypothesis.place != joint.parts[index].hypothesis.place)
+        """Return what else explains an effect's part, one for each place, best first."""
+        kept = [(p.hypothesis, p.values) for i, p in enumerate(joint.parts) if i != index]
+        taken = {part.hypothesis.place for part in joint.parts}
+        base = fit_joint(self.evidence, kept)
+        ranked = sorted(
+            self._scan(base, [h for h in self.hypotheses if h.place not in taken]), key=lambda item: item[0]
+        )
+        found: dict[tuple[str, str, str], Tried] = {}
+        for _, hypothesis, values in ranked:
+            if hypothesis.place not in found and len(found) < EXCHANGED:
+                fitted = fit_joint(self.evidence, [*kept, (hypothesis, values)], evaluations=10)
+                found[hypothesis.place] = Tried(joint=fitted, index=len(kept), score=self.score(fitted, 1.0))
+        return tuple(sorted(found.values(), key=lambda item: item.joint.cost))
 
 
 def _taken(x: Matrix, residual: Vector) -> float:

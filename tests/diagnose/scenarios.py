@@ -70,7 +70,7 @@ def draw(kind, seed, size_um=None):
 
     def mistimed(s):
         # The 20.92 min mode of the DTF at another time constant, gain at rest kept.
-        from scipy.signal import cont2discrete  # noqa: PLC0415
+        from scipy.signal import cont2discrete
 
         poles = [-1 / 1.5657, -1 / 291.85]
         num = np.array(list(reversed([0.0001065, 0.04279, -0.00769, -0.01453])))
@@ -91,7 +91,7 @@ def draw(kind, seed, size_um=None):
     table = {
         "none": ((), lambda s: np.zeros(s[0])),
         "input": (("input", "", channel), lambda s: fixed("a", lag(s[1][channel], tau))),
-        "input square": (("input", "", "spindle_rpm"), lambda s: fixed("a", lag((s[1]["spindle_rpm"] / 8e3) ** 2, tau))),
+        "input square": (("input", "", "spindle_rpm"), lambda s: fixed("a", lag((s[1]["spindle_rpm"] / 8e3)**2, tau))),
         "input delay": (("input", "", channel), lambda s: fixed("a", late(lag(s[1][channel], tau), delay))),
         "gain DTF": (("gain", "DTF", ""), lambda s: fixed("a", s[4])),
         "gain TDTF": (("gain", "TDTF", ""), lambda s: fixed("a", s[5])),

@@ -125,9 +125,9 @@ def propose(setting: Setting) -> Iterator[Hypothesis]:
     for channel in setting.channels:
         for path in setting.paths:
             for law in FORMS:
-                for origin in ORIGINS if channel in setting.zeroed else ORIGINS[:1]:
-                    yield ScheduledHypothesis(
-                        path=path, channel=channel, form=f"{law} from {origin}", law=law, origin=origin,
-                        free=(setting.tau(),) if law == "speed" else (), amplitudes=("change",),
-                        span=setting.spans.get(channel, 1.0), function=setting.functions.get(path, ((), ())),
-                    )  # fmt: skip
+                yield ScheduledHypothesis(
+                    path=path, channel=channel, form=law, law=law,
+                    origin="zero" if channel in setting.zeroed else "start",
+                    free=(setting.tau(),) if law == "speed" else (), amplitudes=("change",),
+                    span=setting.spans.get(channel, 1.0), function=setting.functions.get(path, ((), ())),
+                )  # fmt: skip

@@ -1,0 +1,75 @@
+"""`compensator diagnose` as its user runs it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from compensator.cli import main
+from compensator.demo import write_table
+from compensator.model.model_file import load_model
+from tests.diagnose.scenarios import draw, record
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    columns, _, _ = record([draw("scheduled", 3), draw("drift", 3)], 77)
+    path = tmp_path_factory.mktemp("data") / "run.csv"
+    write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
+    return path
+
+
+def test_json_model_and_page(tmp_path, table, capsys):
+    out = tmp_path / "diagnosis"
+    assert main(["diagnose", str(table), "--model", "quill", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "Scheduled: DTF fan_rpm" in printed
+    found = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    assert found["verdict"] == "explained"
+    assert [(e["kind"], e["path"], e["channel"]) for e in found["effects"]] == [
+        ("scheduled", "DTF", "fan_rpm"),
+        ("drift", None, None),
+    ]
+    assert [e["deployable"] for e in found["effects"]] == [True, False]
+    for effect in found["effects"]:
+        assert effect["rms_after_um"] < effect["rms_before_um"]
+        for value in effect["parameters"].values():
+            assert 0.0 < value["std"] < abs(value["value"])
+    assert found["after"]["rms_um"] < found["before"]["rms_um"]
+    assert all({"kind", "channel", "rms_after_um", "how_to_tell_apart"} <= set(rival) for rival in found["rivals"])
+    model = load_model(out / "model.toml")
+    assert [effect.kind for effect in model.effects] == ["scheduled"]
+    assert model.provenance["diagnosis"]["base_model_sha256"] == load_model("quill").sha256
+    page = (out / "report.html").read_text(encoding="utf-8")
+    for words in ("before and after", "Errors on held-out data", "how it ranked", model.sha256):
+        assert words in page
+
+
+def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, capsys):
+    out = tmp_path / "first"
+    assert main(["diagnose", str(table), "--model", "quill", "--out", str(out)]) == 0
+    capsys.readouterr()
+    again = tmp_path / "second"
+    assert main(["diagnose", str(table), "--model", str(out / "model.toml"), "--out", str(again), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [e["kind"] for e in found["effects"]] == ["drift"]
+    assert main(["simulate", str(table), "--model", str(out / "model.toml"), "--out", str(tmp_path / "s.csv")]) == 0
+
+
+def test_an_adequate_model_is_written_as_it_was(tmp_path, capsys):
+    columns, _, _ = record([], 78, 24.0)
+    path = tmp_path / "run.csv"
+    write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
+    assert main(["diagnose", str(path), "--model", "quill", "--out", str(tmp_path / "d"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["verdict"] == "adequate"
+    model = load_model(tmp_path / "d" / "model.toml")
+    assert (model.dtf, model.effects) == (load_model("quill").dtf, ())
+
+
+def test_data_without_y_is_refused(tmp_path, capsys):
+    columns, _, _ = record([], 79, 6.0)
+    del columns["y_um"]
+    path = tmp_path / "run.csv"
+    write_table(path, {"t_s": np.arange(360) * 60.0, **columns})
+    assert main(["diagnose", str(path), "--model", "quill", "--out", str(tmp_path / "d")]) == 2
+    assert "y_um" in capsys.readouterr().err

@@ -1,0 +1,102 @@
+"""Every deployable effect streams what its whole-record side says, from a file, across a restart."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.joint import Part, response
+from compensator.errors import ModelError
+from compensator.model.effects import kinds
+from compensator.model.effects.hypothesis import proposals
+from compensator.model.engine import Engine
+from compensator.model.model_file import load_model, parse_model
+from compensator.model.model_writer import dump_model
+from compensator.model.thermal_model import EffectTable
+from tests.diagnose.scenarios import record
+from tests.identify.quill_runs import runs_from
+
+QUILL = load_model("quill")
+INVERSE = dataclasses.replace(QUILL, estimator=dataclasses.replace(QUILL.estimator, method="inverse"))
+
+
+@pytest.fixture(scope="module")
+def day():
+    columns, _, _ = record([], 5, 12.0)
+    return runs_from(columns)
+
+
+@pytest.fixture(scope="module")
+def evidence(day):
+    return evidence_of(QUILL, day)
+
+
+def forms(evidence):
+    wanted = ("coolant_degc", "fan_rpm", "")
+    return [h for h in proposals(evidence.setting) if h.deployable and h.channel in wanted]
+
+
+def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
+    run = day[0]
+    seen = set()
+    for hypothesis in forms(evidence):
+        values = tuple(free.grid[len(free.grid) // 2] for free in hypothesis.free)
+        amplitudes = tuple(0.3 + 0.1 * i for i in range(len(hypothesis.amplitudes)))
+        part = Part(hypothesis=hypothesis, values=values, amplitudes=amplitudes)
+        table = EffectTable(kind=hypothesis.kind, table=hypothesis.table(values, amplitudes))
+        model = dataclasses.replace(INVERSE, effects=(table,))
+        model = parse_model(dump_model(model).encode(), source=hypothesis.kind)
+        engine = Engine(model)
+        engine.set_reference(*run.reference)
+        streamed = [e.y_effects_um[0] for e in engine.run(run.t_q_degc, run.at_degc, run.channels)]
+        whole = response(evidence, part)
+        scale = max(1.0, float(np.max(np.abs(whole))))
+        assert streamed == pytest.approx(whole, abs=2e-6 * scale), (hypothesis.place, hypothesis.form)
+        seen.add(hypothesis.kind)
+    assert seen == set(kinds())
+
+
+def test_a_restart_in_between_changes_no_bit(day, evidence):
+    run = day[0]
+    for hypothesis in forms(evidence):
+        values = tuple(free.grid[0] for free in hypothesis.free)
+        table = hypothesis.table(values, (0.5,) * len(hypothesis.amplitudes))
+        model = dataclasses.replace(QUILL, effects=(EffectTable(kind=hypothesis.kind, table=table),))
+        engine, second = Engine(model), Engine(model)
+        engine.set_reference(*run.reference)
+        channels = [{n: float(v[k]) for n, v in run.channels.items()} for k in range(200)]
+        for k in range(100):
+            engine.step(run.t_q_degc[k], run.at_degc[k], channels[k])
+        second.restore(engine.snapshot())
+        for k in range(100, 200):
+            first = engine.step(run.t_q_degc[k], run.at_degc[k], channels[k])
+            assert second.step(run.t_q_degc[k], run.at_degc[k], channels[k]) == first, (
+                hypothesis.place,
+                hypothesis.form,
+            )
+
+
+@pytest.mark.parametrize(
+    ("kind", "table", "words"),
+    [
+        ("input", {"channel": "x", "curve": "cubic", "tau_min": [1.0], "gain": [1.0], "delay_min": 0.0}, "curve"),
+        ("input", {"channel": "x", "curve": "linear", "tau_min": [-1.0], "gain": [1.0], "delay_min": 0.0}, "tau_min"),
+        ("gain", {"path": "TTF", "change": 0.1}, "path"),
+        ("gain", {"path": "DTF", "chnge": 0.1}, "chnge"),
+        ("hysteresis", {"path": "DTF", "form": "play", "half_width_um": float("nan")}, "half_width_um"),
+        ("delay", {"path": "DTF", "delay_min": "soon", "lag_min": 0.0}, "delay_min"),
+    ],
+)  # fmt: skip
+def test_a_wrong_table_names_kind_key_and_value(kind, table, words):
+    with pytest.raises(ModelError, match=f"effect {kind}: .*{words}"):
+        Engine(dataclasses.replace(QUILL, effects=(EffectTable(kind=kind, table=table),)))
+
+
+def test_a_channel_that_is_missing_at_first_starts_the_effect_when_it_comes():
+    table = {"channel": "c", "curve": "linear", "tau_min": [0.5], "gain": [2.0], "delay_min": 0.0}
+    engine = Engine(dataclasses.replace(QUILL, effects=(EffectTable(kind="input", table=table),)))
+    engine.set_reference(20.0, 20.0)
+    assert engine.step(20.0, 20.0, {"c": float("nan")}).y_effects_um == (0.0,)
+    assert engine.step(20.0, 20.0, {"c": 30.0}).y_effects_um == (0.0,)
+    assert engine.step(20.0, 20.0, {"c": 31.0}).y_effects_um[0] > 0.5

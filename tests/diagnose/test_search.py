@@ -1,0 +1,111 @@
+"""Nobody tells the search which effect there is; it names kind and place, and what it adds holds on another day."""
+
+import numpy as np
+import pytest
+
+from compensator.diagnose.diagnosis import diagnose
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.joint import fit_joint, standard_errors
+from compensator.diagnose.search import Search
+from compensator.identify.calibration import predict
+from compensator.model.effects.hypothesis import proposals
+from compensator.model.model_file import load_model
+from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
+from sim_hardware.physics.effects.mechanical import StickSlip
+from tests.diagnose.scenarios import KINDS, draw, record
+from tests.identify.quill_runs import runs_from
+
+QUILL = load_model("quill")
+
+
+def named(scenarios, seed, hours=36.0, **noise):
+    columns, _, _ = record(scenarios, seed, hours, **noise)
+    found = Search(evidence_of(QUILL, runs_from(columns))).run()
+    return sorted(part.hypothesis.place for part in found.joint.parts)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_effect_is_named_and_no_second_invented(kind):
+    scenario = draw(kind, 100)
+    assert named([scenario], 1100) == ([scenario.place] if scenario.place else [])
+
+
+@pytest.mark.parametrize("pair", [("input", "step"), ("gain DTF", "drift"), ("play", "input")])
+def test_two_effects_at_once(pair):
+    scenarios = [draw(kind, 21) for kind in pair]
+    assert named(scenarios, 1121) == sorted(s.place for s in scenarios)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_added_to_data_without_an_effect(seed):
+    assert named([], 1200 + seed, hours=24.0 + 12.0 * seed, noise_k=0.04, noise_um=0.15) == []
+
+
+@pytest.mark.parametrize("kind", ["input", "gain TDTF", "missing mode", "nonlinear", "scheduled", "play"])
+def test_the_extended_model_removes_the_error_on_a_fresh_day(kind):
+    scenario = draw(kind, 7)
+    columns, _, _ = record([scenario], 1007)
+    diagnosis = diagnose(QUILL, runs_from(columns))
+    fresh, true, effect = record([scenario], 5007, 24.0)
+    run = runs_from(fresh)[0]
+
+    def error(model, y):
+        e = y - predict(model, run)
+        return float(np.mean((e - e.mean()) ** 2))
+
+    possible = error(QUILL, true) - error(QUILL, true - effect)
+    assert error(QUILL, true) - error(diagnosis.model, true) > 0.97 * possible
+    assert diagnosis.verdict == "explained"
+    assert diagnosis.after.rms_um < 0.5 * diagnosis.before.rms_um
+    assert diagnosis.effects[0].rms_after_um < 1.3 * diagnosis.noise_floor_um
+
+
+@pytest.mark.parametrize("kind", ["late sensor", "drift", "step", "periodic", "unobserved"])
+def test_what_cannot_be_deployed_is_explained_and_left_out(kind):
+    scenario = draw(kind, 8)
+    columns, _, _ = record([scenario], 1008, 24.0)
+    diagnosis = diagnose(QUILL, runs_from(columns))
+    assert [e.part.hypothesis.place for e in diagnosis.effects] == [scenario.place]
+    assert not diagnosis.effects[0].deployable
+    assert diagnosis.model.effects == ()
+    assert len(diagnosis.effects[0].explanation.split()) > 12
+    assert diagnosis.verdict == ("unexplained" if kind == "unobserved" else "explained")
+
+
+def test_rough_data_hides_nothing_and_invents_nothing():
+    columns, _, _ = record([draw("gain DTF", 3)], 1003)
+    rng = np.random.default_rng(0)
+    n = columns["y_um"].size
+    columns["t_q_degc"] += 0.3
+    for name in ("t_q_degc", "at_degc"):
+        columns[name] = np.round(columns[name] / 0.02) * 0.02
+    for name in ("t_q_degc", "at_degc", "y_um"):
+        columns[name][rng.integers(100, n, 6)] = np.nan
+    columns["y_um"][rng.integers(100, n, 4)] += 40.0
+    found = Search(evidence_of(QUILL, runs_from(columns))).run()
+    assert [part.hypothesis.place for part in found.joint.parts] == [("gain", "DTF", "")]
+
+
+def test_physics_of_another_hand():
+    duty = Duty.working_day(41, hours=30.0)
+    sensors = usual_sensors(duty.extra_names, temperature_noise_k=0.1, y_noise_um=2.0)
+    columns = World(PublishedQuill(effects=[StickSlip(play_um=6.0)]), duty, sensors, 5).record(60.0)
+    columns.pop("t_s")
+    diagnosis = diagnose(QUILL, runs_from(columns))
+    assert [e.part.hypothesis.place for e in diagnosis.effects] == [("hysteresis", "DTF", "")]
+    assert diagnosis.effects[0].part.named["half_width_um"] == pytest.approx(3.0, rel=0.1)
+
+
+def test_standard_errors_are_what_scatters():
+    scenario = draw("gain DTF", 5)
+    values, stds = [], []
+    for noise in range(14):
+        columns, _, _ = record([scenario], 1305, 24.0)
+        rng = np.random.default_rng(noise)
+        columns["y_um"] = columns["y_um"] + rng.normal(0.0, 1.0, columns["y_um"].size)
+        evidence = evidence_of(QUILL, runs_from(columns))
+        hypothesis = next(h for h in proposals(evidence.setting) if h.place == ("gain", "DTF", ""))
+        joint = fit_joint(evidence, [(hypothesis, ())])
+        values.append(joint.parts[0].amplitudes[0])
+        stds.append(standard_errors(evidence, joint, evidence.colour(joint.residual))[0]["change"])
+    assert 0.5 * np.std(values) < np.mean(stds) < 2.0 * np.std(values)
