@@ -72,9 +72,39 @@ def load_data(path: Path, period_s: float, roles: Mapping[str, str] | None = Non
     DataError
         One line that names file, row or column, value and what was expected.
     """
-    t_s, columns = _read_mcap(path) if path.suffix == ".mcap" else _read_csv(path)
+    if path.suffix == ".mcap":
+        return load_recordings([path], period_s, roles)
+    t_s, columns = _read_csv(path)
     columns = _with_roles(path, columns, roles or {})
     return _gridded(path, t_s, columns, period_s)
+
+
+def load_recordings(paths: Sequence[Path], period_s: float, roles: Mapping[str, str] | None = None) -> Data:
+    """Read recordings that follow each other as one: a machine's day goes on in the next file.
+
+    Parameters
+    ----------
+    paths : sequence of pathlib.Path
+        MCAP files of ours, in any order.
+    period_s, roles
+        As :func:`load_data`.
+
+    Raises
+    ------
+    DataError
+        As :func:`load_data`.
+    """
+    parts = []
+    for path in paths:
+        t_s, columns = _read_mcap(path)
+        parts.append((t_s, _with_roles(path, columns, roles or {})))
+    names = dict.fromkeys(name for _, columns in parts for name in columns)
+    t_s = np.concatenate([t for t, _ in parts])
+    whole = {
+        name: np.concatenate([columns.get(name, np.full(t.size, np.nan)) for t, columns in parts]) for name in names
+    }
+    order = np.argsort(t_s, kind="stable")
+    return _gridded(paths[0], t_s[order], {name: values[order] for name, values in whole.items()}, period_s)
 
 
 def roles_of(pairs: Sequence[str]) -> dict[str, str]:
@@ -177,7 +207,7 @@ def _read_mcap(path: Path) -> tuple[Vector, dict[str, Vector]]:
         raise DataError(f"{path}: no samples in it")
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, math.nan) for row in rows]) for name in names}
-    return (np.array(times) - times[0]) / 1e9, columns
+    return np.array(times) / 1e9, columns
 
 
 def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: float) -> Data:

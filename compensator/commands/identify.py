@@ -24,7 +24,7 @@ from compensator.identify.summary import figures, text
 from compensator.model.model_file import load_model
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.tables import load_data, require, roles_of
+from compensator.tables import load_data, load_recordings, require, roles_of
 
 log = logging.getLogger("compensator")
 
@@ -144,9 +144,12 @@ def read_runs(
     paths: Sequence[Path], roles: Mapping[str, str], remarks: list[str], *, period_s: float = PERIOD_S
 ) -> list[Run]:
     """Read tables and recordings into runs; what had to be put right is added to the remarks."""
+    recordings = [path for path in paths if path.suffix == ".mcap"]
+    tables = [(path, load_data(path, period_s, roles)) for path in paths if path.suffix != ".mcap"]
+    if recordings:
+        tables.append((recordings[0], load_recordings(recordings, period_s, roles)))
     runs = []
-    for path in paths:
-        data = load_data(path, period_s, roles)
+    for path, data in tables:
         remarks += data.remarks
         for record in data.records:
             require(path, record, _NEEDED)
