@@ -31,6 +31,8 @@ Matrix = npt.NDArray[np.float64]
 MOST = 4
 #: Hypotheses that are fitted after each scan, and where something stands already.
 POLISHED, EXCHANGED = 12, 6
+#: Parts of an effect that are larger than their sum by this much cancel each other.
+CANCELS = 6.0
 #: Blocks of the slower search, and the share of the held-out error that an effect must take there.
 BLOCKS, GENERAL = 4, 0.1
 #: A residual with less colour than this is noise, and no hidden source is looked for in it.
@@ -203,7 +205,8 @@ class Search:
         found = []
         for _, hypothesis, values in ranked:
             fitted = fit_joint(self.evidence, [*starts, (hypothesis, values)])
-            found.append(Tried(joint=fitted, index=len(starts), score=self.score(fitted, 1.0)))
+            if self._is_plausible(fitted.parts[-1]):
+                found.append(Tried(joint=fitted, index=len(starts), score=self.score(fitted, 1.0)))
         return sorted(found, key=lambda item: item.score)
 
     def _scan(self, base: Joint, candidates: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis, tuple[float, ...]]]:
@@ -278,6 +281,13 @@ class Search:
                 return joint
             joint = fewer[out]
         return joint
+
+    def _is_plausible(self, part: Part) -> bool:
+        """Refuse an effect whose columns cancel: two lags that stand for a derivative or a ramp are no physics."""
+        if len(part.amplitudes) < 2:
+            return True
+        table = columns_of(self.evidence, part.hypothesis, part.values)[0] * np.array(part.amplitudes)
+        return bool(np.max(np.linalg.norm(table, axis=0)) < CANCELS * np.linalg.norm(table.sum(axis=1)))
 
     def _rivals(self, joint: Joint, index: int) -> tuple[Tried, ...]:
         """Return what else explains an effect's part, one for each place, best first."""

@@ -91,7 +91,7 @@ def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[str, ...]]]:
 def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:
     t_q, at, heat = columns["t_q_degc"], columns["at_degc"], columns.get("heat_w")
     difference = t_q - at
-    rest = _rest_length(difference, heat)
+    rest = _rest_length((difference, at), heat)
     reference = float(np.mean(t_q[:rest])), float(np.mean(at[:rest]))
     return Run(
         name=name, t_s=t_s, difference_k=difference - (reference[0] - reference[1]), ambient_k=at - reference[1],
@@ -100,13 +100,20 @@ def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:
     )  # fmt: skip
 
 
-def _rest_length(difference: Vector, heat: Vector | None) -> int:
+def _rest_length(temperatures: Sequence[Vector], heat: Vector | None) -> int:
     """Return how many samples at the start show nothing but noise: their mean is a better zero than one sample."""
-    head = difference[:REST_SAMPLES]
-    moved = np.abs(head - np.median(head[:5])) > 5.0 * noise_std(difference) + 0.01
+    size = min(REST_SAMPLES, temperatures[0].size)
+    moved = np.zeros(size, dtype=bool)
+    for values in temperatures:
+        head = values[:size]
+        # What has moved by less than the noise of a sample cannot be told from it, and harms less than it helps.
+        drift = np.abs(np.cumsum(head) / np.arange(1, size + 1) - np.median(head[:5]))
+        moved |= (np.abs(head - np.median(head[:5])) > 5.0 * noise_std(values) + 0.01) | (
+            drift > noise_std(values) + 0.005
+        )
     if heat is not None:
-        moved |= np.abs(heat[: head.size] - heat[0]) > 1e-9
-    return max(1, int(np.argmax(moved)) if moved.any() else head.size)
+        moved |= np.abs(heat[:size] - heat[0]) > 1e-9
+    return max(1, int(np.argmax(moved)) if moved.any() else size)
 
 
 def _stretches(missing: npt.NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

@@ -188,8 +188,8 @@ class Setting:
         return tuple(name for name, size in self.sizes_um.items() if size > 0.0)
 
     def tau(self, name: str = "tau_min", low: float = 0.6) -> Free:
-        """Return a time constant, from a sample to half of the record."""
-        high = max(self.minutes / 2.0, 10.0 * self.period_min)
+        """Return a time constant, from a sample to a third of the record."""
+        high = max(self.minutes / 3.0, 10.0 * self.period_min)
         low = low * self.period_min
         grid = tuple(float(t) for t in np.geomspace(low, high, 12))
         return Free(name=name, low=low, high=high, grid=grid)

@@ -98,9 +98,10 @@ def propose(setting: Setting) -> Iterator[Hypothesis]:
     """Propose play and sticking of every path, and of both together."""
     for path in setting.paths:
         size = setting.sizes_um[path]
-        grid = tuple(float(w) for w in size * np.geomspace(0.002, 0.4, 14))
-        free = (Free(name="half_width_um", low=size * 5e-4, high=size * 0.5, grid=grid),)
         for law in FORMS:
+            # Where it slips all the way, the residual is no smooth function of the width: try many.
+            grid = tuple(float(w) for w in size * np.geomspace(0.002, 0.4, 14 if law == "play" else 90))
+            free = (Free(name="half_width_um", low=size * 5e-4, high=size * 0.5, grid=grid),)
             yield HysteresisHypothesis(path=path, form=law, law=law, acts_on=path, free=free)
             if path == "DTF" and len(setting.paths) > 1:
                 yield HysteresisHypothesis(path=path, form=f"{law}, both", law=law, acts_on="all", free=free)

@@ -36,6 +36,24 @@ class Drift(Hypothesis):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Settling(Drift):
+    """A ramp that dies out."""
+
+    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+        """Return 1 − exp(−t/τ)."""
+        minutes: Vector = np.arange(waves.size, dtype=np.float64) * waves.period_min
+        return np.asarray(1.0 - np.exp(-minutes / values[0]))[:, None]
+
+    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
+        """Say what settles."""
+        return (
+            f"Y drifts by {shown(named['size_um'])} µm with a time constant of {shown(named['tau_min'])} min "
+            f"({rms_um:.2g} µm rms) whatever the inputs do: a mount or a joint that settles is no error of the "
+            "machine. Check the mount, measure against a fixed reference."
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Step(Hypothesis):
     """A jump at a time."""
 
@@ -81,6 +99,9 @@ def propose(setting: Setting) -> Iterator[Hypothesis]:
     """Propose a ramp, a jump anywhere and every period that the record holds twice."""
     minutes, period = setting.minutes, setting.period_min
     yield Drift(form="ramp", amplitudes=("um_per_h",))
+    taus = tuple(float(t) for t in np.geomspace(minutes / 8.0, 2.0 * minutes, 6))
+    settle = Free(name="tau_min", low=minutes / 10.0, high=3.0 * minutes, grid=taus)
+    yield Settling(form="settling", free=(settle,), amplitudes=("size_um",))
     grid = tuple(float(t) for t in np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0)))
     at = Free(name="at_min", low=period, high=minutes - period, grid=grid, log=False)
     yield Step(form="jump", free=(at,), amplitudes=("jump_um",))
