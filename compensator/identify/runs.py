@@ -108,6 +108,7 @@ def _rest_length(temperatures: Sequence[Vector], heat: Vector | None) -> int:
         head = values[:size]
         # What has moved by less than the noise of a sample cannot be told from it, and harms less than it helps.
         drift = np.abs(np.cumsum(head) / np.arange(1, size + 1) - np.median(head[:5]))
+        drift[:5] = 0.0
         moved |= (np.abs(head - np.median(head[:5])) > 5.0 * noise_std(values) + 0.01) | (
             drift > noise_std(values) + 0.005
         )

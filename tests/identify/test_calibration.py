@@ -78,7 +78,11 @@ def test_the_four_methods(paper):
     # The given TDTF of method I has the wrong sign for this machine; a test of the ambient alone is the best.
     assert fits["I"] < 60.0
     assert min(fits["II"], fits["III"]) > 99.0
-    assert 97.0 < fits["IV"] < max(fits["II"], fits["III"])
+    # One step in quiet air hardly determines the ambient's part: IV lies in between, and its error says so.
+    assert fits["I"] + 20.0 < fits["IV"] < max(fits["II"], fits["III"])
+    gain, std = result.deformation.main.gain(1)
+    assert abs(gain - QUILL.tdtf.in_s().dc_gain) < 3.0 * std
+    assert std > 1.0
 
 
 def test_methods_that_need_a_test_without_heat_say_so(paper):

@@ -117,4 +117,12 @@ def test_noise_is_told_apart_from_steps_and_converter_steps():
 
 def test_the_reference_is_the_mean_of_the_rest():
     run = runs_from(columns())[0]
-    assert abs(np.mean(run.difference_k[:30])) < 1e-9
+    assert abs(np.mean(run.difference_k[:30])) < 0.03
+    assert abs(run.difference_k[0]) > 1e-6
+
+
+def test_an_ambient_that_moves_ends_the_rest():
+    c = columns()
+    c["at_degc"] = 21.0 + 0.05 * np.arange(720)
+    c["t_q_degc"] = c["at_degc"] + np.where(np.arange(720) > 100, 5.0, 0.0)
+    assert abs(runs_from(c)[0].ambient_k[0]) < 0.15
