@@ -73,6 +73,25 @@ def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: floa
     return functions
 
 
+def free_run_rms(segments: Sequence[Segment], structure: Structure, *, period_s: float) -> float:
+    """Return what an ARX of this structure leaves in free run, its zero taken off; infinite where it is unstable.
+
+    Parameters
+    ----------
+    segments, structure, period_s
+        As :func:`fit_arx`.
+    """
+    functions = fit_arx(segments, structure, period_s=period_s)
+    if not functions[0].is_stable():
+        return float("inf")
+    errors = []
+    for segment in segments:
+        predicted = sum(f.response(u) for f, u in zip(functions, segment.inputs, strict=True))
+        error = (segment.y - predicted)[segment.used]
+        errors.append(error - error.mean())
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
 def starts(segments: Sequence[Segment], structure: Structure, *, period_s: float) -> list[list[float]]:
     """Return time constants to start a search from, min: ARX's poles, and two spreads over the record's length.
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from compensator.errors import DataError
+from compensator.identify.arx import free_run_rms
 from compensator.identify.choice import Told, silent
 from compensator.identify.deformation import DeformationFit, PathFit, fit_deformation
 from compensator.identify.runs import Run, noise_std, walk_std
@@ -110,6 +111,12 @@ class Calibration:
         pairs = list(zip(self.temperature.segments, self.temperature.fit.residuals, strict=True))
         y = np.concatenate([s.y[s.used] for s, _ in pairs])
         return scores(y, y - np.concatenate([r[s.used] for s, r in pairs])).fit_pct
+
+    @property
+    def arx_rms_um(self) -> float:
+        """What an ARX of the same structure leaves in free run on the fitted data, µm: for comparison only."""
+        segments, structure = self.deformation.segments, self.deformation.main.structure
+        return free_run_rms(segments, structure, period_s=self.model.period_s)
 
     @property
     def paths(self) -> tuple[PathFit, ...]:

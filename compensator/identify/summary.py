@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from compensator.identify.calibration import Calibration
@@ -125,5 +126,7 @@ def _table(calibration: Calibration) -> list[str]:
         for part in calibration.parts
     ]  # fmt: skip
     rows.append(["folds", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""])
+    arx = calibration.arx_rms_um
+    rows.append(["ARX, to compare", "fitted", "", "", f"{arx:.2f}" if math.isfinite(arx) else "unstable", "", "", ""])
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return ["  ".join(f"{c:{'<' if i < 2 else '>'}{widths[i]}}" for i, c in enumerate(row)) for row in rows]

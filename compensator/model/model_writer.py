@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 import os
@@ -14,14 +15,11 @@ from typing import Any
 import numpy as np
 
 from compensator.errors import ModelError
-from compensator.model.model_file import load_model
-from compensator.model.thermal_model import Path, ThermalModel
+from compensator.model.model_file import load_model, parse_model
+from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-_PURPOSE = {
-    "TTF": "heat to T_Q - AT; its inverse gives the heat",
-    "TDTF": "change of the ambient to deformation",
-}
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
 def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
@@ -42,22 +40,29 @@ def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
     Raises
     ------
     ModelError
-        If the model holds something that a file cannot.
+        If the model holds something that a file cannot; what stood there before stays.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     len(write_model(FilePath(folder) / "copy.toml", load_model("quill")).sha256)
+    64
     """
-    text = dump_model(model)
+    data = dump_model(model).encode("utf-8")
+    parse_model(data, source=str(path))  # before the old file goes: the reader knows bounds that the model does not
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     temporary = FilePath(name)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())
         temporary.chmod(0o644)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    return load_model(path)
+    return load_model(path.absolute())  # a bare "quill" is the name of a built-in model
 
 
 def dump_model(model: ThermalModel) -> str:
@@ -66,7 +71,7 @@ def dump_model(model: ThermalModel) -> str:
     Parameters
     ----------
     model : ThermalModel
-        What to write.
+        What to write. A covariance belongs to sampled coefficients: a path in s is written without it.
 
     Returns
     -------
@@ -76,11 +81,10 @@ def dump_model(model: ThermalModel) -> str:
     Raises
     ------
     ModelError
-        If a number is not finite, naming its key.
+        If a number is not finite or a value has no form in TOML, naming its key.
 
     Examples
     --------
-    >>> from compensator.model.model_file import parse_model
     >>> model = load_model("quill")
     >>> parse_model(dump_model(model).encode(), source="copy").dtf == model.dtf
     True
@@ -90,92 +94,124 @@ def dump_model(model: ThermalModel) -> str:
 
 def _lines(model: ThermalModel) -> Iterator[str]:
     drive = "heat, W" if model.kind == "heat" else "T_Q - AT, K (nobody measured the heat, so there is no TTF)"
-    yield f"# Thermal model {_comment(model.name)}. The DTF is driven by {drive}."
-    yield "# Time is in minutes in functions of s; b and a are in powers of 1/z at the sample period."
+    yield _comment(f"Thermal model {model.name}. The DTF is driven by {drive}; the deformation is in um.")
+    yield "# Functions of s: ascending powers, time in minutes. b and a: powers of 1/z at the sample period."
     yield "schema = 1"
-    yield from _pairs({
+    yield from _pairs("", {
         "name": model.name, "kind": model.kind, "sample_period_s": model.period_s, "inputs": model.inputs,
     })  # fmt: skip
-    for name in ("TTF", "DTF", "TDTF"):
+    purposes = {
+        "TTF": "Heat to T_Q - AT; its inverse gives the heat",
+        "DTF": f"{'Heat' if model.kind == 'heat' else 'T_Q - AT'} to deformation",
+        "TDTF": "Change of the ambient to deformation",
+    }
+    for name, purpose in purposes.items():
         path: Path | None = getattr(model, name.lower())
         if path is not None:
-            yield ""
-            yield from _path(f"paths.{name}", path, _PURPOSE.get(name, "what drives it to deformation"), {})
+            yield from _path(f"paths.{name}", path, purpose, {})
     for name, (replaces, path) in model.alternatives.items():
-        yield ""
-        yield from _path(f"alternatives.{_key(name)}", path, f"stands in for {replaces}", {"replaces": replaces})
-    estimator = model.estimator
-    walk = "heat_walk_std_w" if model.kind == "heat" else "difference_walk_std_k"
-    yield from (
-        "", "# Noise of a sample of each thermocouple, K, and how much drive and ambient change in one sample.",
-        "[estimator]",
-    )  # fmt: skip
-    yield from _pairs({
-        "method": estimator.method, "t_q_noise_std_k": estimator.t_q_noise_std_k,
-        "at_noise_std_k": estimator.at_noise_std_k, walk: estimator.drive_walk_std,
-        "at_walk_std_k": estimator.at_walk_std_k,
-    })  # fmt: skip
+        yield from _path(f"alternatives.{_key(name)}", path, f"Stands in for {replaces}", {"replaces": replaces})
+    yield from _estimator(model.kind, model.estimator)
     if model.validity:
-        yield from ("", "# Ranges that the model is trusted in; outside them the service holds.", "[validity]")
-        yield from _pairs({key: list(bounds) for key, bounds in model.validity.items()})
-    yield from ("", "# Standard deviation of the model's own error in y.", "[uncertainty]")
-    yield from _pairs({"y_std_um": model.y_std_um})
-    for effect in model.effects:
-        yield from ("", "[[effect]]", *_pairs({"kind": effect.kind, **effect.table}))
+        yield from (
+            "",
+            "# Ranges that the model is trusted in; outside them the service holds. The key ends in the unit.",
+        )
+        yield from ("[validity]", *_pairs("validity", {key: list(bounds) for key, bounds in model.validity.items()}))
+    yield from ("", "# Standard deviation of the model's own error in y, um.", "[uncertainty]")
+    yield from _pairs("uncertainty", {"y_std_um": model.y_std_um})
+    for number, effect in enumerate(model.effects, start=1):
+        yield from _effect(f"effect {number}", effect)
     if model.provenance:
-        yield from ("", "[provenance]", *_pairs(model.provenance))
+        yield from ("", "# Where the model comes from.", "[provenance]", *_pairs("provenance", model.provenance))
 
 
 def _path(where: str, path: Path, purpose: str, extra: Mapping[str, Any]) -> Iterator[str]:
-    function = path.sampled
-    gain = f"{function.dc_gain:.5g}"
-    std = _gain_std(path)
-    if std is not None:
-        gain += f" +- {std:.2g}"
-    taus = ", ".join(f"{tau:.4g}" for tau in function.time_constants_min() if tau > 0.0)
-    yield f"# {purpose}. Gain at rest {gain} {path.unit}; time constants {taus or 'none'} min."
-    yield f"[{where}]"
     table: dict[str, Any] = {**extra, "unit": path.unit}
     if path.continuous is not None:
-        table |= {"form": "continuous", "numerator": list(path.continuous.numerator),
-                  "denominator": list(path.continuous.denominator)}  # fmt: skip
+        table |= {"form": "continuous", "numerator": path.continuous.numerator,
+                  "denominator": path.continuous.denominator}  # fmt: skip
     else:
-        table |= {"form": "sampled", "b": list(function.b), "a": list(function.a)}
+        table |= {"form": "sampled", "b": path.sampled.b, "a": path.sampled.a}
         if path.covariance is not None:
-            table["covariance"] = [list(row) for row in path.covariance]
-    yield from _pairs(table)
+            table["covariance"] = path.covariance
+    lines = list(_pairs(where, table))
+    yield from ("", _comment(f"{purpose}. {_gain(where, path)}."), _comment(_dynamics(path)), f"[{where}]", *lines)
 
 
-def _gain_std(path: Path) -> float | None:
-    """Return the standard error of Σb / Σa from the covariance of b and a_1 …."""
-    if path.covariance is None:
-        return None
+def _gain(where: str, path: Path) -> str:
+    """Say the gain at rest, Σb / Σa, with its standard error from the covariance of b and a_1 …."""
     b, a = path.sampled.b, path.sampled.a
     total = math.fsum(a)
-    gradient = np.array([1.0 / total] * len(b) + [-path.sampled.dc_gain / total] * (len(a) - 1))
-    return float(np.sqrt(max(gradient @ np.array(path.covariance) @ gradient, 0.0)))
+    gain = math.inf if total == 0.0 else (path.continuous or path.sampled).dc_gain
+    if math.isinf(gain):
+        return "No gain at rest: it integrates"
+    if path.covariance is None:
+        return f"Gain at rest {gain:.5g} {path.unit}"
+    gradient = np.array([1.0 / total] * len(b) + [-gain / total] * (len(a) - 1))
+    n = gradient.size
+    if len(path.covariance) != n or any(len(row) != n for row in path.covariance):
+        raise ModelError(f"{where}.covariance: expected {n} rows of {n} numbers")
+    variance = float(gradient @ np.array(path.covariance) @ gradient)
+    return f"Gain at rest {gain:.5g} +- {math.sqrt(max(variance, 0.0)):.2g} {path.unit} (one standard error)"
+
+
+def _dynamics(path: Path) -> str:
+    """Say the time constants and zeros, in s where the file has s: a pole faster than 2/T is negative in z."""
+    function = path.continuous or path.sampled
+    taus = ", ".join(f"{tau:.4g}" for tau in function.time_constants_min() if tau != 0.0)
+    if path.continuous is not None:
+        zeros, at = path.continuous.zeros_per_min(), "s = {} 1/min"
+    else:
+        zeros, at = path.sampled.zeros(), "z = {}"
+    places = ", ".join(f"{z.real:.4g}" if z.imag == 0.0 else f"{z:.4g}" for z in zeros)
+    return f"Time constants: {f'{taus} min' if taus else 'none'}. Zeros: {at.format(places) if places else 'none'}."
+
+
+def _estimator(kind: str, estimator: Estimator) -> Iterator[str]:
+    key, drive = ("heat_walk_std_w", "the heat, W") if kind == "heat" else ("difference_walk_std_k", "T_Q - AT, K")
+    yield ""
+    yield '# "kalman": drive and path states together. "inverse": the drive from the reversed TTF or as measured.'
+    yield "# t_q_noise, at_noise: standard deviation of the noise of one sample, K."
+    yield f"# {key}: standard deviation of the change of {drive}, in one sample; at_walk: of the ambient, K."
+    yield "[estimator]"
+    yield from _pairs("estimator", {
+        "method": estimator.method, "t_q_noise_std_k": estimator.t_q_noise_std_k,
+        "at_noise_std_k": estimator.at_noise_std_k, key: estimator.drive_walk_std,
+        "at_walk_std_k": estimator.at_walk_std_k,
+    })  # fmt: skip
+
+
+def _effect(where: str, effect: EffectTable) -> Iterator[str]:
+    if "kind" in effect.table:
+        raise ModelError(f"{where}: kind = {effect.table['kind']!r} stands beside the kind {effect.kind!r}")
+    yield from ("", "# Added to the base.", "[[effect]]", *_pairs(where, {"kind": effect.kind, **effect.table}))
 
 
 def _comment(text: str) -> str:
-    return re.sub(r"[\x00-\x1f\x7f]", " ", text)
+    return "# " + _CONTROL.sub(" ", _encodable(text))
 
 
-def _pairs(table: Mapping[str, Any]) -> Iterator[str]:
+def _pairs(where: str, table: Mapping[str, Any]) -> Iterator[str]:
     for key, value in table.items():
-        yield f"{_key(str(key))} = {_value(str(key), value)}"
+        yield f"{_key(str(key))} = {_value(f'{where}.{key}' if where else str(key), value)}"
 
 
 def _key(key: str) -> str:
     return key if _BARE_KEY.fullmatch(key) else _string(key)
 
 
+def _encodable(text: str) -> str:
+    return text.encode("utf-8", "replace").decode("utf-8")  # a lone surrogate, as in a damaged file name, has no UTF-8
+
+
 def _string(text: str) -> str:
-    # JSON's escapes are TOML's, but for DEL, which TOML wants escaped; lone surrogates have no UTF-8.
-    return json.dumps(text.encode("utf-8", "replace").decode("utf-8"), ensure_ascii=False).replace("\x7f", "\\u007f")
+    # JSON's escapes are TOML's, but for DEL, which TOML wants escaped.
+    return json.dumps(_encodable(text), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _value(key: str, value: Any) -> str:
-    if isinstance(value, bool):
+    if isinstance(value, (bool, np.bool_)):
         return "true" if value else "false"
     if isinstance(value, (float, np.floating)):
         if not math.isfinite(value):
@@ -185,6 +221,8 @@ def _value(key: str, value: Any) -> str:
         return str(int(value))
     if isinstance(value, str):
         return _string(value)
+    if isinstance(value, (datetime.date, datetime.time)):
+        return value.isoformat()
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{_key(str(k))} = {_value(f'{key}.{k}', v)}" for k, v in value.items()) + " }"
     if isinstance(value, Sequence):
@@ -192,4 +230,4 @@ def _value(key: str, value: Any) -> str:
         if items and isinstance(value[0], (Mapping, Sequence)) and not isinstance(value[0], str):
             return "[\n" + "".join(f"  {item},\n" for item in items) + "]"
         return "[" + ", ".join(items) + "]"
-    raise ModelError(f"{key} = {value!r}: expected a number, text, list or table")
+    raise ModelError(f"{key} = {value!r}: expected a number, text, date, list or table")

@@ -127,6 +127,9 @@ def _errors(calibration: Calibration) -> Table:
     rows.append(
         ["blocks of the fitted data, in turn", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""]
     )
+    arx = calibration.arx_rms_um
+    left = f"{arx:.2f}" if np.isfinite(arx) else "unstable"
+    rows.append(["ARX of the same structure, to compare", "fitted", "", "", left, "", "", ""])
     return Table(
         title="Errors in free run",
         head=["data", "part", "h", "fit %", "rms µm", "peak to peak µm", "uncompensated µm", "persistence µm"],

@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from compensator.errors import DataError
+from compensator.identify.arx import free_run_rms
 from compensator.identify.choice import fit, folds_of
 from compensator.identify.output_error import Segment, Structure, _Problem, fit_output_error
 from compensator.identify.rest import settle_starts
@@ -146,3 +147,10 @@ def test_accuracy_on_the_published_case():
         deformation.append(fit_pct(v, true_y) - fit_pct(v, both.simulate([q, a])))
     assert np.median(ttf) < 0.02
     assert np.median(deformation) < 0.5
+
+
+def test_arx_is_far_off_in_free_run_where_output_error_is_not():
+    heat, ambient, _, y, _, _ = published(CALIBRATION_W, 1)
+    segment = Segment.of([heat, ambient], y)
+    assert fit([segment], TRUE, 60.0).sigma < 0.35
+    assert free_run_rms([segment], TRUE, period_s=60.0) > 3.0

@@ -1,8 +1,13 @@
 """A model file that is written says the same as the model it comes from."""
 
 import dataclasses
+import datetime
+import hashlib
 import math
+import os
+import pathlib
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,20 +16,28 @@ from compensator.errors import ModelError
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model, write_model
 from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
-from compensator.model.transfer_function import SampledTransferFunction
+from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
+
+SAMPLED = Path(
+    sampled=SampledTransferFunction(b=(0.1, -0.05), a=(1.0, -0.97), period_s=60.0),
+    unit="um/K",
+    covariance=((1e-6, 0.0, 1e-9), (0.0, 2e-6, 0.0), (1e-9, 0.0, 3e-8)),
+)
 
 
 def direct_model(**changes):
-    path = Path(
-        sampled=SampledTransferFunction(b=(0.1, -0.05), a=(1.0, -0.97), period_s=60.0),
-        unit="um/K",
-        covariance=((1e-6, 0.0, 1e-9), (0.0, 2e-6, 0.0), (1e-9, 0.0, 3e-8)),
-    )
     estimator = Estimator(
         method="kalman", t_q_noise_std_k=0.02, at_noise_std_k=0.03, drive_walk_std=0.1, at_walk_std_k=0.1
     )
     model = ThermalModel(
-        name="direct", kind="direct", period_s=60.0, ttf=None, dtf=path, tdtf=path, estimator=estimator, y_std_um=0.4
+        name="direct",
+        kind="direct",
+        period_s=60.0,
+        ttf=None,
+        dtf=SAMPLED,
+        tdtf=SAMPLED,
+        estimator=estimator,
+        y_std_um=0.4,
     )
     return dataclasses.replace(model, **changes)
 
@@ -56,7 +69,8 @@ def test_effects_and_nested_provenance_survive():
 @given(st.text(max_size=40))
 def test_any_text_survives(text):
     text = text.encode("utf-8", "replace").decode()
-    assert read_back(direct_model(name=text, provenance={"note": text, text: 1})).provenance == {"note": text, text: 1}
+    model = direct_model(name=text, provenance={"note": text, text: [text, {text: [[text]]}]})
+    assert read_back(model) == model
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
@@ -65,20 +79,112 @@ def test_any_number_survives_to_the_bit(value):
     assert read_back(direct_model(provenance={"x": value})).provenance["x"] == value
 
 
-def test_a_number_that_is_not_finite_is_refused_by_name():
-    with pytest.raises(ModelError, match=r"noise\.std = nan"):
-        dump_model(direct_model(provenance={"noise": {"std": math.nan}}))
+def test_dates_that_an_engineer_wrote_survive():
+    noon = datetime.datetime(2020, 1, 2, 12, 0, 0, 500, tzinfo=datetime.UTC)
+    model = direct_model(provenance={"day": noon.date(), "at": noon, "local": noon.replace(tzinfo=None)})
+    assert read_back(model) == model
 
 
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"provenance": {"noise": {"std": math.nan}}}, r"provenance\.noise\.std = nan"),
+        ({"validity": {"at_degc": (15.0, math.inf)}}, r"validity\.at_degc = inf"),
+        ({"y_std_um": math.nan}, r"uncertainty\.y_std_um = nan"),
+        ({"effects": (EffectTable(kind="gain", table={"parts": [[1.0, -math.inf]]}),)}, r"effect 1\.parts = -inf"),
+        ({"dtf": dataclasses.replace(SAMPLED, covariance=((math.nan,) * 3,) * 3)}, r"paths\.DTF\.covariance = nan"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused_by_name(changes, message):
+    with pytest.raises(ModelError, match=message):
+        dump_model(direct_model(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"provenance": {"who": None}}, r"provenance\.who = None"),
+        ({"effects": (EffectTable(kind="gain", table={"kind": "input"}),)}, "effect 1: kind = 'input'"),
+        ({"dtf": dataclasses.replace(SAMPLED, covariance=((1.0,),))}, r"paths\.DTF\.covariance: expected 3 rows"),
+    ],
+)
+def test_what_a_file_cannot_say_is_refused_by_name(changes, message):
+    with pytest.raises(ModelError, match=message):
+        dump_model(direct_model(**changes))
+
+
+@pytest.mark.parametrize("bad", [{"provenance": {"x": math.inf}}, {"y_std_um": -1.0}, {"validity": {"x": (3.0, 1.0)}}])
+def test_a_model_that_cannot_be_written_or_read_leaves_the_old_file_and_nothing_else(tmp_path, bad):
     file = tmp_path / "model.toml"
     first = write_model(file, direct_model())
     with pytest.raises(ModelError):
-        write_model(file, direct_model(provenance={"x": math.inf}))
+        write_model(file, direct_model(**bad))
     assert [p.name for p in tmp_path.iterdir()] == ["model.toml"]
     assert load_model(file).sha256 == first.sha256
 
 
+def test_a_disk_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    file = tmp_path / "model.toml"
+    first = write_model(file, direct_model())
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write_model(file, direct_model(name="second"))
+    assert [p.name for p in tmp_path.iterdir()] == ["model.toml"]
+    assert load_model(file) == first
+
+
+def test_what_was_written_comes_back_even_under_the_name_of_a_built_in_model(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    written = write_model(pathlib.Path("quill"), direct_model())
+    assert dataclasses.replace(written, sha256="") == direct_model()
+    assert written.sha256 == hashlib.sha256((tmp_path / "quill").read_bytes()).hexdigest()
+
+
+def test_a_damaged_name_does_not_stop_the_writing(tmp_path):
+    assert write_model(tmp_path / "model.toml", direct_model(name="run\udcff")).name == "run?"
+
+
 def test_the_comment_gives_gain_and_standard_error():
-    gain = (0.1 - 0.05) / 0.03
-    assert f"Gain at rest {gain:.5g} +- " in dump_model(direct_model())
+    b, a = SAMPLED.sampled.b, SAMPLED.sampled.a
+    at = np.array([*b, *a[1:]])
+
+    def gain(x):
+        return (x[0] + x[1]) / (1.0 + x[2])
+
+    slope = np.array([(gain(at + h) - gain(at - h)) / 2e-6 for h in 1e-6 * np.eye(3)])
+    std = math.sqrt(slope @ np.array(SAMPLED.covariance) @ slope)
+    assert f"T_Q - AT to deformation. Gain at rest {gain(at):.5g} +- {std:.2g} um/K" in dump_model(direct_model())
+
+
+def test_the_comment_gives_time_constants_and_zeros():
+    text = dump_model(load_model("quill"))
+    assert "Time constants: 12.82, 76.34 min. Zeros: s = -2, -0.01588 1/min." in text
+    assert "Time constants: 1.667 min. Zeros: none." in text
+    assert "Zeros: z = 0.5." in dump_model(direct_model())
+
+
+def test_a_pole_faster_than_the_sampling_keeps_its_time_constant_in_the_comment():
+    fast = TransferFunction(numerator=(1.0,), denominator=(1.0, 0.05), unit="um/K")  # a pole at z = -0.82
+    assert "Time constants: 0.05 min." in dump_model(direct_model(dtf=Path.from_continuous(fast, 60.0)))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        Path(sampled=SampledTransferFunction(b=(0.1,), a=(1.0, -1.0), period_s=60.0), unit="um/K"),
+        Path.from_continuous(TransferFunction(numerator=(1.0,), denominator=(0.0, 1.0), unit="um/K"), 60.0),
+    ],
+)
+def test_an_alternative_that_integrates_is_written(path):
+    model = direct_model(alternatives={"drift away": ("DTF", path)})
+    assert "Stands in for DTF. No gain at rest" in dump_model(model)
+    assert read_back(model) == model
+
+
+def test_a_unit_cannot_break_out_of_its_comment():
+    odd = dataclasses.replace(SAMPLED, unit="um/K\nname = 3")
+    model = direct_model(alternatives={"odd": ("DTF", odd)})
+    assert read_back(model) == model
