@@ -9,7 +9,7 @@ import pathlib
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from compensator.errors import ModelError
@@ -64,9 +64,12 @@ def test_effects_and_nested_provenance_survive():
         provenance={"data": [{"file": "a b.csv", "rows": 7}], "odd key": {"x y": "z"}, "empty": []},
     )
     assert read_back(model) == model
+    assert read_back(model).effects[0].table["on"] is True  # 1 == True
 
 
 @given(st.text(max_size=40))
+@example('"\\ \x00\x7f\x85\r\n\u2028 # µ')
+@example("")
 def test_any_text_survives(text):
     text = text.encode("utf-8", "replace").decode()
     model = direct_model(name=text, provenance={"note": text, text: [text, {text: [[text]]}]})
@@ -105,7 +108,10 @@ def test_a_number_that_is_not_finite_is_refused_by_name(changes, message):
     [
         ({"provenance": {"who": None}}, r"provenance\.who = None"),
         ({"effects": (EffectTable(kind="gain", table={"kind": "input"}),)}, "effect 1: kind = 'input'"),
-        ({"dtf": dataclasses.replace(SAMPLED, covariance=((1.0,),))}, r"paths\.DTF\.covariance: expected 3 rows"),
+        (
+            {"dtf": dataclasses.replace(SAMPLED, covariance=((1.0, 1.0, 1.0),))},
+            r"paths\.DTF\.covariance: expected 3 rows",
+        ),
     ],
 )
 def test_what_a_file_cannot_say_is_refused_by_name(changes, message):

@@ -140,8 +140,12 @@ async def test_a_fault_is_missing_never_a_number_and_heals(
         else:
             assert all(o.offset.state in ("degraded", "hold") for o in outcomes[41:47])
             assert all(not math.isnan(number(o.offset.y_offset_um)) for o in outcomes[41:47])
-        offsets = [number(o.offset.y_offset_um) for o in outcomes]
+        # A line that opens late on a busy machine leaves the first samples without an offset; from the first number
+        # on there is always one, and it never jumps.
+        started = next(i for i, o in enumerate(outcomes) if o.offset.state != "starting")
+        assert started < 30
+        offsets = [number(o.offset.y_offset_um) for o in outcomes[started:]]
         jumps = [i for i, (a, b) in enumerate(itertools.pairwise(offsets)) if not abs(b - a) <= 8.0 + 1e-9]
-        assert not jumps, [outcomes[i + 1].offset for i in jumps[:2]]
+        assert not jumps, [outcomes[started + i + 1].offset for i in jumps[:2]]
         times = [o.offset.time_utc_ns for o in outcomes]
         assert all(b - a == 60_000_000_000 for a, b in itertools.pairwise(times))
