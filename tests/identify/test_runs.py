@@ -1,0 +1,174 @@
+"""Records become runs: gaps, wild readings, noise, reference, other channels."""
+
+import numpy as np
+import pytest
+
+from compensator.identify.runs import SHORTEST_RUN, noise_std, runs_of, walk_std, without_wild
+from compensator.tables import SHORT_GAP_SAMPLES, Record
+
+N = 600
+
+
+def columns(seed=0):
+    rng = np.random.default_rng(seed)
+    heat = np.where((np.arange(N) >= 60) & (np.arange(N) < 300), 90.0, 0.0)
+    at = 21.0 + 0.5 * np.sin(np.arange(N) / 200.0) + rng.normal(0.0, 0.02, N)
+    rise = np.where(np.arange(N) >= 60, 10.0 * (1.0 - np.exp(-(np.arange(N) - 60) / 40.0)), 0.0)
+    t_q = at + 1.5 + rise + rng.normal(0.0, 0.02, N)
+    return {"t_q_degc": t_q, "at_degc": at, "y_um": 4.0 * rise + rng.normal(0.0, 0.3, N), "heat_w": heat}
+
+
+def runs(c, name="day.csv"):
+    return list(runs_of(name, Record(t_s=np.arange(N) * 60.0, columns=c)))
+
+
+@pytest.mark.parametrize("column", ["t_q_degc", "at_degc", "heat_w"])
+def test_the_longest_gap_that_is_bridged(column):
+    c = columns()
+    c[column] = c[column].copy()
+    c[column][200 : 200 + SHORT_GAP_SAMPLES] = np.nan
+    ((run, _),) = runs(c)
+    assert run.name == "day.csv"
+    assert run.t_s.size == N
+    assert np.isfinite(run.difference_k).all() and np.isfinite(run.ambient_k).all()
+    c[column][200 : 201 + SHORT_GAP_SAMPLES] = np.nan
+    parts = [run for run, _ in runs(c)]
+    assert [run.name for run in parts] == ["day.csv part 1", "day.csv part 2"]
+    assert [run.t_s.size for run in parts] == [200, N - 201 - SHORT_GAP_SAMPLES]
+    assert parts[1].t_s[0] == (201 + SHORT_GAP_SAMPLES) * 60.0
+
+
+def test_a_bridge_is_straight():
+    c = columns()
+    c["heat_w"] = np.linspace(0.0, 599.0, N)
+    c["heat_w"][100:150] = np.nan
+    ((run, _),) = runs(c)
+    assert run.heat_w == pytest.approx(np.arange(N), abs=1e-9)
+
+
+def test_every_part_has_its_own_reference():
+    c = columns()
+    c["at_degc"][300:400] = np.nan
+    c["at_degc"][400:] += 3.0
+    first, second = (run for run, _ in runs(c))
+    assert second.reference[1] - first.reference[1] > 2.0
+    assert abs(first.ambient_k[0]) < 0.1 and abs(second.ambient_k[0]) < 0.1
+
+
+def test_absolute_temperatures_come_back():
+    c = columns()
+    ((run, _),) = runs(c)
+    assert run.t_q_degc == pytest.approx(c["t_q_degc"], abs=1e-9)
+    assert run.at_degc == pytest.approx(c["at_degc"], abs=1e-9)
+
+
+def test_missing_ends_and_crumbs_are_left_out():
+    c = columns()
+    c["t_q_degc"][:70] = np.nan
+    c["t_q_degc"][-5:] = np.nan
+    ((run, _),) = runs(c)
+    assert (run.t_s[0], run.t_s.size) == (70 * 60.0, N - 75)
+    c = columns()
+    c["at_degc"][SHORTEST_RUN - 1 : 200] = np.nan
+    ((run, _),) = runs(c)
+    assert run.t_s[0] == 200 * 60.0
+
+
+def test_nothing_measured_gives_no_run():
+    c = columns()
+    c["at_degc"] = np.full(N, np.nan)
+    assert runs(c) == []
+
+
+def test_the_reference_ends_where_the_heat_begins():
+    c = columns()
+    c["heat_w"] = np.where(np.arange(N) >= 10, 90.0, 0.0)
+    ((run, _),) = runs(c)
+    assert run.reference[0] == pytest.approx(np.mean(c["t_q_degc"][:10]), abs=1e-12)
+
+
+def test_other_channels_come_along_and_the_roles_do_not():
+    c = columns() | {"spindle_rpm": np.arange(float(N))}
+    c["spindle_rpm"][5] = np.nan
+    ((run, _),) = runs(c)
+    assert set(run.channels) == {"spindle_rpm"}
+    assert run.channels["spindle_rpm"][5] == pytest.approx(5.0)
+
+
+def test_heat_is_never_cleaned():
+    c = columns()
+    c["heat_w"][450] = 90.0
+    ((run, remarks),) = runs(c)
+    assert run.heat_w[450] == 90.0
+    assert remarks == ()
+
+
+@pytest.mark.parametrize("size", [4.0, -4.0])
+def test_wild_readings_of_either_sign_go(size):
+    values = np.random.default_rng(1).normal(0.0, 0.05, 400)
+    values[[50, 120, 300]] += size
+    cleaned, count = without_wild(values)
+    assert count == 3
+    assert np.flatnonzero(np.isnan(cleaned)).tolist() == [50, 120, 300]
+    assert not np.isnan(values).any()
+
+
+def test_a_step_a_ramp_and_a_pulse_of_two_samples_stay():
+    noise = np.random.default_rng(2).normal(0.0, 0.05, 400)
+    step, ramp, pulse = noise.copy(), noise + np.arange(400) * 0.1, noise.copy()
+    step[200:] += 20.0
+    pulse[200:202] += 20.0
+    for values in (step, ramp, pulse):
+        assert without_wild(values)[1] == 0
+
+
+def test_a_signal_full_of_spikes_is_a_signal():
+    values = np.random.default_rng(3).normal(0.0, 0.01, 400)
+    values[10::15] += 5.0
+    assert without_wild(values)[1] == 0
+
+
+def test_a_wild_reading_beside_a_gap_does_not_hide():
+    values = np.random.default_rng(4).normal(0.0, 0.05, 400)
+    values[100:110] = np.nan
+    values[110] = 6.0
+    cleaned, count = without_wild(values)
+    assert count == 1
+    assert np.isnan(cleaned[110])
+
+
+def test_noise_is_that_of_the_samples_whatever_the_signal_does():
+    rng = np.random.default_rng(5)
+    noise = rng.normal(0.0, 0.3, 4000)
+    slow = 60.0 * np.sin(np.arange(4000) / 300.0)
+    steps = np.repeat(rng.normal(0.0, 50.0, 40), 100)
+    wild = np.zeros(4000)
+    wild[::97] = 30.0
+    for signal in (slow, steps, wild):
+        assert noise_std(noise + signal) == pytest.approx(0.3, rel=0.1)
+
+
+def test_noise_under_a_converter_s_steps():
+    rng = np.random.default_rng(6)
+    slow = np.sin(np.arange(4000) / 300.0)
+    for quantum in (0.01, 0.05):
+        measured = np.round((slow + rng.normal(0.0, 0.05, 4000)) / quantum) * quantum
+        assert noise_std(measured) == pytest.approx(np.hypot(0.05, quantum / np.sqrt(12)), rel=0.12)
+    # A coarse converter hardly ever changes: its noise is neither nothing nor more than its step.
+    assert 0.0 < noise_std(np.round(slow / 0.02) * 0.02) < 0.02
+
+
+def test_noise_skips_what_is_missing_and_of_nothing_is_nothing():
+    noise = np.random.default_rng(7).normal(0.0, 0.3, 4000)
+    noise[::9] = np.nan
+    assert noise_std(noise) == pytest.approx(0.3, rel=0.1)
+    assert noise_std(np.full(100, 3.0)) == 0.0
+    assert noise_std(np.arange(5.0)) == 0.0
+
+
+def test_walk_is_told_apart_from_noise_and_does_not_cross_runs():
+    rng = np.random.default_rng(8)
+    walks = [1000.0 * i + np.cumsum(rng.normal(0.0, 0.2, 5000)) for i in range(2)]
+    measured = [walk + rng.normal(0.0, 0.1, 5000) for walk in walks]
+    assert walk_std(measured, 0.1) == pytest.approx(0.2, rel=0.05)
+    assert walk_std([rng.normal(0.0, 0.1, 5000)], 0.2) == 0.0
