@@ -5,8 +5,9 @@ from __future__ import annotations
 import html
 import io
 import re
-from dataclasses import dataclass
-from typing import Any
+import textwrap
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -23,16 +24,30 @@ COLOURS = {INK: "--ink", GRID: "--grid"} | {colour: f"--line-{i}" for i, colour 
 _DASHES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)))
 #: Buckets that a longer curve is thinned to; each keeps its lowest and highest point.
 _BUCKETS = 700
+#: Gaps up to which each is shown, however narrow.
+_GAPS = 100
+#: What a letter and what the sample of a legend's entry take, and what stands left of the axes, inches.
+_LETTER_IN, _SAMPLE_IN, _LEFT_IN = 0.09, 0.65, 0.8
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A curve with its name; `band` is what its uncertainty spans, lower and upper."""
+    """A curve with its name.
+
+    Parameters
+    ----------
+    name : str
+        Stands in the legend.
+    x, y : numpy.ndarray, shape (n,)
+        Points; a value that is not finite leaves a gap.
+    band : tuple of numpy.ndarray, optional
+        What its uncertainty spans, lower and upper, each of shape (n,).
+    """
 
     name: str
     x: Vector
     y: Vector
-    band: tuple[Vector, Vector] | None = None
+    band: tuple[Vector, Vector] | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +57,7 @@ class Marks:
     name: str
     x: Vector
     y: Vector
-    marker: str = "x"
+    marker: Literal["x", "o"] = field(default="x", kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +71,7 @@ class Stems:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A shaded stretch of the x axis."""
+    """A shaded stretch of the x axis; stretches of one name share an entry of the legend."""
 
     name: str
     first: float
@@ -100,27 +115,44 @@ class Figure:
     height: float = 3.4
 
 
-def thinned(x: Vector, y: Vector) -> npt.NDArray[np.int_]:
+def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> npt.NDArray[np.int_]:
     """Return the indices that keep a curve's look: lowest and highest of each bucket, its ends, and its gaps.
+
+    A gap narrower than a bucket is narrower than the line that is drawn. Where there are many such, they are left
+    out: samples lost here and there would otherwise leave nothing of the curve but lone points.
+
+    Parameters
+    ----------
+    x, y : numpy.ndarray, shape (n,)
+        The curve.
+    x_log : bool
+        Whether buckets are equally wide in the logarithm of x; else they hold equally many samples.
 
     Examples
     --------
     >>> y = np.zeros(100_000)
     >>> y[54_321] = 1.0
     >>> keep = thinned(np.arange(100_000.0), y)
-    >>> keep.size < 2000, 54_321 in keep
+    >>> keep.size < 1500, 54_321 in keep
     (True, True)
     """
     if x.size <= 2 * _BUCKETS:
         return np.arange(x.size)
+    place = np.arange(x.size) * (_BUCKETS / x.size)
+    if x_log and x[0] > 0.0 and bool(np.all(np.diff(x) > 0.0)):
+        place = np.log(x / x[0]) / np.log(x[-1] / x[0]) * _BUCKETS
+    finite = np.isfinite(y)
     keep = {0, x.size - 1}
-    for bucket in np.array_split(np.arange(x.size), _BUCKETS):
-        values = y[bucket]
-        missing = np.isnan(values)
-        if missing.any():
-            keep.add(int(bucket[np.argmax(missing)]))
-        if not missing.all():
-            keep |= {int(bucket[np.nanargmin(values)]), int(bucket[np.nanargmax(values)])}
+    for bucket in np.split(np.arange(x.size), np.flatnonzero(np.diff(np.floor(place))) + 1):
+        seen = bucket[finite[bucket]]
+        if seen.size:
+            keep |= {int(seen[np.argmin(y[seen])]), int(seen[np.argmax(y[seen])])}
+    known = np.flatnonzero(finite)
+    gaps = np.diff(known) > 1
+    if np.count_nonzero(gaps) > _GAPS:
+        gaps &= np.diff(place[known]) >= 1.0
+    for i in np.flatnonzero(gaps).tolist():
+        keep |= {int(known[i]), int(known[i]) + 1, int(known[i + 1])}
     return np.array(sorted(keep))
 
 
@@ -143,9 +175,11 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
     }  # fmt: skip
     with mpl.rc_context(style):
         canvas = Canvas(figsize=(width, figure.height), layout="constrained")
-        _draw(canvas.subplots(), figure)
+        axes = canvas.subplots()
+        _draw(axes, figure)
+        _legend(axes, width)
         buffer = io.StringIO()
-        canvas.savefig(buffer, format="svg", metadata={"Date": None})
+        canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     for colour, variable in COLOURS.items():
@@ -156,37 +190,66 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
 
 
 def _draw(axes: Axes, figure: Figure) -> None:
+    named: set[str] = set()
     for span in figure.spans:
-        axes.axvspan(span.first, span.last, color=GRID, alpha=0.35, linewidth=0, label=span.name)
+        label = "" if span.name in named else _plain(span.name)
+        axes.axvspan(span.first, span.last, color=GRID, alpha=0.35, linewidth=0, label=label)
+        named.add(span.name)
     if figure.unit_circle:
         angle = np.linspace(0.0, 2.0 * np.pi, 200)
         axes.plot(np.cos(angle), np.sin(angle), color=INK, linewidth=0.8)
         axes.set_aspect("equal", adjustable="datalim")
-    drawn = 0
-    for line in figure.lines:
-        keep = thinned(line.x, line.y)
-        colour = LINES[drawn % len(LINES)]
-        axes.plot(line.x[keep], line.y[keep], linestyle=_DASHES[drawn % len(_DASHES)], color=colour, label=line.name,
-                  linewidth=1.5)  # fmt: skip
-        if line.band is not None:
-            low, high = line.band
-            axes.fill_between(line.x[keep], low[keep], high[keep], color=colour, alpha=0.2, linewidth=0)
-        drawn += 1
+    for i, line in enumerate(figure.lines):
+        _curve(axes, line, i, figure.x_log)
+    drawn = len(figure.lines)
     for marks in figure.marks:
         hollow: dict[str, Any] = {"markerfacecolor": "none"} if marks.marker == "o" else {}
-        axes.plot(marks.x, marks.y, marks.marker, color=LINES[drawn % len(LINES)], label=marks.name, **hollow)
+        colour = LINES[drawn % len(LINES)]
+        axes.plot(marks.x, marks.y, marks.marker, color=colour, label=_plain(marks.name), **hollow)
         drawn += 1
     for stems in figure.stems:
-        axes.vlines(stems.x, 0.0, stems.y, color=LINES[drawn % len(LINES)], label=stems.name, linewidth=2.0)
+        colour = LINES[drawn % len(LINES)]
+        axes.vlines(stems.x, 0.0, stems.y, color=colour, label=_plain(stems.name), linewidth=2.0)
         drawn += 1
+    if figure.stems:
+        axes.axhline(0.0, color=INK, linewidth=0.8)
     for limit in figure.limits:
         axes.axhline(limit, color=INK, linewidth=0.8, linestyle="--")
-    if figure.x_log:
+    # A logarithmic axis without a positive value cannot be drawn.
+    if figure.x_log and np.isfinite(axes.dataLim.minposx):
         axes.set_xscale("log")
-    if figure.y_log:
+    if figure.y_log and np.isfinite(axes.dataLim.minposy):
         axes.set_yscale("log")
-    axes.set_xlabel(figure.x_label)
-    axes.set_ylabel(figure.y_label)
+    axes.set_xlabel(_plain(figure.x_label))
+    axes.set_ylabel(_plain(figure.y_label))
     axes.grid(visible=True)
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
+
+
+def _curve(axes: Axes, line: Line, i: int, x_log: bool) -> None:
+    colour = LINES[i % len(LINES)]
+    # The sixth curve has the first one's colour, but another dash.
+    dash = _DASHES[(i + i // len(LINES)) % len(_DASHES)]
+    keep = thinned(line.x, line.y, x_log=x_log)
+    axes.plot(line.x[keep], line.y[keep], linestyle=dash, color=colour, label=_plain(line.name), linewidth=1.5)
+    if line.band is not None:
+        edges = [thinned(line.x, edge, x_log=x_log) for edge in line.band]
+        keep = np.unique(np.concatenate([keep, *edges]))
+        low, high = line.band
+        axes.fill_between(line.x[keep], low[keep], high[keep], color=colour, alpha=0.2, linewidth=0)
+
+
+def _legend(axes: Axes, width: float) -> None:
+    """Put the names above the axes, in as many columns as there is room for."""
+    handles, names = axes.get_legend_handles_labels()
+    if not names:
+        return
+    room = width - _LEFT_IN
+    names = [textwrap.fill(name, int((room - _SAMPLE_IN) / _LETTER_IN)) for name in names]
+    longest = max(len(part) for name in names for part in name.splitlines())
+    columns = min(3, max(1, int(room / (longest * _LETTER_IN + _SAMPLE_IN))))
+    axes.legend(handles, names, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2)
+
+
+def _plain(words: str) -> str:
+    """Keep matplotlib from reading what stands between two dollar signs as a formula."""
+    return words.replace("$", r"\$")

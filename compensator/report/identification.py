@@ -173,10 +173,10 @@ def _path_section(view: PathView) -> Block:
     unit = view.unit.replace("um", "µm")
     hours = view.t_min / 60.0
     band = (view.step - 2 * view.step_std, view.step + 2 * view.step_std)
-    zeros = tuple([Marks("zeros", view.zeros.real, view.zeros.imag, "o")] if view.zeros.size else [])
+    zeros = tuple([Marks("zeros", view.zeros.real, view.zeros.imag, marker="o")] if view.zeros.size else [])
     step = Figure(
         title=f"{view.name}: step response", x_label="time, h", y_label=unit,
-        lines=(Line("step, ± 2 standard errors", hours, view.step, band),), limits=(view.gain,), height=3.2,
+        lines=(Line("step, ± 2 standard errors", hours, view.step, band=band),), limits=(view.gain,), height=3.2,
         note=f"Settles at {with_std(view.gain, view.gain_std)} {unit} (dashed).",
     )  # fmt: skip
     impulse = Figure(title=f"{view.name}: impulse response", x_label="time, h", y_label=f"{unit} per sample",
@@ -189,7 +189,7 @@ def _path_section(view: PathView) -> Block:
     )  # fmt: skip
     plane = Figure(
         title=f"{view.name}: poles and zeros, z plane", x_label="real part", y_label="imaginary part", unit_circle=True,
-        marks=(Marks("poles", view.poles.real, view.poles.imag, "x"), *zeros), height=3.2,
+        marks=(Marks("poles", view.poles.real, view.poles.imag), *zeros), height=3.2,
     )  # fmt: skip
     return Section(
         title=f"{view.name}",

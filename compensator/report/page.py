@@ -7,6 +7,7 @@ page serves a light and a dark screen and paper.
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -17,6 +18,12 @@ from typing import Literal
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, svg
 
 Tone = Literal["good", "warn", "bad"]
+#: Widths of a picture alone and of one in a row, inches: the text of each stays readable in its place.
+_WIDE_IN, _NARROW_IN = 9.0, 4.8
+#: What a cell of a column of numbers looks like: digits, signs, errors, percent; a value that is missing.
+_NUMBER = re.compile(
+    r"[-+−±–]?\s*\d[\d.,\s]*([eE][-+−]?\d+)?(\s*±\s*\d[\d.,eE+−-]*)?\s*%?(\s*\(.*\))?|nan|[-+−]?(inf|∞)|[-–—]"
+)
 _TONE_WORDS: dict[Tone, str] = {"good": "✓ good", "warn": "⚠ mind", "bad": "✗ no"}
 
 
@@ -29,7 +36,19 @@ class Row:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """A table with a header row; the first column is text, the others numbers."""
+    """A table, which scrolls in its own box where it is too wide.
+
+    Parameters
+    ----------
+    title : str
+        A heading; may be empty.
+    head : sequence of str
+        Names of the columns; without any, there is no header row.
+    rows : sequence of sequence of str
+        The first cell names the row. Columns of numbers stand right, others left.
+    note : str
+        A sentence below.
+    """
 
     title: str = ""
     head: Sequence[str]
@@ -117,43 +136,62 @@ def write_page(path: Path, page: Page) -> Path:
 def _figure(figure: Figure, numbers: Iterator[int], width: float) -> str:
     note = f"<p>{html.escape(figure.note)}</p>" if figure.note else ""
     picture = svg(figure, f"f{next(numbers)}", width)
+    if width > _NARROW_IN:
+        picture = f'<div class="scroll" tabindex="0"><div class="wide">{picture}</div></div>'
     return f"<figure><figcaption>{html.escape(figure.title)}</figcaption>{picture}{note}</figure>"
 
 
 def _block(block: Block, numbers: Iterator[int], level: int) -> str:
     if isinstance(block, Figure):
-        return _figure(block, numbers, 9.0)
+        return _figure(block, numbers, _WIDE_IN)
     if isinstance(block, Row):
-        return f'<div class="row">{"".join(_figure(figure, numbers, 4.8) for figure in block.figures)}</div>'
+        return f'<div class="row">{"".join(_figure(figure, numbers, _NARROW_IN) for figure in block.figures)}</div>'
     if isinstance(block, Table):
         return _table(block, level)
-    heading = html.escape(block.title)
     if isinstance(block, Words):
         items = "".join(f"<li>{html.escape(line)}</li>" for line in block.lines)
-        return f'<div class="words {block.kind}"><h{level}>{heading}</h{level}><ul>{items}</ul></div>'
+        sign = '<span aria-hidden="true">⚠ </span>' if block.kind == "warning" else ""
+        return f'<div class="words {block.kind}">{_heading(block.title, level, sign)}<ul>{items}</ul></div>'
     inner = "".join(_block(part, numbers, level + 1) for part in block.blocks)
     if isinstance(block, Details):
-        return f"<details><summary>{heading}</summary>{inner}</details>"
-    return f"<section><h{level}>{heading}</h{level}>{inner}</section>"
+        return f"<details><summary>{_heading(block.title, level)}</summary>{inner}</details>"
+    return f"<section>{_heading(block.title, level)}{inner}</section>"
+
+
+def _heading(words: str, level: int, sign: str = "") -> str:
+    tag = f"h{min(level, 6)}"
+    return f"<{tag}>{sign}{html.escape(words)}</{tag}>"
 
 
 def _table(table: Table, level: int) -> str:
-    head = "".join(f'<th scope="col">{html.escape(cell)}</th>' for cell in table.head)
+    head = "".join(_cell(cell, "col") for cell in table.head) if any(table.head) else ""
     rows = "".join(
-        "<tr>"
-        + "".join(
-            f'<th scope="row">{html.escape(cell)}</th>' if i == 0 else f"<td>{html.escape(cell)}</td>"
-            for i, cell in enumerate(row)
-        )
-        + "</tr>"
-        for row in table.rows
+        "<tr>" + "".join(_cell(cell, "" if i else "row") for i, cell in enumerate(row)) + "</tr>" for row in table.rows
     )
-    title = f"<h{level}>{html.escape(table.title)}</h{level}>" if table.title else ""
+    title = _heading(table.title, level) if table.title else ""
     note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
+    label = html.escape(table.title or "table")
     return (
-        f'{title}<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>{note}"
+        f'{title}<div class="scroll" role="region" aria-label="{label}" tabindex="0"><table class="{_words_in(table)}">'
+        f"{f'<thead><tr>{head}</tr></thead>' if head else ''}<tbody>{rows}</tbody></table></div>{note}"
     )
+
+
+def _words_in(table: Table) -> str:
+    """Return the classes that set columns left whose cells are words for the most part, the first being one of them."""
+    classes = ["text-1"]
+    for i in range(1, max((len(row) for row in table.rows), default=0)):
+        cells = [row[i] for row in table.rows if i < len(row) and row[i]]
+        if 2 * sum(bool(_NUMBER.fullmatch(cell)) for cell in cells) < len(cells):
+            classes.append(f"text-{i + 1}")
+    return " ".join(classes)
+
+
+def _cell(words: str, scope: str) -> str:
+    """Write a cell; one that is empty heads nothing."""
+    if scope and words:
+        return f'<th scope="{scope}">{html.escape(words)}</th>'
+    return f"<td>{html.escape(words)}</td>"
 
 
 __all__ = [
@@ -168,6 +206,7 @@ __all__ = [
     "Span",
     "Stems",
     "Table",
+    "Tone",
     "Words",
     "write_page",
 ]
