@@ -92,7 +92,8 @@ def decode(record: Recorded, path: Path) -> msgspec.Struct:
 
 def recordings(folder: Path, machine: str) -> list[Path]:
     """Return a machine's recordings in the order in which they were started."""
-    return sorted(folder.glob(f"{machine}_????????T??????Z*.mcap"))
+    # By stem: the second file of a second, "…Z-001.mcap", would sort before the first, "…Z.mcap".
+    return sorted(folder.glob(f"{machine}_????????T??????Z*.mcap"), key=lambda path: path.stem)
 
 
 def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:

@@ -37,7 +37,7 @@ class Recorder:
     machine : str
         Name of the machine.
     attachments : dict of str to bytes
-        Files that travel in each recording, by name.
+        Files that travel in each recording, by name; what stands here when a file is opened goes into it.
     """
 
     def __init__(self, folder: Path, machine: str, attachments: dict[str, bytes]) -> None:
@@ -51,7 +51,7 @@ class Recorder:
         self._sequence = 0
         self.path: Path | None = None
 
-    def write(self, records: Iterable[tuple[str, bytes]], time_utc_ns: int) -> None:
+    def write(self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"") -> None:
         """Write records and bring them to disk, all of them before it returns.
 
         Parameters
@@ -60,6 +60,8 @@ class Recorder:
             Topic and JSON.
         time_utc_ns : int
             Time of the records, ns since 1970 UTC.
+        state : bytes
+            State of the compensation before these records; travels as `state.json` in a file that opens with them.
 
         Raises
         ------
@@ -70,7 +72,7 @@ class Recorder:
         try:
             if self._writer is None or day != self._day:
                 self.close()
-                self._open(time_utc_ns, day)
+                self._open(time_utc_ns, day, state)
             assert self._writer is not None and self._file is not None
             for topic, data in records:
                 self._writer.add_message(self._channels[topic], time_utc_ns, data, time_utc_ns, sequence=self._sequence)
@@ -90,7 +92,17 @@ class Recorder:
         finally:
             self._give_up()
 
-    def _open(self, time_utc_ns: int, day: str) -> None:
+    def start_new(self) -> None:
+        """Finish the file, so that the next write opens a new one with the attachments as they are then.
+
+        Raises
+        ------
+        OSError
+            If the disk does not take the end of the file; the file is given up, and the next write opens a new one.
+        """
+        self.close()
+
+    def _open(self, time_utc_ns: int, day: str, state: bytes) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         previous = recordings(self._folder, self._machine)
         metadata = {
@@ -114,6 +126,8 @@ class Recorder:
         self._writer.add_metadata("run", metadata)
         for name, data in self.attachments.items():
             self._writer.add_attachment(time_utc_ns, time_utc_ns, name, "application/toml", data)
+        if state:
+            self._writer.add_attachment(time_utc_ns, time_utc_ns, "state.json", "application/json", state)
         self._flush()
         self._day = day
         directory = os.open(self._folder, os.O_RDONLY)
