@@ -36,10 +36,15 @@ class Machine(_Table, frozen=True, kw_only=True):
 
 
 class ModelChoice(_Table, frozen=True, kw_only=True):
-    """`[model]`: a model file (relative to the configuration) or `quill`."""
+    """`[model]`: a model file (relative to the configuration) or `quill`.
+
+    `store`: folder of the models that were adopted, relative to the configuration; `models` in the recording folder
+    where none is given.
+    """
 
     file: str
     alternative: str | None = None
+    store: str | None = None
 
 
 class Sampling(_Table, frozen=True, kw_only=True):
@@ -100,6 +105,16 @@ class Zero(_Table, frozen=True, kw_only=True):
     at_start: bool = True
 
 
+class Restart(_Table, frozen=True, kw_only=True):
+    """`[restart]`: how a service goes on after an end.
+
+    `bridge_max_min`: longest time without the service that is interpolated; the model's slowest time constant where
+    none is given.
+    """
+
+    bridge_max_min: Positive | None = None
+
+
 class Zenoh(_Table, frozen=True, kw_only=True):
     """`[zenoh]`: where the offset goes. Nothing is listened on unless it stands here."""
 
@@ -130,6 +145,7 @@ class Config(_Table, frozen=True, kw_only=True):
     device: list[dict[str, Any]]
     channel: list[Channel]
     sampling: Sampling = Sampling()
+    restart: Restart = Restart()
 
 
 class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -155,6 +171,11 @@ class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
     def resolve(self, name: str) -> Path:
         """Return a path of the file relative to the file's folder."""
         return (self.path.parent / name).resolve()
+
+    def store(self) -> Path:
+        """Return the folder of the models that were adopted."""
+        store = self.config.model.store
+        return self.resolve(store) if store is not None else self.resolve(self.config.recording.folder) / "models"
 
     def model_name(self) -> str | Path:
         """Return the model's name if it is built in, else its path."""

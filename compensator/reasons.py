@@ -44,6 +44,14 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "The offset moves at its largest permitted rate and has not arrived yet.",
         "Wait; if it stays so, check sensors and limits.offset_rate_max_um_per_min.",
     ),
+    "model_changed": (
+        "Another model was taken over, and the offset is still under way to its value at the permitted rate.",
+        "Wait until it has arrived; `compensator back` returns to the model before.",
+    ),
+    "cold_start": (
+        "What the machine had stored is not known from a record, so the model began with how it was found.",
+        "Allow for the standard deviation, or let the machine come to rest and send the command zero.",
+    ),
     "operator_hold": ("An operator has frozen the offset.", "Send the command resume."),
     "recording_failed": (
         "The sample could not be written to disk; compensation goes on.",

@@ -8,6 +8,7 @@ back to the last complete sample and walks over the missing ones with interpolat
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -74,18 +75,16 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
-class EngineState:
-    """Everything the engine must remember to go on with the same bits."""
+class Inputs:
+    """Inputs of one sample as the engine uses them: changes of the temperatures, channels as they are.
 
-    observer: ObserverState
-    effects: tuple[tuple[float, ...], ...]
-    channels: tuple[tuple[str, float], ...]
-    reference: Reference
-
-
-@dataclass(frozen=True, slots=True)
-class _Inputs:
-    """Inputs of one sample as the engine uses them: changes of the temperatures, channels as they are."""
+    Parameters
+    ----------
+    t_q_k, at_k : float
+        Changes of T_Q and AT from their reference, K; NaN where missing.
+    channels : dict of str to float
+        Channels that the effects use, in their own units; NaN where missing.
+    """
 
     t_q_k: float
     at_k: float
@@ -93,16 +92,62 @@ class _Inputs:
 
     @property
     def complete(self) -> bool:
+        """Whether nothing is missing."""
         return not (math.isnan(self.t_q_k) or math.isnan(self.at_k) or any(map(math.isnan, self.channels.values())))
 
 
-@dataclass(slots=True)
-class _Gap:
-    """Incomplete samples since the last complete one, kept to be walked over again."""
+@dataclass(frozen=True, slots=True)
+class EngineState:
+    """Everything the engine must remember to go on with the same bits.
+
+    Parameters
+    ----------
+    observer : ObserverState
+        State of the observer.
+    effects : tuple of tuple of float
+        State of each effect.
+    channels : tuple of (str, float)
+        Last good value of each channel that an effect uses.
+    reference : Reference
+        What the inputs are taken as changes from.
+    last_complete : Inputs, optional
+        The last complete sample, where a gap that begins after it may be walked over.
+    gap : Gap, optional
+        The gap under way.
+    """
+
+    observer: ObserverState
+    effects: tuple[tuple[float, ...], ...]
+    channels: tuple[tuple[str, float], ...]
+    reference: Reference
+    last_complete: Inputs | None = None
+    gap: Gap | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Incomplete samples since the last complete one, kept to be walked over again.
+
+    Parameters
+    ----------
+    state : EngineState
+        State before the first of them.
+    before : Inputs or None
+        The complete sample before them; None where nothing before is known.
+    samples : tuple of Inputs
+        The incomplete samples.
+    limit : int
+        A gap of more samples than this is left as predicted.
+    held : bool
+        Whether the missing values are taken to have been as those after the gap from its beginning, instead of
+        on a straight line between its ends.
+    """
 
     state: EngineState
-    before: _Inputs
-    samples: list[_Inputs]
+    before: Inputs | None
+    samples: tuple[Inputs, ...] = ()
+    limit: int = BRIDGE_SAMPLES
+    held: bool = False
 
 
 class Engine:
@@ -139,8 +184,8 @@ class Engine:
         absolute = model.inputs == "absolute"
         self._reference = Reference(0.0, 0.0) if absolute else Reference(NAN, NAN)
         self._held: dict[str, float] = {}
-        self._last_complete: _Inputs | None = None
-        self._gap: _Gap | None = None
+        self._last_complete: Inputs | None = None
+        self._gap: Gap | None = None
         self._signals = Signals()
 
     # ------------------------------------------------------------------ reference and state
@@ -179,6 +224,8 @@ class Engine:
             effects=tuple(effect.snapshot() for effect in self._effects),
             channels=tuple(self._held.items()),
             reference=self._reference,
+            last_complete=self._last_complete,
+            gap=self._gap,
         )
 
     def restore(self, state: EngineState) -> None:
@@ -191,12 +238,35 @@ class Engine:
         """
         if len(state.effects) != len(self._effects):
             raise ValueError(f"snapshot of {len(state.effects)} effects, the model has {len(self._effects)}")
+        for effect, effect_state in zip(self._effects, state.effects, strict=True):
+            if len(effect_state) != len(effect.snapshot()):
+                raise ValueError(f"snapshot of {len(effect_state)} numbers for an effect of kind {effect.kind!r}")
         self._observer.restore(state.observer)
         for effect, effect_state in zip(self._effects, state.effects, strict=True):
             effect.restore(effect_state)
         self._held = dict(state.channels)
         self._reference = state.reference
-        self._last_complete = self._gap = None
+        self._last_complete, self._gap = state.last_complete, state.gap
+
+    def check(self, state: EngineState) -> None:
+        """Refuse a snapshot from elsewhere whose parts do not fit together.
+
+        Raises
+        ------
+        ValueError
+            Saying what does not fit.
+        """
+        gap = state.gap
+        inputs = [state.last_complete] if state.last_complete is not None else []
+        if gap is not None:
+            if gap.state.gap is not None:
+                raise ValueError("snapshot with a gap before its gap")
+            self.check(gap.state)
+            inputs += [*gap.samples, *([gap.before] if gap.before is not None else [])]
+        if any(tuple(entry.channels) != self.channels for entry in inputs):
+            raise ValueError(f"snapshot with channels that the effects do not use, expected {list(self.channels)}")
+        probe = Engine(self.model)
+        probe.restore(dataclasses.replace(state, gap=None))
 
     # ------------------------------------------------------------------ one sample
 
@@ -223,7 +293,7 @@ class Engine:
         if not self.has_reference:
             raise ModelError("the engine has no reference yet: call set_reference first")
         given = channels or {}
-        inputs = _Inputs(
+        inputs = Inputs(
             t_q_k=t_q_degc - self._reference.t_q_degc,
             at_k=at_degc - self._reference.at_degc,
             channels={name: given.get(name, NAN) for name in self.channels},
@@ -267,9 +337,39 @@ class Engine:
             self.step(t_q[i], at[i], {name: values[i] for name, values in columns.items()}) for i in range(len(t_q))
         ]
 
+    def skip(self, samples: int, *, held: bool = False) -> Estimate:
+        """Pass over samples that nobody took, as missing ones; the next complete sample walks over them again.
+
+        Parameters
+        ----------
+        samples : int
+            How many, at least 1. However many they are, they are walked over.
+        held : bool
+            The machine is taken to have been all the while as it is found after the gap, instead of on a straight
+            line between its two ends: what is known before says nothing about the end of a long gap.
+
+        Returns
+        -------
+        Estimate
+            What is predicted at the end of the gap.
+
+        Raises
+        ------
+        ModelError
+            If there is no reference yet.
+        """
+        gap = self._gap or Gap(state=self.snapshot(), before=self._last_complete)
+        if held or gap.before is not None:
+            # A long pause must not use up what a short loss of a sensor after it may take.
+            limit = max(gap.limit, len(gap.samples) + samples + self.bridge_samples)
+            self._gap = dataclasses.replace(gap, limit=limit, held=held or gap.held)
+        for _ in range(samples):
+            estimate = self.step(NAN, NAN)
+        return estimate
+
     # ------------------------------------------------------------------ inside
 
-    def _advance(self, inputs: _Inputs, extra_t_q_k2: float = 0.0, extra_at_k2: float = 0.0) -> Estimate:
+    def _advance(self, inputs: Inputs, extra_t_q_k2: float = 0.0, extra_at_k2: float = 0.0) -> Estimate:
         observer = self._observer
         observer.step(inputs.t_q_k, inputs.at_k, extra_t_q_k2=extra_t_q_k2, extra_at_k2=extra_at_k2)
         dtf, tdtf = observer.shares_um()
@@ -293,7 +393,7 @@ class Engine:
             y_rate_um_per_min=rate,
         )
 
-    def _step_effects(self, inputs: _Inputs, dtf: float, tdtf: float) -> tuple[float, ...]:
+    def _step_effects(self, inputs: Inputs, dtf: float, tdtf: float) -> tuple[float, ...]:
         """Step every effect; a channel that is missing keeps its last good value."""
         for name, value in inputs.channels.items():
             if not math.isnan(value):
@@ -317,16 +417,16 @@ class Engine:
             effect.restore(state)
         return growth / self._period_min
 
-    def _keep(self, inputs: _Inputs) -> None:
+    def _keep(self, inputs: Inputs) -> None:
         """Keep an incomplete sample, as long as a walk over the gap is still wanted."""
         if self._gap is None and self._last_complete is not None:
-            self._gap = _Gap(state=self.snapshot(), before=self._last_complete, samples=[])
+            self._gap = Gap(state=self.snapshot(), before=self._last_complete, limit=self.bridge_samples)
         if self._gap is not None:
-            self._gap.samples.append(inputs)
-            if len(self._gap.samples) > self.bridge_samples:
+            self._gap = dataclasses.replace(self._gap, samples=(*self._gap.samples, inputs))
+            if len(self._gap.samples) > self._gap.limit:
                 self._gap = self._last_complete = None
 
-    def _walk_over(self, gap: _Gap, after: _Inputs) -> None:
+    def _walk_over(self, gap: Gap, after: Inputs) -> None:
         """Go back to the last complete sample and step over the gap with interpolated inputs."""
         reference = self._reference
         self.restore(gap.state)
@@ -336,17 +436,18 @@ class Engine:
         feed = self.model.ttf.sampled.b[0] if self.model.ttf else 1.0
         at_walk = estimator.at_walk_std_k**2
         t_q_walk = (feed * estimator.drive_walk_std) ** 2 + at_walk
+        before = after if gap.held or gap.before is None else gap.before
         for i, sample in enumerate(gap.samples, start=1):
-            t_q, t_q_missing = _interpolated(sample.t_q_k, gap.before.t_q_k, after.t_q_k, i / n)
-            at, at_missing = _interpolated(sample.at_k, gap.before.at_k, after.at_k, i / n)
+            t_q, t_q_missing = _interpolated(sample.t_q_k, before.t_q_k, after.t_q_k, i / n)
+            at, at_missing = _interpolated(sample.at_k, before.at_k, after.at_k, i / n)
             channels = {
-                name: _interpolated(value, gap.before.channels[name], after.channels[name], i / n)[0]
+                name: _interpolated(value, before.channels[name], after.channels[name], i / n)[0]
                 for name, value in sample.channels.items()
             }
             # Variance of a random walk that is pinned at both ends.
             bridge = i * (n - i) / n
             self._advance(
-                _Inputs(t_q, at, channels),
+                Inputs(t_q, at, channels),
                 extra_t_q_k2=bridge * t_q_walk if t_q_missing else 0.0,
                 extra_at_k2=bridge * at_walk if at_missing else 0.0,
             )

@@ -54,11 +54,14 @@ class ObserverState:
         Upper triangle of its covariance, row by row.
     settled : bool
         Whether the covariance has reached its steady value.
+    started : bool
+        Whether it has taken a sample since it was at rest.
     """
 
     x: tuple[float, ...]
     p: tuple[float, ...]
     settled: bool
+    started: bool = True
 
 
 def _corrected(p: Matrix, gain: Matrix, column: Matrix, s: float) -> Matrix:
@@ -294,8 +297,9 @@ class Observer:
     def snapshot(self) -> ObserverState:
         """Return what must be kept to go on from here with the same bits."""
         return ObserverState(
-            x=tuple(self._x[: self.size]), p=tuple(self._P[self._upper].tolist()), settled=self._settled
-        )
+            x=tuple(self._x[: self.size]), p=tuple(self._P[self._upper].tolist()), settled=self._settled,
+            started=self._started,
+        )  # fmt: skip
 
     def restore(self, state: ObserverState) -> None:
         """Go on from a snapshot.
@@ -311,7 +315,7 @@ class Observer:
         self._P = np.zeros((self.size, self.size))
         self._P[self._upper] = state.p
         self._P.T[self._upper] = state.p
-        self._started = True
+        self._started = state.started
         self._y_var = self._variance_of_y()
         self._settled = state.settled
         if state.settled:

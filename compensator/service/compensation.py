@@ -8,18 +8,26 @@ through the limiter, whatever caused it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
 
 import msgspec
 
 from compensator.config import Config
-from compensator.errors import ServiceError
+from compensator.errors import DataError, ServiceError
 from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, State, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.guards import HEATED_W, SensorGuards
 from compensator.service.limits import Limited, OffsetLimiter
+from compensator.service.state import (
+    STATE_SCHEMA,
+    CompensationState,
+    Memory,
+    ZeroMode,
+    ZeroState,
+    decode_state,
+    encode_state,
+)
 
 NAN = float("nan")
 
@@ -28,7 +36,10 @@ VALID_SAMPLES = 2.5
 #: Number of samples over which rate and heat are averaged before they decide anything.
 MEAN_SAMPLES = 5
 
-ZeroMode = Literal["auto", "rest", "warm"]
+#: Longest pause that is walked over, in samples: more would delay the sample after it.
+MOST_BRIDGED = 1500
+#: A state that began unknown counts as known after so many of the slowest time constants (5 % are left then).
+KNOWN_AFTER = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,28 +74,6 @@ class _Values:
     others: dict[str, float]
 
 
-@dataclass(slots=True)
-class _Zero:
-    """References beyond those of the engine."""
-
-    y_ref: float = NAN
-    y_base: float = 0.0
-    wanted: bool = False
-    mode: ZeroMode = "auto"
-
-
-@dataclass(slots=True)
-class _Memory:
-    """What is remembered from sample to sample."""
-
-    estimate: Estimate | None = None
-    missing_min: float = 0.0
-    rates: list[float] = field(default_factory=list)
-    heats: list[float] = field(default_factory=list)
-    operator_hold: bool = False
-    internal_error: bool = False
-
-
 class Compensation:
     """Compensation of one machine.
 
@@ -107,9 +96,11 @@ class Compensation:
             raise ServiceError(f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured")
         self._guards = SensorGuards(config.channel, config.guards, self._period_min)
         self._limiter = OffsetLimiter(config.limits, self._period_min)
-        self._zero = _Zero(wanted=config.zero.at_start)
-        self._memory = _Memory()
+        self._zero = ZeroState(wanted=config.zero.at_start)
+        self._memory = Memory()
         self._validity = self._bounds()
+        #: The model's slowest time constant, min.
+        self.slowest_min = slowest_min(model)
 
     def _bounds(self) -> dict[str, tuple[float, float]]:
         """Return the range of validity: the configuration's, narrowed by the model's own."""
@@ -158,6 +149,132 @@ class Compensation:
             model_sha256=self.model.sha256,
         )  # fmt: skip
 
+    # ------------------------------------------------------------------ state
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether the inputs have a reference yet."""
+        return self._engine.has_reference
+
+    @property
+    def last(self) -> tuple[int, int]:
+        """Number and time, ns since 1970 UTC, of the last sample; −1 and 0 before the first."""
+        return self._memory.seq, self._memory.time_utc_ns
+
+    @property
+    def offset_um(self) -> float:
+        """The last offset, µm."""
+        return self._limiter.offset_um
+
+    @property
+    def bridge_max_min(self) -> float:
+        """Longest pause that is interpolated, min."""
+        wanted = self._config.restart.bridge_max_min
+        return min(self.slowest_min if wanted is None else wanted, MOST_BRIDGED * self._period_min)
+
+    def state(self) -> bytes:
+        """Return everything that decides the next outcome, as JSON that keeps every bit."""
+        return encode_state(CompensationState(
+            schema=STATE_SCHEMA, model_sha256=self.model.sha256, alternative=self._config.model.alternative,
+            engine=self._engine.snapshot(), guards=self._guards.snapshot(), offset_um=self._limiter.offset_um,
+            zero=self._zero, memory=self._memory,
+        ))  # fmt: skip
+
+    def restore(self, state: bytes) -> None:
+        """Go on from a state; all further outcomes are those that would have followed, bit for bit.
+
+        Raises
+        ------
+        DataError
+            If it is no state, or that of another model or of other channels. Nothing is changed then.
+        """
+        whole = decode_state(state)
+        for name, found, expected in (
+            ("model_sha256", whole.model_sha256, self.model.sha256),
+            ("alternative", whole.alternative, self._config.model.alternative),
+            ("guards", sorted(whole.guards), sorted(self._guards.snapshot())),
+        ):
+            if found != expected:
+                raise DataError(f"state: {name} = {found!r}, expected {expected!r}")
+        engine = Engine(self.model)
+        try:
+            engine.check(whole.engine)
+            engine.restore(whole.engine)
+        except ValueError as error:
+            raise DataError(f"state: {error}") from error
+        estimate = whole.memory.estimate
+        if estimate is not None and len(estimate.y_effects_um) != len(self.model.effects):
+            raise DataError(f"state: estimate of {len(estimate.y_effects_um)} effects")
+        self._engine, self._zero, self._memory = engine, whole.zero, whole.memory
+        self._guards.restore(whole.guards)
+        self._limiter.offset_um = whole.offset_um
+
+    def pause(self, samples: int) -> None:
+        """Pass over samples that nobody took, such as those while the service did not run.
+
+        They count as missing: the prediction goes on and its standard deviation grows, and the next sample with both
+        temperatures walks over them again. A pause of more than `bridge_max_min` says nothing certain about the state
+        at its end: the machine is then taken to have been all the while as it is found, and the reason `cold_start`
+        stands until that is forgotten.
+
+        Parameters
+        ----------
+        samples : int
+            How many; nothing is done for none.
+        """
+        if samples <= 0:
+            return
+        minutes = samples * self._period_min
+        self._guards.pass_time(minutes)
+        self._memory.missing_min += minutes
+        if not self._engine.has_reference:
+            return
+        if minutes > self.bridge_max_min:
+            self._pass_cold(min(samples, MOST_BRIDGED))
+        else:
+            self._memory.estimate = self._engine.skip(samples)
+
+    def _pass_cold(self, samples: int) -> None:
+        self._memory.estimate = self._engine.skip(samples, held=True)
+        self._memory.cold_min = KNOWN_AFTER * self.slowest_min
+
+    def begin(self, *, t_q_ref_degc: float, at_ref_degc: float, y_ref_um: float, y_base_um: float) -> None:
+        """Begin with a zero that was set before there is a record, and with an unknown state.
+
+        Parameters
+        ----------
+        t_q_ref_degc, at_ref_degc, y_ref_um : float
+            The zero: temperatures, °C, and measured deformation, µm (NaN where it is not known).
+        y_base_um : float
+            Predicted deformation at the last zero on a warm machine, µm.
+        """
+        self._engine.set_reference(t_q_ref_degc, at_ref_degc)
+        self._zero = ZeroState(y_ref=y_ref_um, y_base=y_base_um)
+        self._pass_cold(min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED))
+
+    def begin_at_zero(self) -> None:
+        """Wait for the zero of a record, whatever the configuration says of the start."""
+        self._zero = ZeroState()
+
+    def go_on_from(self, offset_um: float, *, other: Compensation | None = None) -> None:
+        """Go on from the offset that stands, and from what operators have asked of the compensation before.
+
+        Parameters
+        ----------
+        offset_um : float
+            What was published last, µm.
+        other : Compensation, optional
+            The one before, with another model: holds and a zero that waits stand, and the reason `model_changed`
+            stands until the offset has arrived at its new value.
+        """
+        self._limiter.offset_um = offset_um
+        if other is None:
+            return
+        memory = other._memory
+        self._memory.operator_hold, self._memory.internal_error = memory.operator_hold, memory.internal_error
+        self._zero.wanted, self._zero.mode = other._zero.wanted, other._zero.mode
+        self._memory.model_changed = memory.estimate is not None
+
     # ------------------------------------------------------------------ one sample
 
     def process(self, raw: Sample) -> Outcome:
@@ -178,6 +295,7 @@ class Compensation:
         values = _values(sample.channels)
         notes: list[tuple[str, str]] = []
         self._set_zero(values, notes)
+        self._memory.seq, self._memory.time_utc_ns = raw.seq, raw.time_utc_ns
         estimate = None
         if self._engine.has_reference:
             estimate = self._engine.step(values.t_q, values.at, values.others)
@@ -207,7 +325,7 @@ class Compensation:
         else:
             self._engine.set_reference(values.t_q, values.at)
             self._memory.estimate, self._memory.rates, self._memory.heats = None, [], []
-            zero.y_base = 0.0
+            zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
         notes.append((
             "zero",
@@ -239,12 +357,18 @@ class Compensation:
         reasons += [
             f"channel_missing:{name}" for name in self._engine.channels if math.isnan(values.others.get(name, NAN))
         ]
+        if self._memory.cold_min > 0.0:
+            self._memory.cold_min -= self._period_min
+            reasons.append("cold_start")
         blocking = self._blocking(values, expired)
         if blocking:
             return "hold", reasons + blocking, self._limiter.hold()
         if lost:
             reasons.append("predicting")
         limited = self._limiter.follow(0.0 - y_pred, -estimate.y_rate_um_per_min)
+        self._memory.model_changed &= "rate_limited" in limited.reasons
+        if self._memory.model_changed:
+            reasons.append("model_changed")
         reasons += limited.reasons
         return ("degraded" if reasons else "ok"), reasons, limited
 
@@ -303,6 +427,16 @@ class Compensation:
             y_offset_std_um=estimate.y_std_um if estimate else NAN,
             state=state, reasons=reasons, model_sha256=self.model.sha256,
         )  # fmt: skip
+
+
+def slowest_min(model: ThermalModel) -> float:
+    """Return the slowest time constant of a model's paths and effects, min."""
+    paths = [path for path in (model.ttf, model.dtf, model.tdtf) if path is not None]
+    times = [tau for path in paths for tau in path.sampled.time_constants_min() if math.isfinite(tau)]
+    for effect in model.effects:
+        tau = effect.table.get("tau_min", [])
+        times += tau if isinstance(tau, list) else [tau]
+    return max(times, default=model.period_s / 60.0)
 
 
 def _mean(values: list[float]) -> float:

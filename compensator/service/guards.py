@@ -73,6 +73,10 @@ class ChannelGuard:
         limit = self._channel.stuck_after_min
         return limit is not None and self._still_min >= limit
 
+    def pass_time(self, minutes: float) -> None:
+        """Let time pass in which nothing was measured."""
+        self._since_good_min += minutes
+
     def snapshot(self) -> tuple[float, float, float, float]:
         """Return the state."""
         return self._last_good, self._since_good_min, self._still_at, self._still_min
@@ -127,6 +131,11 @@ class SensorGuards:
         known = channels.get("heat_w")
         heat = number(known.mean) if known is not None and verdicts["heat_w"] == "good" else heat_w
         return below_k > self._limits.t_q_below_at_max_k and heat > HEATED_W
+
+    def pass_time(self, minutes: float) -> None:
+        """Let time pass in which nothing was measured."""
+        for guard in self._guards.values():
+            guard.pass_time(minutes)
 
     def snapshot(self) -> dict[str, tuple[float, float, float, float]]:
         """Return the state of every guard."""

@@ -1,0 +1,149 @@
+"""The state of a compensation as JSON: everything that decides the next outcome, to the bit.
+
+A number that is not finite stands as a text (`"nan"`, `"inf"`, `"-inf"`), since JSON has no word for it; every other
+one is written with as many digits as give the same bits back.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgspec
+
+from compensator.errors import DataError
+from compensator.model.engine import EngineState, Estimate
+
+NAN = float("nan")
+
+#: Version of the state. A state of another version is refused, never guessed at.
+STATE_SCHEMA = 1
+
+ZeroMode = Literal["auto", "rest", "warm"]
+
+
+@dataclass(slots=True)
+class ZeroState:
+    """References beyond those of the engine, and the zero that waits for a sample.
+
+    Parameters
+    ----------
+    y_ref : float
+        Measured deformation at the zero, µm.
+    y_base : float
+        Predicted deformation at the last zero on a warm machine, µm.
+    wanted : bool
+        Whether a zero waits for both temperatures.
+    mode : {"auto", "rest", "warm"}
+        How it is to be set.
+    """
+
+    y_ref: float = NAN
+    y_base: float = 0.0
+    wanted: bool = False
+    mode: ZeroMode = "auto"
+
+
+@dataclass(slots=True)
+class Memory:
+    """What is remembered from sample to sample.
+
+    Parameters
+    ----------
+    seq, time_utc_ns : int
+        Number and time of the last sample, −1 and 0 before the first.
+    estimate : Estimate, optional
+        What the engine knew after it.
+    missing_min : float
+        For how long a temperature has been missing, min.
+    rates, heats : list of float
+        Growth, µm/min, and heat, W, of the last samples.
+    operator_hold, internal_error : bool
+        Why the offset is held.
+    model_changed : bool
+        Whether the offset is still under way to that of another model.
+    cold_min : float
+        For how much longer the state counts as unknown, min.
+    """
+
+    seq: int = -1
+    time_utc_ns: int = 0
+    estimate: Estimate | None = None
+    missing_min: float = 0.0
+    rates: list[float] = field(default_factory=list)
+    heats: list[float] = field(default_factory=list)
+    operator_hold: bool = False
+    internal_error: bool = False
+    model_changed: bool = False
+    cold_min: float = 0.0
+
+
+class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The whole state.
+
+    Parameters
+    ----------
+    schema : int
+        `STATE_SCHEMA`.
+    model_sha256 : str
+        Hash of the model file that it belongs to.
+    alternative : str or None
+        The alternative path that stood in for the model's own.
+    engine : EngineState
+        Observer, effects, held channels, reference, gap under way.
+    guards : dict of str to four floats
+        By channel: last good value, min since it, value that it stands still at, min for which it has.
+    offset_um : float
+        The last offset, µm.
+    zero : ZeroState
+        References of Y.
+    memory : Memory
+        What is remembered from sample to sample.
+    """
+
+    schema: int
+    model_sha256: str
+    alternative: str | None
+    engine: EngineState
+    guards: dict[str, tuple[float, float, float, float]]
+    offset_um: float
+    zero: ZeroState
+    memory: Memory
+
+
+def encode_state(state: CompensationState) -> bytes:
+    """Return a state as JSON."""
+    return json.dumps(_worded(msgspec.to_builtins(state)), separators=(",", ":")).encode()
+
+
+def _worded(value: Any) -> Any:
+    """Put words in the place of numbers that are not finite."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if isinstance(value, dict):
+        return {key: _worded(entry) for key, entry in value.items()}
+    return [_worded(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+
+def decode_state(data: bytes) -> CompensationState:
+    """Read a state.
+
+    Raises
+    ------
+    DataError
+        If it is no state of this version.
+    """
+    try:
+        # Not strict: only so does a text stand for a number.
+        state = msgspec.json.decode(data, type=CompensationState, strict=False)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise DataError(f"state: {error}") from error
+    if state.schema != STATE_SCHEMA:
+        raise DataError(f"state: schema = {state.schema}, expected {STATE_SCHEMA}")
+    nested = (state.engine, *([state.engine.gap.state] if state.engine.gap else []))
+    numbers = [state.offset_um, *(value for engine in nested for value in (*engine.observer.x, *engine.observer.p))]
+    if not all(map(math.isfinite, numbers)):
+        raise DataError("state: a number of the offset or of the observer is not finite")
+    return state
