@@ -199,6 +199,86 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     devices: dict[str, str]
 
 
+class ChainPart(msgspec.Struct, frozen=True, kw_only=True):
+    """One of the things that a recording opens with, in the first `/chain` message of the file.
+
+    Parameters
+    ----------
+    name : str
+        Such as `attachment model.toml`, `metadata run`, `channel /sample`.
+    sha256 : str
+        Its hash.
+    """
+
+    name: str
+    sha256: str
+
+
+class ChainLink(msgspec.Struct, frozen=True, kw_only=True):
+    """Value of the hash chain at one record.
+
+    Parameters
+    ----------
+    topic : str
+        Its channel, without the slash.
+    sequence : int
+        Its number in the file.
+    sha256 : str
+        Hash over the record and the value before it, see `compensator.chain`.
+    """
+
+    topic: str
+    sequence: int
+    sha256: str
+
+
+class Chain(msgspec.Struct, frozen=True, kw_only=True):
+    """Values of the hash chain for the records since the last such message, `/chain`.
+
+    Parameters
+    ----------
+    before : str
+        Value before the first of them; in the first message of a file, the last value of the file before.
+    parts : list of ChainPart
+        What the file opens with; only in its first message.
+    records : list of ChainLink
+        One for each record, in the order of the file.
+    """
+
+    schema: int
+    machine: str
+    time_utc_ns: int
+    before: str
+    parts: list[ChainPart]
+    records: list[ChainLink]
+
+
+class Seal(msgspec.Struct, frozen=True, kw_only=True):
+    """Says that a recording was whole up to here, `/seal`; the last record of a finished file.
+
+    Parameters
+    ----------
+    reason : str
+        `hour` within a file; `day`, `stop`, `new`, `failure` at its end; `recovered` where a torn end was finished
+        afterwards.
+    sequence : int
+        Number of the last record before it, −1 where there is none.
+    sha256 : str
+        Value of the hash chain before it.
+    public_key, signature : str
+        Ed25519, hexadecimal; empty where no key is configured. Signed is this message with an empty signature.
+    """
+
+    schema: int
+    machine: str
+    time_utc_ns: int
+    reason: str
+    sequence: int
+    sha256: str
+    public_key: str
+    signature: str
+
+
 #: Message of each recorded channel and Zenoh key.
 MESSAGES: Mapping[str, type[msgspec.Struct]] = {
     "sample": Sample,
@@ -206,6 +286,8 @@ MESSAGES: Mapping[str, type[msgspec.Struct]] = {
     "offset": Offset,
     "event": Event,
     "status": Status,
+    "chain": Chain,
+    "seal": Seal,
 }
 
 _ENCODER = msgspec.json.Encoder()

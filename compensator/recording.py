@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
 
+from compensator import chain
+from compensator.container import PAYLOAD, Container, Damaged
 from compensator.errors import DataError
-from compensator.messages import MESSAGES, Offset, Sample
+from compensator.messages import MESSAGES, Chain, Offset, Sample, Seal
 
 _EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
-
-#: What the reader raises on a torn or damaged file.
-TORN = (McapError, struct.error, UnicodeDecodeError, ValueError, OverflowError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +23,7 @@ class Recorded:
     Parameters
     ----------
     topic : str
-        `sample`, `estimate`, `offset` or `event`.
+        `sample`, `estimate`, `offset`, `event`, `seal` or `chain`.
     data : bytes
         JSON as it was written.
     sequence : int
@@ -57,20 +53,15 @@ def read_messages(path: Path, topics: tuple[str, ...] | None = None) -> Iterator
     DataError
         If it is not an MCAP file. A torn end ends the iteration without an error.
     """
-    try:
-        with path.open("rb") as file:
-            if file.read(5) != b"\x89MCAP":
-                raise DataError(f"{path}: not an MCAP file")
-            file.seek(0)
-            reader = NonSeekingReader(file)
-            wanted = [f"/{topic}" for topic in topics] if topics else None
-            try:
-                for _, channel, message in reader.iter_messages(topics=wanted, log_time_order=False):
-                    yield Recorded(channel.topic.lstrip("/"), message.data, message.sequence, message.log_time)
-            except TORN:
-                return
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror or error}; expected a recording") from error
+    with Container(path) as container:
+        channels = container.contents.channels
+        try:
+            for number, sequence, log_time_ns, body in container.messages():
+                topic = channels[number].topic.lstrip("/")
+                if topics is None or topic in topics:
+                    yield Recorded(topic, body[PAYLOAD:], sequence, log_time_ns)
+        except Damaged:
+            return
 
 
 def decode(record: Recorded, path: Path) -> msgspec.Struct:
@@ -94,6 +85,65 @@ def recordings(folder: Path, machine: str) -> list[Path]:
     """Return a machine's recordings in the order in which they were started."""
     # By stem: the second file of a second, "…Z-001.mcap", would sort before the first, "…Z.mcap".
     return sorted(folder.glob(f"{machine}_????????T??????Z*.mcap"), key=lambda path: path.stem)
+
+
+@dataclass(frozen=True, slots=True)
+class ChainEnd:
+    """Where the hash chain of a file ends.
+
+    Parameters
+    ----------
+    value : bytes
+        Value at its last whole record; the chain of the next file begins with it. A seal that was set afterwards,
+        when a torn end was finished, does not count: the next file was begun without it.
+    unlisted : int
+        Number of whole records behind the last `/chain` message.
+    sealed : str
+        Reason of the seal that it ends with, empty where it ends without one.
+    whole : bool
+        Whether the file has its end.
+    chunked : bool
+        Whether it is compact.
+    """
+
+    value: bytes
+    unlisted: int
+    sealed: str
+    whole: bool
+    chunked: bool
+
+
+def end_of_chain(path: Path) -> ChainEnd | None:
+    """Follow the hash chain of a file to its end; None where it has none.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file.
+    """
+    value, before_seal, unlisted, sealed = b"", b"", 0, ""
+    with Container(path) as container:
+        channels = container.contents.channels
+        try:
+            for number, _, _, body in container.messages():
+                topic = channels[number].topic.lstrip("/")
+                if topic == "chain":
+                    if not value:
+                        first = msgspec.json.decode(body[PAYLOAD:], type=Chain)
+                        value = chain.opening(bytes.fromhex(first.before), chain.parts_of(container.contents))
+                    unlisted = 0
+                    continue
+                if not value:
+                    return None
+                before_seal, value = value, chain.link(value, topic, body)
+                unlisted += 1
+                sealed = msgspec.json.decode(body[PAYLOAD:], type=Seal).reason if topic == "seal" else ""
+        except (Damaged, msgspec.MsgspecError, ValueError):
+            pass
+    if not value:
+        return None
+    contents = container.contents
+    return ChainEnd(before_seal if sealed == "recovered" else value, unlisted, sealed, contents.ended, contents.chunked)
 
 
 def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:

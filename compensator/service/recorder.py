@@ -1,30 +1,38 @@
 """Writes every sample to MCAP so that a kill loses nothing.
 
-One file a day and at each start. The live file is not chunked, and every sample is flushed and synced before
-its offset is published. The configuration and the model travel in each file as attachments; the hash of the
-file before stands in its metadata.
+One file a day and at each start. The live file is not chunked, and every sample is brought to disk with one sync
+before its offset is published. The configuration, the model and the state of the compensation travel in each file as
+attachments. A hash chain runs over everything (`compensator.chain`) and from file to file; where a key is configured
+it is signed every hour and at the end. A finished file is rewritten compact by `compensator.service.finishing`.
 """
 
 from __future__ import annotations
 
-import hashlib
+import fcntl
 import os
 import platform
 from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
 import mcap
-import msgspec
 from mcap.writer import CompressionType, Writer
 
-from compensator import __version__
+from compensator import __version__, chain
 from compensator.clock import NS
-from compensator.messages import MESSAGES, shipped_schema
-from compensator.recording import recordings
+from compensator.container import Attachment, Channel, Contents
+from compensator.messages import MESSAGES, encode, shipped_schema
+from compensator.recording import end_of_chain, recordings
+from compensator.service.finishing import Finisher, Retention
+from compensator.signature import Signer
 
-_TOPICS = ("sample", "estimate", "offset", "event")
+#: Topics of a recording; `chain` and `seal` come from the recorder itself.
+TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
+#: How often the chain is signed within a file.
+SEAL_EVERY_NS = 3600 * NS
 
 
 class Recorder:
@@ -38,17 +46,25 @@ class Recorder:
         Name of the machine.
     attachments : dict of str to bytes
         Files that travel in each recording, by name; what stands here when a file is opened goes into it.
+    retention : Retention, optional
+        How much is kept; everything where nothing is said.
+    signer : Signer, optional
+        Signs the chain.
     """
 
-    def __init__(self, folder: Path, machine: str, attachments: dict[str, bytes]) -> None:
+    def __init__(
+        self, folder: Path, machine: str, attachments: dict[str, bytes], *, retention: Retention | None = None,
+        signer: Signer | None = None,
+    ) -> None:  # fmt: skip
         self._folder = folder
         self._machine = machine
         self.attachments = attachments
-        self._file: BinaryIO | None = None
-        self._writer: Writer | None = None
-        self._channels: dict[str, int] = {}
+        self._signer = signer
+        self._finisher = Finisher(folder, machine, retention or Retention(), signer)
+        self._live: _Live | None = None
         self._day = ""
-        self._sequence = 0
+        #: Why the next file begins, and the last value of the file before it where that is known.
+        self._reason, self._last = "start", b""
         self.path: Path | None = None
 
     def write(self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"") -> None:
@@ -70,27 +86,24 @@ class Recorder:
         """
         day = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%d")
         try:
-            if self._writer is None or day != self._day:
-                self.close()
+            if self._live is None or day != self._day:
+                self._finish("day")
                 self._open(time_utc_ns, day, state)
-            assert self._writer is not None and self._file is not None
-            for topic, data in records:
-                self._writer.add_message(self._channels[topic], time_utc_ns, data, time_utc_ns, sequence=self._sequence)
-                self._sequence += 1
-            self._flush()
+            assert self._live is not None
+            self._live.add(records, time_utc_ns)
+            if self._signer is not None and time_utc_ns - self._live.sealed_ns >= SEAL_EVERY_NS:
+                self._live.seal("hour", time_utc_ns, self._signer)
+            self._live.sync()
         except OSError:
             self._give_up()
             raise
 
     def close(self) -> None:
-        """Finish the file; does nothing when there is none."""
-        if self._writer is None or self._file is None:
-            return
+        """Finish the file and wait until it is compact; does nothing when there is none."""
         try:
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._flush()
+            self._finish("stop")
         finally:
-            self._give_up()
+            self._finisher.wait()
 
     def start_new(self) -> None:
         """Finish the file, so that the next write opens a new one with the attachments as they are then.
@@ -100,75 +113,189 @@ class Recorder:
         OSError
             If the disk does not take the end of the file; the file is given up, and the next write opens a new one.
         """
-        self.close()
+        self._finish("new")
+
+    def remarks(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return what happened to finished files since the last call: text and data, to be said as events."""
+        return self._finisher.remarks()
+
+    # ------------------------------------------------------------------ beginning and end of a file
+
+    def _finish(self, reason: str) -> None:
+        live = self._live
+        if live is None:
+            return
+        try:
+            live.seal(reason, live.time_ns, self._signer)
+            live.finish()
+        except OSError:
+            self._give_up()
+            raise
+        self._live, self._reason, self._last = None, reason, live.head
+        self._finisher.put(live.path, live.time_ns)
+
+    def _give_up(self) -> None:
+        """Leave the file as it was after the last sync; what it took since then was not whole."""
+        live, self._live = self._live, None
+        self._reason = "failure"
+        # Read from the file when the next one opens: only it knows what it took.
+        self._last = b""
+        if live is not None:
+            live.give_up()
 
     def _open(self, time_utc_ns: int, day: str, state: bytes) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         previous = recordings(self._folder, self._machine)
+        before = self._last
+        if previous and not before:
+            end = end_of_chain(previous[-1])
+            before = end.value if end else b""
         metadata = {
             "machine": self._machine,
             "compensator": __version__,
             "mcap": mcap.__version__,
             "python": platform.python_version(),
             "started_utc_ns": str(time_utc_ns),
+            "began": self._reason,
             "previous_file": previous[-1].name if previous else "",
-            "previous_sha256": _sha256(previous[-1]) if previous else "",
+            "previous_chain": before.hex(),
         }
-        self._file = self._create(time_utc_ns)
-        # Without chunks a message is in the file as soon as it is flushed; the data CRC covers a finished one.
-        self._writer = Writer(self._file, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)
-        self._writer.start(profile="", library=f"compensator {__version__}")
-        for topic in _TOPICS:
-            schema = self._writer.register_schema(MESSAGES[topic].__name__, "jsonschema", shipped_schema(topic))
-            self._channels[topic] = self._writer.register_channel(
-                f"/{topic}", "json", schema, {"machine": self._machine}
-            )
-        self._writer.add_metadata("run", metadata)
-        for name, data in self.attachments.items():
-            self._writer.add_attachment(time_utc_ns, time_utc_ns, name, "application/toml", data)
+        attachments = [_attached(name, "application/toml", data, time_utc_ns)
+                       for name, data in self.attachments.items()]  # fmt: skip
         if state:
-            self._writer.add_attachment(time_utc_ns, time_utc_ns, "state.json", "application/json", state)
-        self._flush()
+            attachments.append(_attached("state.json", "application/json", state, time_utc_ns))
+        self.path, descriptor = self._create(time_utc_ns)
+        live = self._live = _Live(self.path, descriptor, self._machine, before or chain.NOTHING, time_utc_ns)
+        live.begin(metadata, attachments)
+        live.sync()
         self._day = day
         directory = os.open(self._folder, os.O_RDONLY)
         try:
             os.fsync(directory)  # the file's name, too, must outlive a power cut
         finally:
             os.close(directory)
+        if self._reason in ("start", "failure"):
+            # A kill leaves files that are not finished: at a start any of them, after a failure the last.
+            for path in previous if self._reason == "start" else previous[-1:]:
+                self._finisher.put(path, time_utc_ns)
 
-    def _create(self, time_utc_ns: int) -> BinaryIO:
+    def _create(self, time_utc_ns: int) -> tuple[Path, int]:
         """Create a file that did not exist, named by machine and UTC time."""
         stamp = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
         for number in range(1000):
             suffix = f"-{number:03d}" if number else ""
-            self.path = self._folder / f"{self._machine}_{stamp}{suffix}.mcap"
+            path = self._folder / f"{self._machine}_{stamp}{suffix}.mcap"
             try:
-                return self.path.open("xb")
+                descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
             except FileExistsError:
                 continue
+            # Held until the file is finished, so that nobody takes it for one that was left behind.
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return path, descriptor
         raise OSError(f"{self._folder}: a thousand recordings of {stamp}")
 
-    def _flush(self) -> None:
-        assert self._writer is not None and self._file is not None
+
+@dataclass(slots=True)
+class _Sink:
+    """What the writer wrote since the last sync; the file gets it in one piece."""
+
+    data: bytearray
+    size: int = 0
+
+    def write(self, data: bytes) -> None:
+        self.data += data
+        self.size += len(data)
+
+    def tell(self) -> int:
+        return self.size
+
+    def flush(self) -> None:
+        return
+
+
+class _Live:
+    """The file that is being written, with its chain."""
+
+    def __init__(self, path: Path, descriptor: int, machine: str, before: bytes, time_ns: int) -> None:
+        self.path = path
+        self.time_ns = self.sealed_ns = time_ns
+        self._machine = machine
+        self._descriptor = descriptor
+        self._sink = _Sink(bytearray())
+        # Without chunks a message is in the file as soon as it is written; the data CRC covers a finished one.
+        self._writer = Writer(self._sink, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)  # type: ignore[arg-type]
+        self._channels: dict[str, int] = {}
+        self._sequence = 0
+        self._synced = 0
+        self._chain = chain.ChainWriter(machine, before)
+
+    @property
+    def head(self) -> bytes:
+        """Value of the chain at the last record."""
+        return self._chain.head
+
+    def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
+        """Write what the file opens with."""
+        contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
+        self._writer.start(profile="", library=f"compensator {__version__}")
+        for topic in TOPICS:
+            name, data, about = MESSAGES[topic].__name__, shipped_schema(topic), {"machine": self._machine}
+            schema = self._writer.register_schema(name, "jsonschema", data)
+            number = self._writer.register_channel(f"/{topic}", "json", schema, about)
+            self._channels[topic] = number
+            contents.channels[number] = Channel(f"/{topic}", "json", about, name, "jsonschema", data)
+        self._writer.add_metadata("run", metadata)
+        for part in attachments:
+            self._writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
+        self._write("chain", self._chain.begin(chain.parts_of(contents), self.time_ns))
+
+    def add(self, records: Iterable[tuple[str, bytes]], time_ns: int) -> None:
+        """Write a group of records and the values of the chain."""
+        self.time_ns = time_ns
+        for topic, data in records:
+            self._chain.add(topic, chain.body_of(self._sequence, time_ns, data))
+            self._write(topic, data)
+        self._write("chain", self._chain.message(time_ns))
+
+    def seal(self, reason: str, time_ns: int, signer: Signer | None) -> None:
+        """Write a seal, signed where there is a key."""
+        message = chain.seal(self._machine, time_ns, reason, self._sequence - 1, self.head)
+        if signer is not None:
+            message = signer.sign(message)
+        self.sealed_ns = time_ns
+        self.add([("seal", encode(message))], time_ns)
+
+    def sync(self) -> None:
+        """Bring everything to disk."""
         self._writer.flush()  # type: ignore[no-untyped-call]
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        view = memoryview(bytes(self._sink.data))
+        while view:
+            view = view[os.write(self._descriptor, view) :]
+        self._sink.data.clear()
+        os.fsync(self._descriptor)
+        self._synced = self._sink.size
 
-    def _give_up(self) -> None:
-        file, self._file, self._writer = self._file, None, None
-        if file is not None:
-            try:
-                file.close()
-            except OSError:
-                # Nothing more can be done for this file; what was synced is on disk.
-                return
+    def finish(self) -> None:
+        """Write the end and close the file."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self.sync()
+        os.close(self._descriptor)
+
+    def give_up(self) -> None:
+        """Cut off what is not whole and close the file."""
+        # Nothing more can be done where this fails, too; what was synced is on disk.
+        with suppress(OSError):
+            os.ftruncate(self._descriptor, self._synced)
+        with suppress(OSError):
+            os.close(self._descriptor)
+        if not self._synced:
+            with suppress(OSError):
+                self.path.unlink()
+
+    def _write(self, topic: str, data: bytes) -> None:
+        self._writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns, sequence=self._sequence)
+        self._sequence += 1
 
 
-def records_of(messages: Iterable[tuple[str, msgspec.Struct]]) -> list[tuple[str, bytes]]:
-    """Encode messages as they are recorded and published."""
-    return [(topic, msgspec.json.encode(message)) for topic, message in messages]
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _attached(name: str, media_type: str, data: bytes, time_ns: int) -> Attachment:
+    return Attachment(name, media_type, time_ns, time_ns, data)

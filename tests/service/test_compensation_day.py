@@ -12,7 +12,7 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import MESSAGES, Offset, number, schemas, shipped_schema
-from compensator.recording import decode, first_sequence, last_sequence, read_messages, recordings
+from compensator.recording import decode, end_of_chain, first_sequence, last_sequence, read_messages, recordings
 from drivers.errors import DeviceTimeout
 from drivers.reading import Quality, Reading
 from tests.service.simulated import START_NS, Bench, config
@@ -268,10 +268,12 @@ async def test_sample_is_on_disk_before_its_offset_is_published(bench: Bench, mo
 
 
 async def test_torn_recording_gives_every_whole_message(bench: Bench) -> None:
+    live: list[bytes] = []
+    bench.at_sample[20] = lambda: live.append(bench.recorder.path.read_bytes())  # type: ignore[union-attr]
     await bench.run(20)
     path = bench.recorder.path
     assert path is not None
-    data = path.read_bytes()
+    data = live[0]
     cut = data.rindex(b'"seq":19')
     path.write_bytes(data[:cut])
     samples = list(read_messages(path, ("sample",)))
@@ -288,10 +290,10 @@ async def test_new_file_at_midnight_names_the_one_before(tmp_path: Any) -> None:
 
     with paths[1].open("rb") as file:
         run = next(m for m in make_reader(file).iter_metadata() if m.name == "run").metadata
-    import hashlib
-
     assert run["previous_file"] == paths[0].name
-    assert run["previous_sha256"] == hashlib.sha256(paths[0].read_bytes()).hexdigest()
+    end = end_of_chain(paths[0])
+    assert end is not None and run["previous_chain"] == end.value.hex()
+    assert (end.sealed, end.whole, end.chunked, end.unlisted) == ("day", True, True, 0)
 
 
 async def test_full_disk_goes_on_and_says_so(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,451 @@
+"""Reads an MCAP file from front to back: live or finished, chunked or not, whole, torn or damaged.
+
+The `mcap` library writes our files, and checks them when they are finished. An audit of a year reads millions of
+records, trusts none of them and must tell a torn end from damage, so it reads the framing itself: one record after
+the other, no index, lengths bounded before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, TypeVar
+
+import lz4.frame
+import zstandard
+
+from compensator.errors import DataError
+
+MAGIC = b"\x89MCAP0\r\n"
+#: Longest record and chunk that is believed, bytes; ours are below 2 MiB.
+LONGEST = 64 * 2**20
+_WINDOW = 2**20
+
+_T = TypeVar("_T")
+
+_FRAME = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<BQHIQQ")
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_CODE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
+_ATTACHMENT, _ATTACHMENT_INDEX, _STATISTICS, _METADATA, _METADATA_INDEX, _SUMMARY_OFFSET, _DATA_END = range(9, 16)
+_SHORTEST = {_FOOTER: 20, _MESSAGE_CODE: 22, _CHUNK: 40, _DATA_END: 4, _STATISTICS: 46}
+
+
+class Damaged(DataError):
+    """A file that is no MCAP file from here on."""
+
+    def __init__(self, path: Path, offset: int, text: str) -> None:
+        super().__init__(f"{path}: byte {offset}: {text}")
+        self.offset, self.text = offset, text
+
+
+class Torn(Damaged):
+    """A file that ends inside a record.
+
+    Parameters
+    ----------
+    rest : bytes
+        The beginning of the record that is not whole, at most 1 MiB of it.
+    """
+
+    def __init__(self, path: Path, offset: int, rest: bytes = b"") -> None:
+        super().__init__(path, offset, "the file ends inside a record")
+        self.rest = rest
+
+
+class Message(NamedTuple):
+    """One message as it stands in the file.
+
+    Parameters
+    ----------
+    channel : int
+        Number of its channel.
+    sequence : int
+        Number of the record.
+    log_time_ns : int
+        When it was written.
+    body : bytes
+        Sequence, log time, publish time (4 + 8 + 8 bytes, little-endian) and payload.
+    """
+
+    channel: int
+    sequence: int
+    log_time_ns: int
+    body: bytes
+
+
+#: Where the payload begins in the body of a message.
+PAYLOAD = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A file that travels in the recording."""
+
+    name: str
+    media_type: str
+    log_time_ns: int
+    create_time_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel with its schema."""
+
+    topic: str
+    encoding: str
+    metadata: dict[str, str]
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+
+
+@dataclass(slots=True)
+class Contents:
+    """What was met so far beside messages.
+
+    Parameters
+    ----------
+    library : str
+        Who wrote the file.
+    metadata : dict of str to dict
+        By name.
+    attachments : dict of str to Attachment
+        By name.
+    channels : dict of int to Channel
+        By number.
+    late : list of str
+        Names of attachments and metadata that stand behind the first message or twice.
+    chunked, ended : bool
+        Whether chunks were met, and whether the file has its end.
+    messages : int
+        Number of messages.
+    """
+
+    library: str = ""
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, Attachment] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    late: list[str] = field(default_factory=list)
+    chunked: bool = False
+    ended: bool = False
+    messages: int = 0
+
+
+class Container:
+    """One MCAP file, read once.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+
+    Raises
+    ------
+    DataError
+        If it cannot be opened or is not an MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.contents = Contents()
+        self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        try:
+            self._file: BinaryIO = path.open("rb")
+            self._size = self._file.seek(0, 2)
+            self._file.seek(0)
+        except OSError as error:
+            raise DataError(f"{path}: {error.strerror or error}; expected a recording") from error
+        self._buffer = b""
+        #: Place of the buffer in the file, and place in the buffer.
+        self._base = self._at = 0
+        self._crc = 0
+
+    def __enter__(self) -> Container:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    # ------------------------------------------------------------------ messages
+
+    def messages(self) -> Iterator[Message]:
+        """Yield every message in the order of the file; what else is met goes into `contents`.
+
+        Raises
+        ------
+        DataError
+            If it is not an MCAP file.
+        Torn
+            Where the file ends inside a record; every whole message was yielded before.
+        Damaged
+            Where a record cannot be one.
+        """
+        self._need(len(MAGIC))
+        start = self._buffer[: len(MAGIC)]
+        if start != MAGIC:
+            if MAGIC.startswith(start):
+                raise Torn(self.path, 0)
+            raise DataError(f"{self.path}: not an MCAP file")
+        self._at = len(MAGIC)
+        unpack = _MESSAGE.unpack_from
+        contents, channels = self.contents, self.contents.channels
+        while True:
+            if self._at + 31 > len(self._buffer):
+                self._need(31)
+            buffer, at = self._buffer, self._at
+            if len(buffer) - at >= 31 and buffer[at] == _MESSAGE_CODE:
+                _, length, channel, sequence, log_time, _ = unpack(buffer, at)
+                end = at + 9 + length
+                if end > len(buffer) or length < 22:
+                    self._frame()
+                    buffer, at = self._buffer, self._at
+                    end = at + 9 + length
+                if channel not in channels:
+                    raise Damaged(self.path, self._base + at, f"a message of channel {channel}, which is not there")
+                contents.messages += 1
+                self._at = end
+                yield Message(channel, sequence, log_time, buffer[at + 11 : end])
+                continue
+            code, length = self._frame()
+            body = self._buffer[self._at + 9 : self._at + 9 + length]
+            if code == _CHUNK:
+                yield from self._chunk(body)
+            elif code == _DATA_END:
+                self._end(body)
+                return
+            else:
+                self._other(code, body, self._base + self._at)
+            self._at += 9 + length
+
+    def _chunk(self, body: bytes) -> Iterator[Message]:
+        """Yield the messages of a chunk."""
+        offset = self._base + self._at
+        self.contents.chunked = True
+        data = self._uncompressed(body, offset)
+        at, size = 0, len(data)
+        unpack, channels, contents = _MESSAGE.unpack_from, self.contents.channels, self.contents
+        while at < size:
+            if size - at < 9:
+                raise Damaged(self.path, offset, "the chunk ends inside a record")
+            code, length = _FRAME.unpack_from(data, at)
+            end = at + 9 + length
+            if end > size or length < _SHORTEST.get(code, 0):
+                raise Damaged(self.path, offset, f"a record of {length} bytes in the chunk, {size - at - 9} are there")
+            if code == _MESSAGE_CODE:
+                _, _, channel, sequence, log_time, _ = unpack(data, at)
+                if channel not in channels:
+                    raise Damaged(self.path, offset, f"a message of channel {channel}, which is not there")
+                contents.messages += 1
+                yield Message(channel, sequence, log_time, data[at + 11 : end])
+            elif code in (_SCHEMA, _CHANNEL):
+                self._other(code, data[at + 9 : end], offset)
+            else:
+                raise Damaged(self.path, offset, f"a record of kind {code} in the chunk")
+            at = end
+
+    def _uncompressed(self, body: bytes, offset: int) -> bytes:
+        size, crc = struct.unpack_from("<QI", body, 16)
+        fields = _Fields(self.path, offset, body, 28)
+        compression = fields.text()
+        data = fields.bytes8()
+        fields.done()
+        if size > LONGEST:
+            raise Damaged(self.path, offset, f"a chunk of {size} bytes, expected at most {LONGEST}")
+        try:
+            if compression == "zstd":
+                # The size in the frame is allocated before anything is read, so it is looked at first.
+                stated = zstandard.frame_content_size(data)
+                if stated not in (-1, size):
+                    raise Damaged(self.path, offset, f"a chunk of {size} bytes whose data says {stated}")
+                data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size or 1)
+            elif compression == "lz4":
+                data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+            elif compression:
+                raise Damaged(self.path, offset, f"a chunk compressed by {compression!r}, expected zstd, lz4 or none")
+        except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
+            raise Damaged(self.path, offset, f"a chunk that cannot be uncompressed: {error}") from error
+        if len(data) != size or (crc and zlib.crc32(data) != crc):
+            raise Damaged(self.path, offset, "a chunk whose CRC is wrong")
+        return data
+
+    # ------------------------------------------------------------------ other records
+
+    def _other(self, code: int, body: bytes, offset: int) -> None:
+        fields = _Fields(self.path, offset, body)
+        contents = self.contents
+        if code == _HEADER:
+            fields.text()
+            contents.library = fields.text()
+        elif code == _SCHEMA:
+            number = fields.number("<H")
+            self._schemas[number] = (fields.text(), fields.text(), fields.bytes4())
+            fields.done()
+        elif code == _CHANNEL:
+            number, schema = fields.number("<H"), fields.number("<H")
+            topic, encoding, metadata = fields.text(), fields.text(), fields.table()
+            fields.done()
+            name, schema_encoding, data = self._schemas.get(schema, ("", "", b""))
+            channel = Channel(topic, encoding, metadata, name, schema_encoding, data)
+            if contents.channels.setdefault(number, channel) != channel:
+                raise Damaged(self.path, offset, f"a second channel {number}, {topic}")
+        elif code == _METADATA:
+            name = fields.text()
+            table = fields.table()
+            fields.done()
+            self._keep(contents.metadata, name, table, "metadata")
+        elif code == _ATTACHMENT:
+            log_time, create_time = fields.number("<Q"), fields.number("<Q")
+            name, media_type, data = fields.text(), fields.text(), fields.bytes8()
+            crc = fields.number("<I")
+            fields.done()
+            if crc and zlib.crc32(body[:-4]) != crc:
+                contents.late.append(f"attachment {name}: its CRC is wrong")
+            self._keep(
+                contents.attachments, name, Attachment(name, media_type, log_time, create_time, data), "attachment"
+            )
+        elif code != _MESSAGE_INDEX:
+            raise Damaged(self.path, offset, f"a record of kind {code}")
+
+    def _keep(self, kept: dict[str, _T], name: str, value: _T, kind: str) -> None:
+        if self.contents.messages or name in kept:
+            self.contents.late.append(f"{kind} {name}: stands " + ("twice" if name in kept else "behind messages"))
+        else:
+            kept[name] = value
+
+    def _end(self, body: bytes) -> None:
+        """Walk over the summary to the end of the file."""
+        offset = self._base + self._at
+        crc = zlib.crc32(self._buffer[: self._at], self._crc)
+        stated = int.from_bytes(body[:4], "little")
+        if stated and stated != crc:
+            raise Damaged(self.path, offset, "the CRC of the data is wrong")
+        self._at += 9 + len(body)
+        summary = zlib.crc32(b"")
+        while True:
+            code, length = self._frame()
+            start = self._at
+            self._at += 9 + length
+            record = self._buffer[start : self._at]
+            if code == _FOOTER:
+                break
+            if code not in (_SCHEMA, _CHANNEL, _CHUNK_INDEX, _ATTACHMENT_INDEX, _STATISTICS, _METADATA_INDEX,
+                            _SUMMARY_OFFSET):  # fmt: skip
+                raise Damaged(self.path, self._base + start, f"a record of kind {code} in the summary")
+            if code == _STATISTICS and int.from_bytes(record[9:17], "little") != self.contents.messages:
+                raise Damaged(
+                    self.path, self._base + start,
+                    f"the summary counts {int.from_bytes(record[9:17], 'little')} messages, "
+                    f"{self.contents.messages} are there",
+                )  # fmt: skip
+            summary = zlib.crc32(record, summary)
+        stated = int.from_bytes(record[25:29], "little")
+        if stated and stated != zlib.crc32(record[:25], summary):
+            raise Damaged(self.path, self._base + self._at, "the CRC of the summary is wrong")
+        self._need(len(MAGIC) + 1)
+        rest = self._buffer[self._at : self._at + len(MAGIC) + 1]
+        if rest != MAGIC:
+            if MAGIC.startswith(rest):
+                raise Torn(self.path, self._base + self._at)
+            more = self._size - self._base - self._at - len(MAGIC)
+            raise Damaged(self.path, self._base + self._at, f"{more} bytes behind the end of the file")
+        self.contents.ended = True
+
+    # ------------------------------------------------------------------ bytes
+
+    def _need(self, count: int) -> None:
+        """Have that many bytes from here on in the buffer, or as many as there are."""
+        have = len(self._buffer) - self._at
+        if have >= count:
+            return
+        self._crc = zlib.crc32(self._buffer[: self._at], self._crc)
+        self._base += self._at
+        self._buffer = self._buffer[self._at :] + self._file.read(max(count - have, _WINDOW))
+        self._at = 0
+
+    def _frame(self) -> tuple[int, int]:
+        """Return kind and length of the record here, with the whole record in the buffer."""
+        self._need(9)
+        offset = self._base + self._at
+        left = self._size - offset
+        if left < 9 or len(self._buffer) - self._at < 9:
+            code = self._buffer[self._at] if len(self._buffer) > self._at else _MESSAGE_CODE
+            if not (code == 0 or _HEADER <= code <= _DATA_END):
+                raise Damaged(self.path, offset, f"a record of kind {code}")
+            raise Torn(self.path, offset)
+        code, length = _FRAME.unpack_from(self._buffer, self._at)
+        if code == 0 and self._only_zeros():
+            raise Torn(self.path, offset)
+        if not _HEADER <= code <= _DATA_END:
+            raise Damaged(self.path, offset, f"a record of kind {code}")
+        if not _SHORTEST.get(code, 0) <= length <= LONGEST:
+            raise Damaged(self.path, offset, f"a record of {length} bytes, expected at most {LONGEST}")
+        self._need(9 + length)
+        if len(self._buffer) - self._at < 9 + length:
+            raise Torn(self.path, offset, self._buffer[self._at : self._at + _WINDOW])
+        return code, length
+
+    def _only_zeros(self) -> bool:
+        """Tell whether nothing but zeros follows: what a power cut leaves of a file that had grown."""
+        while True:
+            if self._buffer[self._at :].strip(b"\0"):
+                return False
+            self._at = len(self._buffer)
+            self._need(1)
+            if len(self._buffer) == self._at:
+                return True
+
+
+class _Fields:
+    """Fields of one record; a length that leads beyond it is damage."""
+
+    def __init__(self, path: Path, offset: int, body: bytes, at: int = 0) -> None:
+        self._path, self._offset, self._body, self._at = path, offset, body, at
+
+    def _take(self, count: int) -> bytes:
+        end = self._at + count
+        if end > len(self._body):
+            raise Damaged(self._path, self._offset, f"a field of {count} bytes in a record of {len(self._body)}")
+        data = self._body[self._at : end]
+        self._at = end
+        return data
+
+    def number(self, form: str) -> int:
+        """Take a number."""
+        (value,) = struct.unpack(form, self._take(struct.calcsize(form)))
+        return int(value)
+
+    def bytes4(self) -> bytes:
+        """Take bytes with a short length."""
+        return self._take(self.number("<I"))
+
+    def bytes8(self) -> bytes:
+        """Take bytes with a long length."""
+        return self._take(self.number("<Q"))
+
+    def text(self) -> str:
+        """Take a text."""
+        data = self.bytes4()
+        try:
+            return data.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise Damaged(self._path, self._offset, f"a text that is not UTF-8: {data[:20]!r}") from error
+
+    def table(self) -> dict[str, str]:
+        """Take a table of texts."""
+        inner = _Fields(self._path, self._offset, self.bytes4())
+        found: dict[str, str] = {}
+        while inner._at < len(inner._body):
+            key = inner.text()
+            if key in found:
+                raise Damaged(self._path, self._offset, f"key {key!r} stands twice")
+            found[key] = inner.text()
+        return found
+
+    def done(self) -> None:
+        """See that nothing is left."""
+        if self._at != len(self._body):
+            raise Damaged(self._path, self._offset, f"{len(self._body) - self._at} bytes more than the record has")
