@@ -20,8 +20,11 @@ from typing import Any
 import numpy as np
 
 from compensator import __version__
+from compensator.commands.arguments import adopt as add_adopt
+from compensator.commands.arguments import back as add_back
 from compensator.commands.arguments import diagnose as add_diagnose
 from compensator.commands.arguments import identify as add_identify
+from compensator.commands.arguments import replay as add_replay
 from compensator.errors import CompensatorError, UsageError
 from drivers.errors import DriverError
 
@@ -90,6 +93,12 @@ def _parser() -> argparse.ArgumentParser:
     add_identify(_command(commands, "identify", _identify, "a model from measured runs", example))
     example = "compensator diagnose day.mcap --model model.toml --out diagnosis"
     add_diagnose(_command(commands, "diagnose", _diagnose, "what a model lacks, from measured data", example))
+    example = "compensator replay recordings/*.mcap"
+    add_replay(_command(commands, "replay", _replay, "audit recordings: nothing changed, all comes out again", example))
+    example = "compensator adopt diagnosis/model.toml --config machine.toml"
+    add_adopt(_command(commands, "adopt", _adopt, "the running service takes a model over without a jump", example))
+    example = "compensator back --config machine.toml"
+    add_back(_command(commands, "back", _back, "the service returns to the model before", example))
     export = _command(
         commands, "export", _export, "a recording as a table", "compensator export day.mcap --out day.csv"
     )
@@ -234,6 +243,30 @@ def _diagnose(arguments: argparse.Namespace) -> int:
     from compensator.commands.diagnose import run
 
     result, text = run(arguments)
+    _print(arguments, result, text)
+    return 0
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from compensator.commands.replay import run
+
+    result, text, code = run(arguments)
+    _print(arguments, result, text)
+    return code
+
+
+def _adopt(arguments: argparse.Namespace) -> int:
+    from compensator.commands.adopt import adopt
+
+    result, text = adopt(arguments)
+    _print(arguments, result, text)
+    return 0
+
+
+def _back(arguments: argparse.Namespace) -> int:
+    from compensator.commands.adopt import back
+
+    result, text = back(arguments)
     _print(arguments, result, text)
     return 0
 

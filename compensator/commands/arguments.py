@@ -41,3 +41,27 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="DIR", help="diagnosis.json, model.toml and report.html come there")
     add("--column", action="append", default=[], metavar="ROLE=NAME", help="role of a column of another name")
+
+
+def replay(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `replay`."""
+    add = parser.add_argument
+    add("recording", type=Path, nargs="+", metavar="FILE.mcap", help="recordings, or a folder of them")
+    add("--public-key", type=Path, metavar="FILE", help="Ed25519 key, PEM, that they must be signed with")
+    add("--model", metavar="OTHER", help="no audit: what this model would have done; a model file, or quill")
+    add("--out", type=Path, metavar="CSV", help="with --model: both offsets, sample by sample")
+
+
+def adopt(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `adopt`."""
+    parser.add_argument("model", metavar="MODEL", help="a model file, or quill")
+    back(parser)
+
+
+def back(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `back`, which `adopt` has too."""
+    add = parser.add_argument
+    add("--config", required=True, metavar="FILE", help="configuration of the service")
+    words = "take it even where the recordings do not determine its state; the standard deviation says what that costs"
+    add("--force", action="store_true", help=words)
+    add("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the service's reply, s (60)")

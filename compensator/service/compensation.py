@@ -167,6 +167,41 @@ class Compensation:
         return self._limiter.offset_um
 
     @property
+    def target_um(self) -> float:
+        """Where the offset is to go, µm; NaN while there is no estimate."""
+        estimate = self._memory.estimate
+        return self._zero.y_base - estimate.y_um if estimate is not None else NAN
+
+    @property
+    def std_um(self) -> float:
+        """Standard deviation of the prediction, µm; NaN while there is none."""
+        return self._memory.estimate.y_std_um if self._memory.estimate is not None else NAN
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether the offset is still under way to that of another model."""
+        return self._memory.model_changed
+
+    @property
+    def operator_hold(self) -> bool:
+        """Whether an operator has frozen the offset."""
+        return self._memory.operator_hold
+
+    @property
+    def zero_that_stands(self) -> dict[str, float]:
+        """The zero, as `begin` takes it."""
+        reference = self._engine.reference
+        return {
+            "t_q_ref_degc": reference.t_q_degc, "at_ref_degc": reference.at_degc,
+            "y_ref_um": self._zero.y_ref, "y_base_um": self._zero.y_base,
+        }  # fmt: skip
+
+    @property
+    def is_cold(self) -> bool:
+        """Whether the state began unknown and that is not forgotten yet."""
+        return self._memory.cold_min > 0.0
+
+    @property
     def bridge_max_min(self) -> float:
         """Longest pause that is interpolated, min."""
         wanted = self._config.restart.bridge_max_min
@@ -256,24 +291,31 @@ class Compensation:
         """Wait for the zero of a record, whatever the configuration says of the start."""
         self._zero = ZeroState()
 
-    def go_on_from(self, offset_um: float, *, other: Compensation | None = None) -> None:
-        """Go on from the offset that stands, and from what operators have asked of the compensation before.
+    def go_on_from(self, offset_um: float, *, model_changed: bool = False) -> None:
+        """Go on from the offset that stands; from there it moves at the permitted rate.
 
         Parameters
         ----------
         offset_um : float
             What was published last, µm.
-        other : Compensation, optional
-            The one before, with another model: holds and a zero that waits stand, and the reason `model_changed`
-            stands until the offset has arrived at its new value.
+        model_changed : bool
+            Whether it is another model's; the reason stands until the offset has arrived at its new value.
         """
         self._limiter.offset_um = offset_um
-        if other is None:
-            return
+        self._memory.model_changed = model_changed
+
+    def succeed(self, other: Compensation) -> None:
+        """Take the place of a compensation with another model: its offset, holds and waiting zero stand.
+
+        Parameters
+        ----------
+        other : Compensation
+            The one before.
+        """
         memory = other._memory
         self._memory.operator_hold, self._memory.internal_error = memory.operator_hold, memory.internal_error
         self._zero.wanted, self._zero.mode = other._zero.wanted, other._zero.mode
-        self._memory.model_changed = memory.estimate is not None
+        self.go_on_from(other.offset_um, model_changed=memory.estimate is not None)
 
     # ------------------------------------------------------------------ one sample
 

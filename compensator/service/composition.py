@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
-from typing import Any
 
 import drivers
 from compensator.clock import Clock, SystemClock
 from compensator.config import LoadedConfig, load_config
-from compensator.errors import ConfigError, ModelError
+from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording import first_sequence
-from compensator.service.compensation import Compensation, Outcome
+from compensator.service.adoption import Adoption, check_model
+from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
-from compensator.service.publisher import Publisher
+from compensator.service.model_store import ModelStore
+from compensator.service.publisher import Publisher, Reply
 from compensator.service.recorder import Recorder
+from compensator.service.restart import resume
 from drivers.errors import DriverConfigError, DriverError
 from drivers.reading import Reading
+
+log = logging.getLogger("compensator")
 
 
 def load(path: str) -> tuple[LoadedConfig, ThermalModel, bytes, drivers.Fleet]:
@@ -32,12 +37,13 @@ def load(path: str) -> tuple[LoadedConfig, ThermalModel, bytes, drivers.Fleet]:
     loaded = load_config(path)
     config = loaded.config
     try:
-        data = read_model_bytes(loaded.model_name())
-        model = parse_model(data, source=config.model.file)
+        configured = read_model_bytes(loaded.model_name())
+        model = parse_model(configured, source=config.model.file)
         if config.model.alternative:
             model = model.with_alternative(config.model.alternative)
     except ModelError as error:
         raise ConfigError(f"{path}: model: {error}") from error
+    data, model = _adopted(loaded, configured, model)
     polls = model.period_s / config.sampling.poll_interval_s
     if abs(polls - round(polls)) > 1e-9 or polls < 1:
         raise ConfigError(
@@ -57,6 +63,18 @@ def load(path: str) -> tuple[LoadedConfig, ThermalModel, bytes, drivers.Fleet]:
             )
         _check_unit(path, channel.name, units[channel.input])
     return loaded, model, data, fleet
+
+
+def _adopted(loaded: LoadedConfig, configured: bytes, model: ThermalModel) -> tuple[bytes, ThermalModel]:
+    """Return the model that was adopted in place of the configured one, if any; one that cannot be used is said."""
+    try:
+        data = ModelStore(loaded.store(), configured).in_use()
+        if data == configured:
+            return configured, model
+        return data, check_model(loaded.config, data, source="adopted model")
+    except CompensatorError as error:
+        log.warning("the adopted model cannot be used, the configured one stands in: %s", error)
+        return configured, model
 
 
 def _check_unit(path: str, name: str, unit: str) -> None:
@@ -104,15 +122,18 @@ async def run_service(
     folder = loaded.resolve(config.recording.folder)
     recorder = Recorder(folder, config.machine.name, {"config.toml": loaded.data, "model.toml": model_bytes})
 
-    def command(name: str, payload: bytes) -> dict[str, Any]:
+    def command(name: str, payload: bytes) -> Reply:
         return daemon.command(name, payload)
 
     publisher = Publisher(config.zenoh, command)
     clock = clock or SystemClock()
+    store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
+    resumed = resume(loaded, model)
     daemon = Daemon(
-        config=config, compensation=Compensation(config, model), devices=fleet.devices, recorder=recorder,
+        config=config, compensation=resumed.compensation, devices=fleet.devices, recorder=recorder,
         publish=publisher.publish, clock=clock,
         first_sequence=first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s),
+        adoption=Adoption(config, folder, store), notes=resumed.notes,
     )  # fmt: skip
     try:
         with publisher:

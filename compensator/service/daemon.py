@@ -8,7 +8,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,10 +18,13 @@ import msgspec
 from compensator import __version__
 from compensator.clock import Clock
 from compensator.config import Config
+from compensator.errors import CompensatorError, ServiceError
 from compensator.messages import SCHEMA, Event, Sample, Status, encode
+from compensator.service.adoption import LONGEST_MODEL, Adoption, Prepared, Wanted
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.grid import Grid
-from compensator.service.publisher import COMMANDS
+from compensator.service.publisher import COMMANDS, Reply
+from compensator.service.retrace import obey, samples_between
 from compensator.service.sampling import ChannelCollector
 from drivers.errors import DriverError
 from drivers.reading import Device, Reading
@@ -29,6 +33,8 @@ log = logging.getLogger("compensator")
 
 #: Part of the poll interval that a sample waits for devices at most.
 WAIT_PART = 0.5
+#: Longest payload of a command that brings no model, bytes.
+LONGEST_COMMAND = 10_000
 
 
 @dataclass(slots=True)
@@ -54,6 +60,17 @@ class Latency:
             del self.seconds[: keep // 2]
 
 
+@dataclass(slots=True)
+class _Adopting:
+    """A model that is being taken over, with the samples that came meanwhile."""
+
+    wanted: Wanted
+    reply: Future[dict[str, Any]]
+    since: list[Outcome] = field(default_factory=list)
+    prepared: Prepared | None = None
+    task: asyncio.Task[None] | None = None
+
+
 class Daemon:
     """The service of one machine.
 
@@ -73,11 +90,16 @@ class Daemon:
         Handed in.
     first_sequence : int
         Sequence number of the first sample.
+    adoption : Adoption, optional
+        Prepares other models; without it the commands `adopt` and `back` are refused.
+    notes : sequence of (str, str, dict)
+        Events of what went before: kind, text and data.
     """
 
     def __init__(
         self, *, config: Config, compensation: Compensation, devices: Mapping[str, Device],
         recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, first_sequence: int,
+        adoption: Adoption | None = None, notes: Sequence[tuple[str, str, dict[str, Any]]] = (),
     ) -> None:  # fmt: skip
         self._config = config
         self._compensation = compensation
@@ -95,6 +117,12 @@ class Daemon:
         self._recording_failed = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
+        self._adoption = adoption
+        self._adopting: _Adopting | None = None
+        self._earlier = notes
+        self._first = True
+        #: Whether a sample broke off half-way, so that its file cannot give the state after it.
+        self._broken_off = False
         self.latency = Latency()
 
     # ------------------------------------------------------------------ running
@@ -114,6 +142,8 @@ class Daemon:
         polls = max(1, round(period_s / self._config.sampling.poll_interval_s))
         grid = Grid(self._clock, period_s, polls)
         self._note("start", f"compensator {__version__} with model {self._compensation.model.name}")
+        for kind, text, data in self._earlier:
+            self._note(kind, text, data)
         done = 0
         try:
             while not self._stop and (samples is None or done < samples):
@@ -159,6 +189,7 @@ class Daemon:
         self._stop = True
 
     async def _close(self) -> None:
+        await self._drop_adoption()
         self._note("stop", "the service ends")
         self._record([], self._clock.utc_ns())
         try:
@@ -216,6 +247,12 @@ class Daemon:
 
     def _sample(self, label_ns: int) -> Outcome:
         began = time.perf_counter()
+        self._pass_pause(label_ns)
+        self._swap()
+        if self._broken_off:
+            self._start_new_file()
+        state = self._compensation.state()
+        self._broken_off = True
         self._obey()
         raw = Sample(
             schema=SCHEMA, machine=self._config.machine.name, seq=self._sequence, time_utc_ns=label_ns,
@@ -223,6 +260,7 @@ class Daemon:
             channels={name: collector.close() for name, collector in self._collectors.items()},
         )  # fmt: skip
         outcome = self._compensation.process(raw)
+        self._broken_off = False
         for kind, text in outcome.notes:
             self._note(kind, text)
         outcome = self._with_recording_state(outcome)
@@ -232,7 +270,7 @@ class Daemon:
             ("estimate", encode(outcome.estimate)),
             ("offset", encode(outcome.offset)),
         ]
-        if not self._record(records, label_ns):
+        if not self._record(records, label_ns, state):
             outcome = self._with_recording_state(outcome)
             records[2] = ("offset", encode(outcome.offset))
         self._publish("offset", records[2][1])
@@ -241,13 +279,41 @@ class Daemon:
         self._publish("estimate", records[1][1])
         self._publish("status", encode(self._status(outcome)))
         self._sequence += 1
+        if self._adopting is not None:
+            self._adopting.since.append(outcome)
         return outcome
 
-    def _record(self, records: list[tuple[str, bytes]], time_utc_ns: int) -> bool:
-        """Bring records and waiting events to disk; tell whether it worked."""
+    def _pass_pause(self, label_ns: int) -> None:
+        """Tell the compensation, before its first sample, for how long nobody measured."""
+        first, self._first = self._first, False
+        _, last_ns = self._compensation.last
+        if not first or last_ns == 0:
+            return
+        period_s = self._compensation.model.period_s
+        missing, bridged = samples_between(last_ns, label_ns, period_s), self._compensation.bridge_max_min
+        minutes = missing * period_s / 60.0
+        self._compensation.pause(missing)
+        text = f"{missing} sample(s) are missing between the last recording and now; "
+        if label_ns <= last_ns:
+            text = (
+                "the wall clock stands before the end of the last recording; how long the service was away is unknown"
+            )
+        elif minutes > bridged:
+            text += f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
+        else:
+            text += f"{minutes:.0f} min are bridged"
+        data = {"missing": missing, "minutes": minutes, "bridged": minutes <= bridged}
+        self._note("restart", text, data | {"y_std_um": self._compensation.std_um})
+
+    def _record(self, records: list[tuple[str, bytes]], time_utc_ns: int, state: bytes | None = None) -> bool:
+        """Bring records and waiting events to disk; tell whether it worked.
+
+        `state` is that before the sample among the records; without one it is as it is now.
+        """
         events = [("event", encode(event)) for event in self._events]
+        state = self._compensation.state() if state is None else state
         try:
-            self._recorder.write([*events, *records], time_utc_ns)
+            self._recorder.write([*events, *records], time_utc_ns, state=state)
         except OSError as error:
             if not self._recording_failed:
                 self._recording_failed = True
@@ -305,33 +371,38 @@ class Daemon:
         if seconds:
             self._note("clock", f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
 
-    def command(self, name: str, payload: bytes) -> dict[str, Any]:
+    def command(self, name: str, payload: bytes) -> Reply:
         """Take a command from another thread; it acts at the next sample.
 
         Parameters
         ----------
         name : str
-            `zero`, `hold` or `resume`.
+            `zero`, `hold`, `resume`, `adopt` or `back`.
         payload : bytes
-            Empty or a JSON object; `zero` takes `mode`: `auto`, `rest` or `warm`.
+            Empty or a JSON object. `zero` takes `mode`: `auto`, `rest` or `warm`; `adopt` takes `model`, the text of a
+            model file, or `sha256`, that of one adopted before, or both; `adopt` and `back` take `force`.
 
         Returns
         -------
-        dict
-            `ok` and `text`.
+        dict or Future of dict
+            `ok` and `text`; a promise of them for `adopt` and `back`, whose warm-up takes its time.
         """
+        brings_model = name in ("adopt", "back")
+        if len(payload) > (LONGEST_MODEL if brings_model else LONGEST_COMMAND):
+            return _refusal(f"{name}: the payload has {len(payload)} bytes, more than a command may have")
         try:
             arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
-        except (msgspec.MsgspecError, UnicodeDecodeError):
-            return {"ok": False, "text": f"{name}: the payload is no JSON object"}
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            return _refusal(f"{name}: the payload is no JSON object")
         mode = arguments.get("mode", "auto")
         if name not in COMMANDS or (name == "zero" and mode not in ("auto", "rest", "warm")):
-            return {
-                "ok": False,
-                "text": f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume",
-            }
+            return _refusal(
+                f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back"
+            )
         if self._loop is None or self._commands.full():
-            return {"ok": False, "text": "the service cannot take a command now"}
+            return _refusal("the service cannot take a command now")
+        if brings_model:
+            return self._adopt_later(name, arguments)
         self._loop.call_soon_threadsafe(self._enqueue, name, arguments)
         return {"ok": True, "text": f"{name}: acts at the next sample"}
 
@@ -343,9 +414,101 @@ class Daemon:
         while not self._commands.empty():
             name, arguments = self._commands.get_nowait()
             self._note("command", name, arguments)
-            if name == "zero":
-                self._compensation.zero(arguments.get("mode", "auto"))
-            elif name == "hold":
-                self._compensation.hold()
-            else:
-                self._compensation.resume()
+            obey(self._compensation, name, arguments)
+
+    # ------------------------------------------------------------------ another model
+
+    def _adopt_later(self, name: str, arguments: dict[str, Any]) -> Reply:
+        assert self._loop is not None
+        try:
+            wanted = Wanted.of(name, arguments)
+        except ServiceError as error:
+            return _refusal(str(error))
+        reply: Future[dict[str, Any]] = Future()
+        self._loop.call_soon_threadsafe(self._begin_adoption, wanted, reply)
+        return reply
+
+    def _begin_adoption(self, wanted: Wanted, reply: Future[dict[str, Any]]) -> None:
+        if self._adoption is None or self._stop or self._adopting is not None:
+            why = "another model is under way" if self._adopting is not None else "this service takes no model now"
+            reply.set_result(_refusal(f"{wanted.action}: {why}"))
+            return
+        # The text of the model is not repeated here: it travels in the recording that begins with it.
+        self._note("command", wanted.action, {"sha256": wanted.sha256, "force": wanted.force})
+        self._adopting = _Adopting(wanted, reply)
+        self._adopting.task = asyncio.create_task(self._prepare(self._adoption, self._adopting))
+        self._adopting.task.add_done_callback(self._tell_refusal)
+
+    async def _prepare(self, adoption: Adoption, adopting: _Adopting) -> None:
+        """Have the model made ready on another thread; then answer. The swap is the next sample's."""
+        running = self._compensation
+        zero = running.zero_that_stands if running.has_reference else None
+        prepared = await asyncio.to_thread(adoption.prepare, adopting.wanted, running.model, zero, self._clock.utc_ns())
+        adopting.prepared = prepared
+        model = prepared.compensation.model
+        how = f"warmed up on {prepared.samples} sample(s) of {prepared.minutes / 60.0:.1f} h"
+        if not prepared.known:
+            how += f", too little to know its state: standard deviation {prepared.compensation.std_um:.1f} µm for now"
+        adopting.reply.set_result({
+            "ok": True, "text": f"model {model.name} ({model.sha256[:12]}) is taken over at the next sample, {how}",
+            "model": model.name, "model_sha256": model.sha256, "warm_up_min": prepared.minutes,
+            "warm_up_samples": prepared.samples, "state_known": prepared.known,
+        })  # fmt: skip
+
+    def _tell_refusal(self, task: asyncio.Task[None]) -> None:
+        """Answer that nothing comes of it, whatever the reason: the running model goes on."""
+        adopting, error = self._adopting, None if task.cancelled() else task.exception()
+        if adopting is None or error is None:
+            return
+        self._adopting = None
+        text = str(error)
+        if not isinstance(error, CompensatorError):
+            log.error("internal error", exc_info=error)
+            text = f"internal error: {type(error).__name__}: {error}"
+        self._note("adopt", f"refused: {text}", {"ok": False, "action": adopting.wanted.action})
+        adopting.reply.set_result(_refusal(text))
+
+    def _swap(self) -> None:
+        """Put a model that is ready in the place of the running one."""
+        adopting = self._adopting
+        if adopting is None or adopting.prepared is None:
+            return
+        self._adopting = None
+        old, prepared = self._compensation, adopting.prepared
+        new = prepared.compensation
+        for outcome in adopting.since:
+            zeroed = any(kind == "zero" for kind, _ in outcome.notes)
+            how = "rest" if outcome.estimate.y_base_um == 0.0 else "warm"
+            prepared.catch_up(outcome.sample, how if zeroed else None)  # type: ignore[arg-type]
+        difference = new.target_um - old.target_um
+        new.succeed(old)
+        self._compensation = new
+        self._recorder.attachments = {**self._recorder.attachments, "model.toml": prepared.data}
+        self._start_new_file()
+        named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
+        self._note(
+            "adopt",
+            f"model {named[0]} in the place of {named[1]}, "
+            f"warm-up {prepared.minutes / 60.0:.1f} h, the offset is to move by {difference:+.2f} µm",
+            {
+                "ok": True, "action": adopting.wanted.action, "old_sha256": old.model.sha256,
+                "new_sha256": new.model.sha256, "warm_up_min": prepared.minutes, "warm_up_samples": prepared.samples,
+                "state_known": prepared.known, "difference_um": difference, "y_std_um": new.std_um,
+            },
+        )  # fmt: skip
+
+    def _start_new_file(self) -> None:
+        try:
+            self._recorder.start_new()
+        except OSError as error:
+            self._note("recording", f"the recording could not be finished: {error}")
+
+    async def _drop_adoption(self) -> None:
+        """End with the adoption under way: a model that was kept is used at the next start."""
+        adopting = self._adopting
+        if adopting is not None and adopting.task is not None:
+            await asyncio.gather(adopting.task, return_exceptions=True)
+
+
+def _refusal(text: str) -> dict[str, Any]:
+    return {"ok": False, "text": text}

@@ -7,16 +7,19 @@ as a whole, and to handing commands over to the service's loop.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
+import msgspec
 import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
 
 #: Commands that the service takes, each a query on `thermal/command/<name>`.
-COMMANDS = ("zero", "hold", "resume")
+COMMANDS = ("zero", "hold", "resume", "adopt", "back")
 
 _KEYS = {
     "offset": "thermal/y/offset",
@@ -26,8 +29,10 @@ _KEYS = {
     "event": "thermal/event",
 }
 
+#: What a command is answered with, or a promise of it where it takes longer than Zenoh's thread may wait.
+Reply = dict[str, Any] | Future[dict[str, Any]]
 #: name, payload → reply
-CommandHandler = Callable[[str, bytes], dict[str, Any]]
+CommandHandler = Callable[[str, bytes], Reply]
 
 
 def session_config(settings: Zenoh) -> zenoh.Config:
@@ -138,10 +143,54 @@ class Publisher:
         return answer
 
     def _answer_command(self, name: str) -> Callable[[Any], None]:
-        def answer(query: Any) -> None:
+        def send(query: Any, reply: dict[str, Any]) -> None:
             with query:
-                payload = query.payload.to_bytes() if query.payload is not None else b""
-                reply = json.dumps(self._on_command(name, payload)).encode()
-                query.reply(self.key(name), reply, encoding=zenoh.Encoding.APPLICATION_JSON)
+                query.reply(self.key(name), json.dumps(reply).encode(), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+        def answer(query: Any) -> None:
+            payload = query.payload.to_bytes() if query.payload is not None else b""
+            reply = self._on_command(name, payload)
+            if isinstance(reply, Future):
+                reply.add_done_callback(lambda done: send(query, done.result()))
+            else:
+                send(query, reply)
 
         return answer
+
+
+def ask(settings: Zenoh, command: str, payload: bytes, *, timeout_s: float) -> dict[str, Any] | None:
+    """Send a command to the running service of a configuration, as an operator's program does.
+
+    Parameters
+    ----------
+    settings : Zenoh
+        Settings of the service: it is looked for where it listens, and at the routers that it connects to.
+    command : str
+        One of `COMMANDS`.
+    payload : bytes
+        JSON.
+    timeout_s : float
+        How long to wait for the reply, s.
+
+    Returns
+    -------
+    dict or None
+        `ok` and `text`; None where no service answers.
+    """
+    listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
+    endpoints = [endpoint for endpoint in listened if not endpoint.endswith(":0")] + settings.connect
+    if not endpoints:
+        return None
+    config = session_config(msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints))
+    config.insert_json5("connect/timeout_ms", "2000")
+    config.insert_json5("connect/exit_on_failure", "true")
+    key = f"{settings.prefix}/thermal/command/{command}"
+    try:
+        with zenoh.open(config) as session:
+            for answer in session.get(key, payload=payload, timeout=timeout_s):
+                if answer.ok is not None:
+                    reply: dict[str, Any] = json.loads(answer.ok.payload.to_bytes())
+                    return reply
+    except (zenoh.ZError, ValueError):
+        return None
+    return None

@@ -259,7 +259,7 @@ async def test_sequence_never_repeats_even_without_the_recordings(bench: Bench) 
 async def test_sample_is_on_disk_before_its_offset_is_published(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     order: list[str] = []
     write = bench.recorder.write
-    monkeypatch.setattr(bench.recorder, "write", lambda *a: (order.append("disk"), write(*a)))
+    monkeypatch.setattr(bench.recorder, "write", lambda *a, **k: (order.append("disk"), write(*a, **k)))
     publish = bench.daemon._publish
     bench.daemon._publish = lambda name, data: (order.append(name), publish(name, data))[1]
     await bench.run(3)
@@ -300,10 +300,10 @@ async def test_full_disk_goes_on_and_says_so(bench: Bench, monkeypatch: pytest.M
     write = bench.recorder.write
     full = [False]
 
-    def failing(records: Any, time_utc_ns: int) -> None:
+    def failing(records: Any, time_utc_ns: int, *, state: bytes) -> None:
         if full[0]:
             raise OSError(28, "No space left on device")
-        write(records, time_utc_ns)
+        write(records, time_utc_ns, state=state)
 
     monkeypatch.setattr(bench.recorder, "write", failing)
     bench.at_sample[10] = lambda: full.__setitem__(0, True)

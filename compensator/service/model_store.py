@@ -1,0 +1,157 @@
+"""The models that were adopted, kept beside the recordings: which one is in use, and which came before.
+
+The configuration stays as it is. An adopted model stands until the configured model itself is changed: whoever edits
+the configuration has the last word.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from compensator.errors import ServiceError
+
+_FILE = "adopted.json"
+
+
+class Adopted(msgspec.Struct, frozen=True, kw_only=True):
+    """One change of the model.
+
+    Parameters
+    ----------
+    sha256 : str
+        Hash of the model file that was in use from then on.
+    name : str
+        Name of the model.
+    time_utc_ns : int
+        When, ns since 1970 UTC.
+    action : {"adopt", "back"}
+        What was asked for.
+    """
+
+    sha256: str
+    name: str
+    time_utc_ns: int
+    action: Literal["adopt", "back"] = "adopt"
+
+
+class _Contents(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+    """`adopted.json`: the models in use, the last one on top, and every change there ever was."""
+
+    schema: Literal[1] = 1
+    configured_sha256: str
+    in_use: list[Adopted] = []
+    history: list[Adopted] = []
+
+
+class ModelStore:
+    """Models that were adopted for one configuration.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Made when the first model comes.
+    configured : bytes
+        The model file that the configuration names.
+
+    Raises
+    ------
+    ServiceError
+        From any method, naming the file, when the folder cannot be used.
+    """
+
+    def __init__(self, folder: Path, configured: bytes) -> None:
+        self.folder = folder
+        self.configured = configured
+        self._configured_sha256 = sha256_of(configured)
+
+    def in_use(self) -> bytes:
+        """Return the model file that the service is to use."""
+        adopted = self._read().in_use
+        return self.load(adopted[-1].sha256) if adopted else self.configured
+
+    def adopted(self) -> bool:
+        """Tell whether a model other than the configured one is in use."""
+        return bool(self._read().in_use)
+
+    def before(self) -> bytes | None:
+        """Return the model file that `back` leads to, None where the configured one is in use."""
+        adopted = self._read().in_use
+        if not adopted:
+            return None
+        return self.load(adopted[-2].sha256) if len(adopted) > 1 else self.configured
+
+    def load(self, sha256: str) -> bytes:
+        """Return a model file of the store."""
+        path = self.folder / f"{sha256}.toml"
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise ServiceError(f"{path}: {error.strerror or error}; expected an adopted model") from error
+        if sha256_of(data) != sha256:
+            raise ServiceError(f"{path}: sha256 {sha256_of(data)}, expected that of its name; the file was changed")
+        return data
+
+    def adopt(self, data: bytes, *, name: str, time_utc_ns: int) -> None:
+        """Put a model on top."""
+        contents = self._read()
+        entry = Adopted(sha256=sha256_of(data), name=name, time_utc_ns=time_utc_ns)
+        contents.in_use.append(entry)
+        contents.history.append(entry)
+        self._put(f"{entry.sha256}.toml", data)
+        self._write(contents)
+
+    def back(self, *, name: str, time_utc_ns: int) -> None:
+        """Take the model on top away; its file stays."""
+        contents = self._read()
+        if contents.in_use:
+            contents.in_use.pop()
+        sha256 = contents.in_use[-1].sha256 if contents.in_use else self._configured_sha256
+        contents.history.append(Adopted(sha256=sha256, name=name, time_utc_ns=time_utc_ns, action="back"))
+        self._write(contents)
+
+    # ------------------------------------------------------------------ files
+
+    def _read(self) -> _Contents:
+        path = self.folder / _FILE
+        try:
+            contents = msgspec.json.decode(path.read_bytes(), type=_Contents)
+        except FileNotFoundError:
+            return _Contents(configured_sha256=self._configured_sha256)
+        except OSError as error:
+            raise ServiceError(f"{path}: {error.strerror or error}") from error
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            raise ServiceError(f"{path}: {error}; remove it to use the configured model") from error
+        if contents.configured_sha256 != self._configured_sha256:
+            return _Contents(configured_sha256=self._configured_sha256, history=contents.history)
+        return contents
+
+    def _write(self, contents: _Contents) -> None:
+        self._put(_FILE, msgspec.json.format(msgspec.json.encode(contents)))
+
+    def _put(self, name: str, data: bytes) -> None:
+        """Write a file so that a power cut leaves the old one or the new one."""
+        path, part = self.folder / name, self.folder / f"{name}.part"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with part.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+            directory = os.open(self.folder, os.O_RDONLY)
+            try:
+                os.fsync(directory)
+            finally:
+                os.close(directory)
+        except OSError as error:
+            raise ServiceError(f"{path}: {error.strerror or error}; the model is not kept") from error
+
+
+def sha256_of(data: bytes) -> str:
+    """Return the hash of a model file."""
+    return hashlib.sha256(data).hexdigest()
