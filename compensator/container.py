@@ -170,6 +170,11 @@ class Container:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
+    @property
+    def position(self) -> int:
+        """How far the file was read, bytes."""
+        return self._base + self._at
+
     # ------------------------------------------------------------------ messages
 
     def messages(self) -> Iterator[Message]:

@@ -6,14 +6,13 @@ import argparse
 import dataclasses
 import hashlib
 import logging
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from compensator import __version__
+from compensator.commands.progress import progress
 from compensator.errors import UsageError
 from compensator.identify.calibration import Calibration, calibrate
 from compensator.identify.comparison import Row, compare
@@ -25,6 +24,9 @@ from compensator.model.model_file import load_model
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.tables import load_data, load_recordings, require, roles_of
+
+#: `progress` is used from here by the other commands, too.
+__all__ = ["Request", "finished", "identify", "progress", "provenance", "read_runs", "run", "write"]
 
 log = logging.getLogger("compensator")
 
@@ -176,14 +178,3 @@ def provenance(request: Request) -> dict[str, Any]:
     ]
     asked = {**settings, "columns": list(request.columns)}
     return {"source": f"compensator {__version__} identify", "data": files, "asked": asked}
-
-
-@contextmanager
-def progress(words: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on a terminal; yield what it is told with: steps done, of how many."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
-        task = bar.add_task(words, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -1,0 +1,64 @@
+"""`compensator replay`: the audit of recordings, and what another model would have done."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+from compensator.audit.comparison import COLUMNS, compare
+from compensator.audit.series import audit, summary
+from compensator.commands.progress import progress
+from compensator.errors import UsageError
+from compensator.model.model_file import load_model
+
+#: Exit code where an audit found a difference.
+FOUND = 3
+
+
+def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str, int]:
+    """Run the command; return its result, its text and the exit code.
+
+    Raises
+    ------
+    CompensatorError
+        If something that was given cannot be read.
+    """
+    paths = _files(arguments.recording)
+    if arguments.model is not None:
+        if arguments.public_key is not None:
+            raise UsageError("--public-key: belongs to the audit, which --model does not make")
+        return _compare(paths, arguments.model, arguments.out)
+    if arguments.out is not None:
+        raise UsageError("--out: is for --model, which is not given")
+    with progress("auditing") as told:
+        found = audit(paths, public_key=arguments.public_key, told=told)
+    return found.as_json(), summary(found), 0 if found.clean else FOUND
+
+
+def _compare(paths: list[Path], name: str, out: Path | None) -> tuple[dict[str, Any], str, int]:
+    model = load_model(name)
+    with progress("comparing") as told, out.open("w", newline="", encoding="utf-8") if out else nullcontext() as file:
+        row = None
+        if file is not None:
+            row = csv.writer(file, lineterminator="\n").writerow
+            row(COLUMNS)
+        found = compare(paths, model, told=told, row=row)
+    text = found.text() + (f"\nboth offsets: {out}" if out else "")
+    return found.as_json() | ({"out": str(out)} if out else {}), text, 0
+
+
+def _files(given: list[Path]) -> list[Path]:
+    """Return the recordings given; a folder stands for those in it."""
+    paths: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            inside = sorted(path.glob("*.mcap"), key=lambda file: file.stem)
+            if not inside:
+                raise UsageError(f"{path}: no recordings in it, expected FILE.mcap")
+            paths += inside
+        else:
+            paths.append(path)
+    return paths
