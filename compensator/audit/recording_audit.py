@@ -23,6 +23,7 @@ End = Literal["finished", "recovered", "open", "torn", "truncated", "damaged"]
 
 #: Messages between two calls of `told`.
 _STEP = 2000
+_CHUNK, _ATTACHMENT, _METADATA = b"\x06", b"\x09", b"\x0c"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,7 +246,7 @@ class _Audit:
         elif not isinstance(error, Torn):
             self._end = "damaged"
             self._findings.add("damaged", f"byte {error.offset}: {error.text}")
-        elif self._contents.chunked:
+        elif self._was_compact(error):
             self._end = "truncated"
             self._findings.add("truncated", f"a finished file that ends at byte {error.offset}; its end is missing")
         elif error.rest.count(b'{"schema":') > 1 or len(error.rest) >= 2**20:
@@ -256,6 +257,14 @@ class _Audit:
             self._end = "finished"
         else:
             self._end = "torn" if unlisted or error.rest or error.offset < self._size else "open"
+
+    def _was_compact(self, torn: Torn) -> bool:
+        """Tell whether the file had been finished: only then metadata and attachments stand before the channels."""
+        contents = self._contents
+        if contents.channels:
+            return contents.chunked
+        begun = bool(contents.metadata or contents.attachments)
+        return begun or torn.rest[:1] in (_ATTACHMENT, _METADATA, _CHUNK)
 
     def _result(self) -> RecordingAudit:
         check, work, contents = self._check, self._work, self._contents

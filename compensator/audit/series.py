@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -156,7 +156,7 @@ def judge(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
     signed : bool
         Whether seals were checked against a key.
     """
-    files = sorted(audits, key=lambda f: (f.machine, f.started_ns or f.first_ns, f.file))
+    files = sorted(map(_named, audits), key=lambda f: (f.machine, f.started_ns, f.file))
     judged = _Judge(files, signed)
     for before, after in zip([None, *files[:-1]], files, strict=True):
         judged.file(after)
@@ -166,6 +166,18 @@ def judge(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
     first = next((file.difference for file in files if file.difference), None)
     return Audit(files=tuple(files), findings=tuple(findings), findings_count=count, difference=first,
                  remarks=tuple(judged.remarks))  # fmt: skip
+
+
+def _named(file: RecordingAudit) -> RecordingAudit:
+    """Return the file with machine and time of its name where nothing is left of them in it."""
+    name = _NAME.match(file.file)
+    if name is None or file.machine:
+        return file
+    try:
+        began = datetime.strptime(name["stamp"], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+    except ValueError:
+        return file
+    return replace(file, machine=name["machine"], started_ns=int(began.timestamp()) * 10**9)
 
 
 class _Judge:
@@ -231,6 +243,12 @@ class _Judge:
             self._first(after)
             return
         if not before.last:
+            if (
+                before.end in ("open", "torn")
+                and after.previous_file == before.file
+                and after.previous != NOTHING.hex()
+            ):
+                self._find("truncated", before, f"{after.file} goes on from records that are not there")
             return
         if after.previous == before.last:
             self._state(before, after)
