@@ -125,9 +125,17 @@ class Zenoh(_Table, frozen=True, kw_only=True):
 
 
 class Recording(_Table, frozen=True, kw_only=True):
-    """`[recording]`: folder of the MCAP files, relative to the configuration."""
+    """`[recording]`: folder of the MCAP files, relative to the configuration.
+
+    `keep_days`, `keep_mb`: finished files beyond that age, or beyond that size of all of them, are removed, the oldest
+    first; everything is kept where nothing is said. `signing_key`: Ed25519 private key, PEM, that seals are signed
+    with; it stands outside the folder.
+    """
 
     folder: str
+    keep_days: Positive | None = None
+    keep_mb: Positive | None = None
+    signing_key: str | None = None
 
 
 class Config(_Table, frozen=True, kw_only=True):

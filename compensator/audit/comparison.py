@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from compensator.audit.findings import utc
-from compensator.audit.recomputation import model_of, obey, raw_of
+from compensator.audit.recomputation import act, model_of, raw_of
 from compensator.audit.recording_audit import recorded_groups
 from compensator.audit.verification import Record
 from compensator.config import Config
@@ -226,7 +226,8 @@ class _Run:
             compensation.pause(round((sample.time_utc_ns - self._last_ns) / (sample.period_s * 1e9)) - 1)
         self._last_ns = sample.time_utc_ns
         for event in events:
-            obey(compensation, event)
+            if event.seq == sample.seq:
+                act(compensation, event)
         try:
             outcome = compensation.process(raw_of(sample))
         except (KeyError, AttributeError, TypeError) as error:

@@ -16,6 +16,7 @@ from compensator.messages import Event, Offset, Sample, encode
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation
+from compensator.service.retrace import obey
 
 #: Beginnings of what the service says when the disk does not take the recording, and when it does again.
 DISK_FAILED, DISK_BACK = "the disk does not take the recording", "the disk takes the recording again"
@@ -59,16 +60,11 @@ def raw_of(sample: Sample) -> Sample:
     return replace(sample, channels={k: replace(c, quality=c.device_quality) for k, c in channels.items()})
 
 
-def obey(compensation: Compensation, event: Event) -> None:
+def act(compensation: Compensation, event: Event) -> None:
     """Do what an event says was asked of the compensation."""
     if event.kind == "command":
-        if event.text == "zero":
-            compensation.zero(event.data.get("mode", "auto"))
-        elif event.text == "hold":
-            compensation.hold()
-        elif event.text == "resume":
-            compensation.resume()
-    elif event.kind == "error" and event.text.startswith("internal error"):
+        obey(compensation, event.text, event.data)
+    elif event.kind == "error":
         compensation.fail()
 
 
@@ -138,10 +134,15 @@ class Recomputation:
         if sample is not None:
             self._sample(sample, estimate, offset, events, records)
         elif offset:
-            self._held(offset, records)
+            self._held(offset, events, records)
+
+    def _act(self, events: list[Event], seq: int) -> None:
+        """Do what was asked before this sample; what a full disk held back is in the file's state already."""
+        for event in events:
+            if event.seq == seq:
+                act(self.compensation, event)
 
     def _event(self, event: Event) -> None:
-        obey(self.compensation, event)
         if event.kind == "start":
             self.restarted = self.restarted or not self.samples
         elif event.kind == "recording":
@@ -157,6 +158,8 @@ class Recomputation:
         self, data: bytes, estimate: bytes, offset: bytes, events: list[Event], records: list[Record]
     ) -> None:  # fmt: skip
         sample = self._decoded(_SAMPLE, data, "sample", records[0].sequence)
+        if events:
+            self._act(events, sample.seq)
         try:
             outcome = self.compensation.process(raw_of(sample))
         except (KeyError, AttributeError, TypeError) as error:
@@ -192,13 +195,14 @@ class Recomputation:
                 self._count(Difference(file=self._file, topic="event", seq=sample.seq, time_utc_ns=sample.time_utc_ns,
                                        fields=(Field(name=kind, recorded=said, recomputed=text),)))  # fmt: skip
 
-    def _held(self, offset: bytes, records: list[Record]) -> None:
+    def _held(self, offset: bytes, events: list[Event], records: list[Record]) -> None:
         """Compare an offset that was published although its sample could not be worked on."""
         last = records[-1]
         try:
             said = msgspec.json.decode(offset, type=Offset)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             raise DataError(f"{self._file}: /offset record {last.sequence}: {error}") from error
+        self._act(events, said.seq)
         expected = encode(self.compensation.held(said.machine, said.seq, said.time_utc_ns))
         if expected != offset:
             self._differs("offset", said.seq, said.time_utc_ns, offset, expected)

@@ -39,6 +39,8 @@ class Audit:
         The first sample that comes out differently.
     remarks : tuple of str
         What is worth knowing and not wrong.
+    signed : bool
+        Whether signatures were checked against a key.
     """
 
     files: tuple[RecordingAudit, ...]
@@ -46,6 +48,7 @@ class Audit:
     findings_count: int
     difference: Difference | None
     remarks: tuple[str, ...]
+    signed: bool
 
     @property
     def samples(self) -> int:
@@ -72,7 +75,8 @@ class Audit:
             for f in self.files
         ]  # fmt: skip
         return {
-            "clean": self.clean, "samples": self.samples, "differing_samples": self.differing,
+            "clean": self.clean, "signatures_checked": self.signed,
+            "samples": self.samples, "differing_samples": self.differing,
             "findings_count": self.findings_count, "findings": [f.as_json() for f in self.findings],
             "difference": self.difference.as_json() if self.difference else None, "remarks": list(self.remarks),
             "files": files,
@@ -165,7 +169,7 @@ def judge(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
     count = sum(len(own) for own in judged.own.values()) + sum(file.findings_count for file in files)
     first = next((file.difference for file in files if file.difference), None)
     return Audit(files=tuple(files), findings=tuple(findings), findings_count=count, difference=first,
-                 remarks=tuple(judged.remarks))  # fmt: skip
+                 remarks=tuple(judged.remarks), signed=signed)  # fmt: skip
 
 
 def _named(file: RecordingAudit) -> RecordingAudit:
@@ -308,6 +312,9 @@ def summary(found: Audit) -> str:
     if chained and not found.findings_count:
         records = sum(file.records for file in chained)
         lines.append(f"The hash chain holds over {records} records; nothing was changed, removed, inserted or moved.")
+        if not found.signed:
+            lines.append("Who could write all of these files could compute the chain anew: only a signature, checked "
+                         "with --public-key, excludes that.")  # fmt: skip
     if found.findings_count:
         lines.append(f"{found.findings_count} finding(s):")
         lines += [f"  {finding.line()}" for finding in found.findings]

@@ -16,10 +16,12 @@ from compensator.recording import first_sequence
 from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
+from compensator.service.finishing import Retention
 from compensator.service.model_store import ModelStore
 from compensator.service.publisher import Publisher, Reply
 from compensator.service.recorder import Recorder
 from compensator.service.restart import resume
+from compensator.signature import Signer
 from drivers.errors import DriverConfigError, DriverError
 from drivers.reading import Reading
 
@@ -62,7 +64,22 @@ def load(path: str) -> tuple[LoadedConfig, ThermalModel, bytes, drivers.Fleet]:
                 f"configured, expected one of: {', '.join(map(str, sorted(units)))}"
             )
         _check_unit(path, channel.name, units[channel.input])
+    _signer(loaded)
     return loaded, model, data, fleet
+
+
+def _signer(loaded: LoadedConfig) -> Signer | None:
+    """Return what signs the recordings, None where no key is configured."""
+    name = loaded.config.recording.signing_key
+    if name is None:
+        return None
+    path, folder = loaded.resolve(name), loaded.resolve(loaded.config.recording.folder)
+    if path.is_relative_to(folder):
+        raise ConfigError(
+            f"{loaded.path}: recording.signing_key = {name!r}: stands among the recordings, expected a place where "
+            f"nobody who can change them can read it"
+        )
+    return Signer(path)
 
 
 def _adopted(loaded: LoadedConfig, configured: bytes, model: ThermalModel) -> tuple[bytes, ThermalModel]:
@@ -120,7 +137,9 @@ async def run_service(
     loaded, model, model_bytes, fleet = load(path)
     config = loaded.config
     folder = loaded.resolve(config.recording.folder)
-    recorder = Recorder(folder, config.machine.name, {"config.toml": loaded.data, "model.toml": model_bytes})
+    keep = Retention(keep_days=config.recording.keep_days, keep_mb=config.recording.keep_mb)
+    attachments = {"config.toml": loaded.data, "model.toml": model_bytes}
+    recorder = Recorder(folder, config.machine.name, attachments, retention=keep, signer=_signer(loaded))
 
     def command(name: str, payload: bytes) -> Reply:
         return daemon.command(name, payload)

@@ -323,6 +323,8 @@ class Daemon:
             self._recording_failed = False
             self._note("recording", "the disk takes the recording again")
         self._events = self._events[len(events) :]
+        for text, data in self._recorder.remarks():
+            self._note("recording", text, data)
         return True
 
     def _with_recording_state(self, outcome: Outcome) -> Outcome:
