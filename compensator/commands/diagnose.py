@@ -12,7 +12,8 @@ from typing import Any
 
 from compensator import __version__
 from compensator.commands.identify import progress, read_runs
-from compensator.diagnose.diagnosis import Diagnosis, diagnose
+from compensator.diagnose.diagnosis import diagnose
+from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.summary import figures, text
 from compensator.model.model_file import load_model
 from compensator.model.model_writer import write_model

@@ -37,6 +37,8 @@ OWN_SHARE = 0.02
 OWN_TIMES = 2.0
 #: A sum of squares up to this many times that of noise and own error is noise.
 CLEAN_TIMES = 1.3
+#: A displacement is what a cause does, never a cause: another probe follows Y whatever moves it.
+_OUTCOME = "_um"
 #: A channel whose span is less than this many of its noise deviations does not move.
 MOVES = 8.0
 
@@ -230,6 +232,8 @@ def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -
     common = [name for name in waves[0].channels if all(name in wave.channels for wave in waves)]
     moving, zeroed = {}, set()
     for name in common:
+        if name.endswith(_OUTCOME):
+            continue
         values = np.concatenate([wave.channels[name] for wave in waves])
         if np.ptp(values) > MOVES * noise_std(values) and np.ptp(values) > 0.0:
             moving[name] = float(np.ptp(values))

@@ -37,8 +37,7 @@ class Part:
     @property
     def named(self) -> dict[str, float]:
         """Every parameter by name."""
-        names = [*(free.name for free in self.hypothesis.free), *self.hypothesis.amplitudes]
-        return dict(zip(names, (*self.values, *self.amplitudes), strict=True))
+        return self.hypothesis.named(self.values, self.amplitudes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from compensator.diagnose.evidence import Evidence, Mask
-from compensator.diagnose.joint import Joint, Part, columns_of, fit_joint, summed
+from compensator.diagnose.evidence import Evidence
+from compensator.diagnose.joint import Joint, Part, columns_of, fit_joint
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, proposals
 from compensator.model.effects.unobserved import Unobserved
@@ -33,8 +33,6 @@ MOST = 4
 POLISHED, EXCHANGED = 12, 6
 #: Parts of an effect that are larger than their sum by this much cancel each other.
 CANCELS = 6.0
-#: Blocks of the slower search, and the share of the held-out error that an effect must take there.
-BLOCKS, GENERAL = 4, 0.1
 #: A residual with less colour than this is noise, and no hidden source is looked for in it.
 CLEAN = 1.3
 
@@ -147,43 +145,6 @@ class Search:
         """Tell whether an effect takes enough to be of use, the base model's own error counted as still there."""
         allowance = self.evidence.allowance
         return joint.cost + allowance < (1.0 - hypothesis.worth) * (without.cost + allowance)
-
-    def run_by_folds(self) -> Found:
-        """Search by the error on blocks of time that are held out in turn, among what can be deployed.
-
-        For data whose base model is far off: there a count of samples says nothing about chance, because what is
-        left is no noise. Slower, and blind to events that happen once.
-        """
-        before = fit_joint(self.evidence, [])
-        blocks = [(block, self.evidence.hidden(block)) for block in self.evidence.blocks(BLOCKS)]
-        joint, error = before, self._held_out(before, blocks)
-        places = [h for h in self.hypotheses if h.deployable and len(h.free) <= 1]
-        while len(joint.parts) < MOST:
-            taken = {part.hypothesis.place for part in joint.parts}
-            starts = [(part.hypothesis, part.values) for part in joint.parts]
-            ranked = sorted(self._scan(joint, [h for h in places if h.place not in taken]), key=lambda item: item[0])
-            tried = []
-            for _, hypothesis, values in ranked[:POLISHED]:
-                fitted = fit_joint(self.evidence, [*starts, (hypothesis, values)], evaluations=10)
-                tried.append((self._held_out(fitted, blocks), fitted))
-            if not tried:
-                break
-            best, fitted = min(tried, key=lambda item: item[0])
-            if best > (1.0 - GENERAL) * error:
-                break
-            joint, error = fitted, best
-        rivals = tuple(self._rivals(joint, i) for i in range(len(joint.parts)))
-        colour = self.evidence.colour(joint.residual)
-        return Found(before=before, joint=joint, colour=colour, rivals=rivals, places=self.places)
-
-    def _held_out(self, joint: Joint, blocks: Sequence[tuple[Mask, Evidence]]) -> float:
-        """Return the mean square on blocks, each by a fit to the others that starts from the fit to all."""
-        total = 0.0
-        starts = [(part.hypothesis, part.values) for part in joint.parts]
-        for block, seen in blocks:
-            effects = summed(seen, fit_joint(seen, starts, evaluations=5))
-            total += float(np.sum(seen.left(self.evidence.residual, effects, at_rest=True)[block] ** 2))
-        return total / self.evidence.count
 
     def score(self, joint: Joint, colour: float) -> float:
         """Return *J*."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from compensator.diagnose.diagnosis import Diagnosis, Effect
 from compensator.diagnose.joint import Part
+from compensator.diagnose.outcome import Diagnosis, Effect
 from compensator.simulation import Scores
 
 _VERDICTS = {

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from compensator.diagnose.diagnosis import Diagnosis, Effect
+from compensator.diagnose.outcome import Diagnosis, Effect
 from compensator.diagnose.summary import name, verdict
 from compensator.identify.summary import with_std
 from compensator.model.thermal_model import ThermalModel

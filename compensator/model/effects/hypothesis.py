@@ -136,6 +136,11 @@ class Hypothesis:
         columns = self.columns(waves, values)
         return columns if fixed is None else np.column_stack((fixed, columns))
 
+    def named(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, float]:
+        """Return every parameter by the name and unit that people read."""
+        names = [*(free.name for free in self.free), *self.amplitudes]
+        return dict(zip(names, (*values, *amplitudes), strict=True))
+
     def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
         """Return the `[[effect]]` table that the engine runs."""
         raise NotImplementedError

@@ -1,6 +1,9 @@
 """`input`: a measured channel acts on Y that the model does not know of.
 
-y += Σ_i gain_i · L(τ_i) · [f(c(t − d)) − f(c at the start)],   f(c) = c, c² or |c|
+y += Σ_i gain_i · L(τ_i) · [f(c(t − d)) − f(c at the start)],   f(c) = c, c², |c| or |c|^(5/3)
+
+The heat of a bearing is its speed times a friction torque that itself grows with the speed: by its power of 2/3 in a
+lubricated one (Palmgren, Ball and Roller Bearing Engineering), by the speed itself where the fluid shears.
 """
 
 from __future__ import annotations
@@ -28,9 +31,14 @@ from compensator.model.effects.hypothesis import (
 from compensator.model.effects.stream import Delay, Lag
 from compensator.model.effects.table import Table
 
-CURVES = ("linear", "square", "abs")
-_STREAM: Mapping[str, Callable[[float], float]] = {"linear": lambda c: c, "square": lambda c: c * c, "abs": abs}
-_BATCH: Mapping[str, Callable[[Vector], Vector]] = {"linear": lambda c: c, "square": np.square, "abs": np.abs}
+CURVES = ("linear", "square", "abs", "power 5/3")
+_STREAM: Mapping[str, Callable[[float], float]] = {
+    "linear": lambda c: c, "square": lambda c: c * c, "abs": abs, "power 5/3": lambda c: abs(c) ** (5.0 / 3.0),
+}  # fmt: skip
+_BATCH: Mapping[str, Callable[[Vector], Vector]] = {
+    "linear": lambda c: c, "square": np.square, "abs": np.abs, "power 5/3": lambda c: np.abs(c) ** (5.0 / 3.0),
+}  # fmt: skip
+_WORDS = {"linear": "", "square": " (its square)", "abs": " (its size)", "power 5/3": " (its size to the power of 5/3)"}
 
 
 @register("input")
@@ -108,12 +116,73 @@ class InputHypothesis(Hypothesis):
     def explain(self, named: Mapping[str, float], rms_um: float) -> str:
         """Say what acts."""
         taus = [shown(v) for n, v in named.items() if n.startswith("tau")]
-        curve = {"linear": "", "square": " (its square)", "abs": " (its size)"}[self.curve]
         delay = f", {shown(named['delay_min'])} min late" if "delay_min" in named else ""
         return (
-            f"The channel {self.channel}{curve} moves Y by {rms_um:.2g} µm rms with a lag of {' and '.join(taus)} "
-            f"min{delay}. The model has no such input; feed the channel in."
+            f"The channel {self.channel}{_WORDS[self.curve]} moves Y by {rms_um:.2g} µm rms with a lag of "
+            f"{' and '.join(taus)} min{delay}. The model has no such input; feed the channel in."
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BankHypothesis(InputHypothesis):
+    """A channel behind a row of lags that are given: what is fitted where the path's shape is not known.
+
+    Parameters
+    ----------
+    taus_min : tuple of float
+        The lags, min.
+    """
+
+    taus_min: tuple[float, ...] = ()
+
+    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+        """Return the channel behind each lag."""
+        curved = _BATCH[self.curve](waves.channels[self.channel])
+        return bank(curved - curved[0], self.taus_min, waves.period_min)
+
+    def named(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, float]:
+        """Return what the lags make together: the gain at rest, and when half of it is there after a step."""
+        power = {"linear": "", "square": "2", "abs": "", "power 5/3": "_5_3"}[self.curve]
+        total = math.fsum(amplitudes)
+        return {f"gain_um_per_{unit_of(self.channel)}{power}": total, "half_time_min": self._half_time(amplitudes)}
+
+    def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
+        """Return the table that the engine runs."""
+        return {"channel": self.channel, "curve": self.curve, "tau_min": list(self.taus_min), "gain": list(amplitudes),
+                "delay_min": 0.0}  # fmt: skip
+
+    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
+        """Say what acts."""
+        return (
+            f"The channel {self.channel}{_WORDS[self.curve]} moves Y by {rms_um:.2g} µm rms; half of it is there after "
+            f"{shown(named['half_time_min'])} min. The model has no such input; feed the channel in."
+        )
+
+    def _half_time(self, amplitudes: Sequence[float]) -> float:
+        t = np.geomspace(0.1, 10.0 * max(self.taus_min), 400)
+        gains, taus = np.array(amplitudes), np.array(self.taus_min)
+        part: Vector = (1.0 - np.exp(-t[:, None] / taus)) @ gains / math.fsum(amplitudes)
+        if not (part >= 0.5).any():
+            return float(t[-1])
+        there = int(np.argmax(part >= 0.5))
+        if there == 0:
+            return float(t[0])
+        return float(np.exp(np.interp(0.5, part[there - 1 : there + 1], np.log(t[there - 1 : there + 1]))))
+
+
+def bank(u: Vector, taus_min: Sequence[float], period_min: float) -> Matrix:
+    """Return a signal behind each of a row of lags, shape (n, len(taus_min))."""
+    return np.column_stack([lowpass(u, tau, period_min) for tau in taus_min])
+
+
+def banks(setting: Setting, taus_min: tuple[float, ...]) -> list[BankHypothesis]:
+    """Return every channel that moves behind a row of lags; one with a zero of its own also through the curves."""
+    return [
+        BankHypothesis(channel=channel, form=curve, curve=curve, taus_min=taus_min,
+                       amplitudes=tuple(f"gain_{i}" for i in range(1, len(taus_min) + 1)))
+        for channel in setting.channels
+        for curve in (("linear", "power 5/3", "square") if channel in setting.zeroed else ("linear",))
+    ]  # fmt: skip
 
 
 @proposes

@@ -1,0 +1,255 @@
+"""A base model that is far off: fitted anew together with what it lacks.
+
+A model that was calibrated while something acted that it has no input for has bent its own paths to make up for it. Its
+residual is then no longer the effect, and whatever is found in it holds nowhere else. So the paths are fitted
+again, beside each channel in turn, and the channel that helps most on blocks of time that were held out is added; then
+the next.
+
+Every path and channel acts through a row of given lags, whose gains are held small: a ridge, with the weight `RIDGE`
+against columns of standard deviation 1 (the last fit takes a lighter one where that does better). So there is nothing
+to search, one Gram matrix of each block serves all fits, and hundreds of combinations are compared by their error on
+blocks of several lengths: short ones alone would favour what merely follows, long ones alone depend on where they
+begin.
+
+Sources: Hoerl and Kennard, Ridge regression (1970); Stone, Cross-validatory choice (1974).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.diagnose.evidence import Evidence
+from compensator.diagnose.joint import Part
+from compensator.model.effects.hypothesis import lag_pole
+from compensator.model.effects.input import BankHypothesis, bank, banks
+from compensator.model.transfer_function import SampledTransferFunction
+
+Vector = npt.NDArray[np.float64]
+Matrix = npt.NDArray[np.float64]
+
+#: Lags in a row, and the longest of them, min.
+LAGS, LONGEST_MIN = 6, 600.0
+#: Weight of the ridge, as a share of the samples.
+RIDGE = 0.03
+#: Weights of the last fit, the heaviest first; the one with the least error on held-out blocks is taken.
+RIDGES = (RIDGE, 0.01, 0.003, 0.001)
+#: Lengths of the blocks that are held out, h.
+BLOCKS_H = (3.0, 5.0, 8.0)
+#: Most channels added, and what each must leave at most of the held-out error.
+MOST, LEAVES = 3, 0.9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tried:
+    """A channel and the error on held-out blocks with it.
+
+    Parameters
+    ----------
+    hypothesis : BankHypothesis
+        The channel and its curve.
+    rms_um : float
+        Free-run error on the blocks, µm.
+    blocks_um2 : numpy.ndarray
+        Sum of squares of each block, µm².
+    """
+
+    hypothesis: BankHypothesis
+    rms_um: float
+    blocks_um2: Vector
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refit:
+    """Base and channels fitted together.
+
+    Parameters
+    ----------
+    parts : tuple of Part
+        The channels added, in the order in which they were.
+    std : tuple of dict of str to float
+        Standard errors of what each part is named by, from leaving out one block at a time.
+    dtf, tdtf : SampledTransferFunction or None
+        The paths, fitted anew.
+    predicted : numpy.ndarray, shape (n,)
+        Deformation on every sample, the zero of each run included, µm.
+    by_paths : numpy.ndarray, shape (n,)
+        The same by the paths alone, fitted without any channel.
+    rms_um : tuple of float
+        Error on held-out blocks: of the base alone, then with each channel more.
+    rivals : tuple of tuple of Tried
+        For each part, the other channels in its place, best first.
+    """
+
+    parts: tuple[Part, ...]
+    std: tuple[dict[str, float], ...]
+    dtf: SampledTransferFunction
+    tdtf: SampledTransferFunction | None
+    predicted: Vector
+    by_paths: Vector
+    rms_um: tuple[float, ...]
+    rivals: tuple[tuple[Tried, ...], ...]
+
+
+def deformation(evidence: Evidence) -> Vector:
+    """Return the measured deformation less the effects that the model has already, µm; 0 where it is not used."""
+    paths = np.concatenate([wave.y_dtf_um + wave.y_tdtf_um for wave in evidence.waves])
+    return np.asarray(np.where(evidence.used, evidence.residual + paths, 0.0))
+
+
+def refit(evidence: Evidence) -> Refit:
+    """Fit the base anew and add channels while the error on held-out blocks falls.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        Residual and signals; only the samples used are looked at.
+    """
+    fitting = _Fitting(evidence)
+    chosen: list[BankHypothesis] = []
+    best, blocks = fitting.held_out(chosen)
+    errors, rivals = [best], []
+    while len(chosen) < MOST:
+        taken = {hypothesis.channel for hypothesis in chosen}
+        tried = []
+        for hypothesis in fitting.hypotheses:
+            if hypothesis.channel not in taken:
+                rms, each = fitting.held_out([*chosen, hypothesis])
+                tried.append(Tried(hypothesis=hypothesis, rms_um=rms, blocks_um2=each))
+        tried.sort(key=lambda item: item.rms_um)
+        # A fall that a single block brings is that block's luck.
+        if not tried or tried[0].rms_um > LEAVES * best or np.mean(tried[0].blocks_um2 < blocks) <= 0.5:
+            break
+        chosen.append(tried[0].hypothesis)
+        best, blocks = tried[0].rms_um, tried[0].blocks_um2
+        errors.append(best)
+        rivals.append(tuple(tried[1:]))
+    return fitting.result(chosen, tuple(errors), tuple(rivals))
+
+
+class _Fitting:
+    """Columns of everything that could be in the fit, and their Gram matrices."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence = evidence
+        setting, period = evidence.setting, evidence.setting.period_min
+        longest = min(LONGEST_MIN, max(setting.minutes / 3.0, 20.0 * period))
+        self.taus = tuple(float(t) for t in np.geomspace(period, longest, LAGS))
+        self.hypotheses = banks(setting, self.taus)
+        self.paths = ["drive", *(["ambient_k"] if setting.has_ambient else [])]
+        runs = np.zeros((evidence.used.size, len(evidence.waves)))
+        start = 0
+        for i, wave in enumerate(evidence.waves):
+            runs[start : start + wave.size, i] = 1.0
+            start += wave.size
+        groups = [
+            *(
+                np.concatenate([bank(getattr(w, name), self.taus, period) for w in evidence.waves])
+                for name in self.paths
+            ),
+            *(np.concatenate([h.columns(w, ()) for w in evidence.waves]) for h in self.hypotheses),
+        ]
+        whole = np.concatenate([runs, *groups], axis=1)
+        scale = np.std(whole[evidence.used], axis=0)
+        scale[: runs.shape[1]] = 1.0
+        scale[scale == 0.0] = 1.0
+        self.scale, self.table = scale, whole / scale
+        self.base = runs.shape[1] + LAGS * len(self.paths)
+        self.y = deformation(evidence)
+        self.blocks = [self._grams(mask) for mask in self._masks()]
+        self.all = self._grams([evidence.used])
+
+    def _masks(self) -> list[list[npt.NDArray[np.bool_]]]:
+        hours = self.evidence.count * self.evidence.setting.period_min / 60.0
+        return [list(self.evidence.blocks(max(2, round(hours / length)))) for length in BLOCKS_H]
+
+    def _grams(self, masks: Sequence[npt.NDArray[np.bool_]]) -> list[tuple[Matrix, Vector, float, int]]:
+        found = []
+        for mask in masks:
+            x, y = self.table[mask], self.y[mask]
+            found.append((x.T @ x, x.T @ y, float(y @ y), int(mask.sum())))
+        return found
+
+    def columns_of(self, chosen: Sequence[BankHypothesis]) -> npt.NDArray[np.int_]:
+        """Return which columns a fit has: zeros and paths, then each channel's."""
+        at = [np.arange(self.base)]
+        for hypothesis in chosen:
+            first = self.base + LAGS * self.hypotheses.index(hypothesis)
+            at.append(np.arange(first, first + LAGS))
+        return np.concatenate(at)
+
+    def held_out(self, chosen: Sequence[BankHypothesis], ridge: float = RIDGE) -> tuple[float, Vector]:
+        """Return the error on blocks that were held out, µm rms, and the sum of squares of each."""
+        at = self.columns_of(chosen)
+        cut = np.ix_(at, at)
+        (gram, moment, _, count), errors, squares = self.all[0], [], []
+        gram, moment = gram[cut], moment[at]
+        for blocks in self.blocks:
+            for g, m, yy, n in blocks:
+                own, right = g[cut], m[at]
+                w = _solved(gram - own, moment - right, ridge * (count - n))
+                errors.append((max(float(w @ own @ w - 2.0 * w @ right + yy), 0.0), n))
+            squares.append(sum(e for e, _ in errors[-len(blocks) :]) / sum(n for _, n in errors[-len(blocks) :]))
+        return float(np.sqrt(np.mean(squares))), np.array([e for e, _ in errors])
+
+    def weights(self, chosen: Sequence[BankHypothesis], ridge: float, without: int | None = None) -> Vector:
+        """Return the weights of the fit to everything that is used, or to all but one of the shortest blocks."""
+        at = self.columns_of(chosen)
+        gram, moment, _, count = self.all[0]
+        if without is not None:
+            own, right, _, n = self.blocks[0][without]
+            gram, moment, count = gram - own, moment - right, count - n
+        return _solved(gram[np.ix_(at, at)], moment[at], ridge * count)
+
+    def result(
+        self, chosen: Sequence[BankHypothesis], errors: tuple[float, ...], rivals: tuple[tuple[Tried, ...], ...]
+    ) -> Refit:
+        """Fit to everything that is used, and take the pieces apart."""
+        at = self.columns_of(chosen)
+        ridge = min(RIDGES, key=lambda weight: self.held_out(chosen, weight)[0])
+        w = self.weights(chosen, ridge)
+        gains = w / self.scale[at]
+        others = [self.weights(chosen, ridge, i) / self.scale[at] for i in range(len(self.blocks[0]))]
+        parts, std = [], []
+        for i, hypothesis in enumerate(chosen):
+            own = slice(self.base + LAGS * i, self.base + LAGS * (i + 1))
+            parts.append(Part(hypothesis=hypothesis, values=(), amplitudes=tuple(gains[own].tolist())))
+            std.append(_jackknife(parts[-1], [other[own] for other in others]))
+        paths = [
+            self._function(gains[first : first + LAGS])
+            for first in range(len(self.evidence.waves), self.base, LAGS)
+        ]  # fmt: skip
+        return Refit(
+            parts=tuple(parts), std=tuple(std), dtf=paths[0], tdtf=paths[1] if len(paths) > 1 else None,
+            predicted=self.table[:, at] @ w,
+            by_paths=self.table[:, : self.base] @ self.weights([], RIDGE), rms_um=errors, rivals=rivals,
+        )  # fmt: skip
+
+    def _function(self, gains: Vector) -> SampledTransferFunction:
+        """Return a row of lags as one transfer function."""
+        period = self.evidence.setting.period_min
+        poles = np.array([lag_pole(tau, period) for tau in self.taus])
+        numerator = np.zeros(poles.size + 1)
+        for i, gain in enumerate(gains.tolist()):
+            half = (1.0 - poles[i]) / 2.0
+            numerator += gain * half * np.convolve([1.0, 1.0], np.poly(np.delete(poles, i)))
+        return SampledTransferFunction(
+            b=tuple(numerator.tolist()), a=tuple(np.poly(poles).tolist()), period_s=60.0 * period
+        )
+
+
+def _solved(gram: Matrix, moment: Vector, ridge: float) -> Vector:
+    return np.asarray(np.linalg.solve(gram + ridge * np.eye(moment.size), moment))
+
+
+def _jackknife(part: Part, others: Sequence[Vector]) -> dict[str, float]:
+    """Return standard errors of what a row of lags is named by, from fits that leave out one block each.
+
+    A coloured residual is in them; what the ridge takes off every fit alike is not.
+    """
+    named = [part.hypothesis.named((), gains.tolist()) for gains in others]
+    count = len(others)
+    return {name: float(np.std([n[name] for n in named]) * np.sqrt(count - 1)) for name in part.named}

@@ -1,0 +1,126 @@
+"""The measured spindle, through the commands: calibrate two inputs, diagnose, run what comes out on hours not seen.
+
+Beside it: no compensation, persistence (the last measured value stands), and a ridge regression over lags of every
+channel, its weight chosen on blocks of the hours that it was fitted to.
+"""
+
+import contextlib
+import csv
+import io
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from compensator.cli import main
+
+FILE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
+#: Hours of the fit, hours that judge.
+SPLITS = (((0, 16), (16, 32)), ((0, 20), (20, 32)), ((0, 24), (24, 32)), ((0, 28), (28, 32)))
+ROWS_PER_H = 240
+
+
+def quietly(*words):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        assert main([str(word) for word in words]) == 0
+
+
+def column(path, name):
+    with path.open(encoding="utf-8") as file:
+        return np.array([float(row[name] or "nan") for row in csv.DictReader(file)])
+
+
+def cut(folder, last_h):
+    """Write the hours of the fit; the probes other than Y stay in, as they would in a log."""
+    rows = FILE.read_text(encoding="utf-8").splitlines()
+    path = folder / "fit.csv"
+    path.write_text("\n".join(rows[: 1 + last_h * ROWS_PER_H]) + "\n", encoding="utf-8")
+    return path
+
+
+def lagged(u):
+    """Return a signal and its means over the last 5 min to 10 h, exponentially weighted."""
+    found = []
+    for tau in (1.0, 5.0, 20.0, 60.0, 180.0, 600.0):
+        out, p = np.zeros(u.size), np.exp(-1.0 / tau)
+        for i in range(1, u.size):
+            out[i] = p * out[i - 1] + (1.0 - p) * (u[i] - u[0])
+        found.append(out)
+    return np.stack(found, axis=1)
+
+
+def ridge(y, used):
+    """Predict by every temperature and the speed behind lags."""
+    with FILE.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = [name for name in rows[0] if name.endswith(("_degc", "_rpm"))]
+    minutes = y.size
+    table = np.concatenate(
+        [lagged(np.array([float(r[n]) for r in rows])[: 4 * minutes].reshape(-1, 4).mean(axis=1)) for n in names],
+        axis=1,
+    )
+    table = np.column_stack([table / (table[used].std(axis=0) + 1e-9), np.ones(minutes)])
+
+    def fitted(mask, weight):
+        x = table[mask]
+        return np.linalg.solve(x.T @ x + weight * mask.sum() * np.eye(x.shape[1]), x.T @ y[mask])
+
+    def left(weight):
+        total = 0.0
+        for block in np.array_split(np.flatnonzero(used), 5):
+            mask = used.copy()
+            mask[block] = False
+            total += float(np.sum((table[block] @ fitted(mask, weight) - y[block]) ** 2))
+        return total
+
+    return table @ fitted(used, min((1e-4, 1e-3, 1e-2, 1e-1), key=left))
+
+
+def one(probe, fit_h, judge_h, *, beside=True):
+    """Return rms and mean absolute errors on the hours that judge, µm, by name, and what was found."""
+    roles = ["--column", "t_q_degc=t5_degc", "--column", "at_degc=t16_degc", "--column", f"y_um=ch{probe}_um"]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        data = cut(folder, fit_h[1])
+        quietly("identify", data, *roles, "--out", folder / "two.toml")
+        quietly("diagnose", data, *roles, "--model", folder / "two.toml", "--out", folder / "d")
+        predicted = {}
+        for label, model in (("two inputs", folder / "two.toml"), ("extended", folder / "d/model.toml")):
+            quietly("simulate", FILE, *roles, "--model", model, "--out", folder / "p.csv")
+            predicted[label] = column(folder / "p.csv", "y_pred_um")
+            y = column(folder / "p.csv", "y_um")
+        found = json.loads((folder / "d/diagnosis.json").read_text(encoding="utf-8"))["effects"]
+    judged = slice(judge_h[0] * 60, judge_h[1] * 60)
+    used = np.zeros(y.size, dtype=bool)
+    used[fit_h[0] * 60 : fit_h[1] * 60] = True
+    predicted |= {"none": np.zeros(y.size), "persistence": np.full(y.size, y[judge_h[0] * 60 - 1])}
+    if beside:
+        predicted["ridge, all"] = ridge(y, used)
+    errors = {
+        label: (
+            float(np.sqrt(np.nanmean((y - p)[judged] ** 2))),
+            float(np.nanmean(np.abs((y - p)[judged]))),
+        )
+        for label, p in predicted.items()
+    }
+    return errors, " + ".join(f"{e['channel']} ({e['form']})" for e in found) or "nothing"
+
+
+def report():
+    """Print a row for each probe and split."""
+    if not FILE.exists():
+        print("measured spindle: the data is not here")
+        return
+    names = ("none", "persistence", "two inputs", "ridge, all", "extended")
+    print("\nmeasured spindle, free run on hours that nothing saw, µm rms (mean absolute):")
+    print(f"{'':<8}{'fit, h':>8}{'judged, h':>11}" + "".join(f"{name:>15}" for name in names) + "   found")
+    for probe in range(1, 6):
+        for fit_h, judge_h in SPLITS:
+            errors, found = one(probe, fit_h, judge_h)
+            cells = "".join(f"{errors[name][0]:>8.1f} ({errors[name][1]:4.1f})" for name in names)
+            print(f"ch{probe:<6}{fit_h[0]:>4}-{fit_h[1]:<4}{judge_h[0]:>6}-{judge_h[1]:<4}{cells}   {found}")
+
+
+if __name__ == "__main__":
+    report()

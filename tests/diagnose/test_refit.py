@@ -1,0 +1,148 @@
+"""A base model that was calibrated while something acted: its paths are fitted anew beside what it lacks."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from compensator.commands.identify import read_runs
+from compensator.diagnose.diagnosis import diagnose
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.refit import deformation, refit
+from compensator.identify.calibration import calibrate, predict
+from compensator.identify.settings import Settings
+from tests.bench.spindle import FILE, SPLITS, one
+from tests.identify.quill_runs import runs_from
+
+
+def lag(u, tau):
+    p = np.exp(-1.0 / tau)
+    return lfilter([1.0 - p], [1.0, -p], u)
+
+
+def machine(seed, speeds, *, logged=True):
+    """A machine whose spindle bends it by the square of the speed; T_Q sees a motor that heats alike at any speed."""
+    rng = np.random.default_rng(seed)
+    hours = [(speed, h) for speed in speeds for h in (speed, 0)]
+    rpm = np.concatenate([np.zeros(60), *(np.full(200, float(on)) for _, on in hours)])
+    n = rpm.size
+    room = 21.0 + np.cumsum(rng.normal(0.0, 0.01, n)) + np.sin(np.arange(n) / 250.0)
+    motor = 9.0 * lag((rpm > 0) * 1.0, 45.0)
+    y = 1.4 * lag(motor, 90.0) - 2.0 * lag(room - room[0], 200.0)
+    y = y - 2.4e-6 * lag(rpm**2, 70.0)
+    columns = {
+        "t_q_degc": room + motor + rng.normal(0, 0.02, n), "at_degc": room + rng.normal(0, 0.02, n),
+        "y_um": y + rng.normal(0, 0.2, n), "shop_degc": 19.0 + lag(rng.normal(0.0, 1.0, n), 60.0) * 8.0,
+        "second_um": 0.8 * y + rng.normal(0, 0.2, n),
+    }  # fmt: skip
+    if logged:
+        columns["spindle_rpm"] = rpm
+    return runs_from(columns)
+
+
+def calibrated(runs):
+    """A model as the command writes it: with the error of its own calibration."""
+    calibration = calibrate(runs, Settings(kind="direct"), period_s=60.0, name="two inputs")
+    return dataclasses.replace(calibration.model, provenance={"folds_rms_um": calibration.folds_rms_um})
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return machine(1, (1500, 3000, 4500, 2200, 3800))
+
+
+@pytest.fixture(scope="module")
+def found(runs):
+    return diagnose(calibrated(runs), runs)
+
+
+def test_the_channel_and_its_curve_are_named(found):
+    assert [e.part.hypothesis.place for e in found.effects] == [("input", "", "spindle_rpm")]
+    effect = found.effects[0]
+    assert effect.part.hypothesis.curve == "square"
+    assert effect.deployable
+    gain, half_time = effect.part.named["gain_um_per_rpm2"], effect.part.named["half_time_min"]
+    assert gain == pytest.approx(-2.4e-6, rel=0.25)
+    assert half_time == pytest.approx(70.0 * np.log(2.0), rel=0.35)
+    assert 0.0 < effect.std["gain_um_per_rpm2"] < 0.2 * abs(gain)
+    assert effect.std["half_time_min"] > 0.0
+
+
+def test_blocks_that_took_no_part_and_a_run_of_other_speeds_come_out_right(found, runs):
+    assert found.after.rms_um < 0.2 * found.before.rms_um
+    fresh = machine(2, (4000, 1000, 2800))[0]
+    first, extended = (
+        float(np.sqrt(np.mean((fresh.y_um - predict(model, fresh)) ** 2))) for model in (calibrated(runs), found.model)
+    )
+    assert extended < 0.15 * first
+    assert extended < 1.5
+
+
+def test_the_extended_model_says_what_error_it_has_left(found):
+    assert found.model.y_std_um == found.model.provenance["folds_rms_um"] < 1.5
+    assert any("fitted anew" in words for words in found.warnings)
+
+
+def test_a_model_that_does_not_say_how_good_it_is_comes_to_the_same(found, runs):
+    silent = dataclasses.replace(calibrated(runs), provenance={})
+    again = diagnose(silent, runs)
+    assert [e.part.hypothesis for e in again.effects] == [e.part.hypothesis for e in found.effects]
+
+
+def test_what_is_not_logged_is_not_made_up(runs):
+    blind = machine(1, (1500, 3000, 4500, 2200, 3800), logged=False)
+    model = calibrated(blind)
+    result = diagnose(model, blind)
+    assert result.verdict in ("unexplained", "partly_explained")
+    if not result.effects or result.after.rms_um > result.before.rms_um:
+        assert result.model.effects == ()
+    # Another probe moves with Y whatever the cause, and is no cause.
+    assert all(e.part.hypothesis.channel != "second_um" for e in result.effects)
+
+
+def test_the_paths_are_what_the_fit_says(runs):
+    """The rows of lags, written as transfer functions, give the same deformation."""
+    evidence = evidence_of(calibrated(runs), runs)
+    whole = refit(evidence)
+    wave = evidence.waves[0]
+    y = whole.dtf.response(wave.drive - wave.drive[0]) + whole.tdtf.response(wave.ambient_k - wave.ambient_k[0])
+    for part in whole.parts:
+        y = y + part.hypothesis.columns(wave, ()) @ np.array(part.amplitudes)
+    zero = whole.predicted - y
+    assert zero == pytest.approx(np.full(zero.size, zero[0]), abs=1e-6)
+
+
+def test_held_out_samples_do_not_take_part(runs):
+    evidence = evidence_of(calibrated(runs), runs)
+    block = next(evidence.blocks(3))
+    seen = evidence.hidden(block)
+    before = refit(seen)
+    disturbed = runs_from({
+        "t_q_degc": runs[0].t_q_degc, "at_degc": runs[0].at_degc, "y_um": np.where(block, 77.0, runs[0].y_um),
+        **runs[0].channels,
+    })  # fmt: skip
+    again = refit(evidence_of(calibrated(runs), disturbed).hidden(block))
+    assert again.rms_um == pytest.approx(before.rms_um, rel=1e-6)
+    assert not deformation(seen)[block].any()
+
+
+@pytest.mark.skipif(not FILE.exists(), reason="the measured spindle's data is not here")
+def test_the_measured_spindle_lacks_its_speed():
+    """Fitted to 20 h, judged on the 12 h after them: a speed beyond any that was seen."""
+    fit_h, judge_h = SPLITS[1]
+    errors, found = one(3, fit_h, judge_h, beside=False)
+    assert found.startswith("spindle_rpm (square)")
+    assert errors["extended"][0] < 0.25 * errors["two inputs"][0]
+    assert errors["extended"][0] < 0.25 * errors["persistence"][0]
+
+
+@pytest.mark.skipif(not FILE.exists(), reason="the measured spindle's data is not here")
+def test_the_other_probes_do_not_become_inputs():
+    roles = {"t_q_degc": "t5_degc", "at_degc": "t16_degc", "y_um": "ch3_um"}
+    runs = read_runs([FILE], roles, [], period_s=60.0)
+    evidence = evidence_of(calibrated(runs), runs)
+    assert "spindle_rpm" in evidence.setting.channels
+    assert not [name for name in evidence.setting.channels if name.startswith("ch")]
+    assert json.dumps(sorted(evidence.setting.zeroed)) == '["spindle_rpm"]'
