@@ -206,7 +206,7 @@ def test_another_model_is_taken_over(tmp_path: Path) -> None:
     found = look(tmp_path)
     assert found.clean, summary(found)
     assert [file.began for file in found.files] == ["start", "new"]
-    assert len({file.model for file in found.files}) == 2 and "model_changed" in reasons(tmp_path)
+    assert len({file.model for file in found.files}) == 2 and "cold_start" in reasons(tmp_path)
 
 
 def test_a_file_without_a_state_begins_afresh(tmp_path: Path) -> None:
