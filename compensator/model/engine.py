@@ -298,14 +298,16 @@ class Engine:
             at_k=at_degc - self._reference.at_degc,
             channels={name: given.get(name, NAN) for name in self.channels},
         )
+        unknown = None
         if inputs.complete:
             if self._gap is not None:
+                unknown = self._observer.covariance_ahead()
                 self._walk_over(self._gap, inputs)
                 self._gap = None
             self._last_complete = inputs
         else:
             self._keep(inputs)
-        return self._advance(inputs)
+        return self._advance(inputs, unknown=unknown)
 
     def run(
         self, t_q_degc: Sequence[float] | Vector, at_degc: Sequence[float] | Vector,
@@ -369,9 +371,13 @@ class Engine:
 
     # ------------------------------------------------------------------ inside
 
-    def _advance(self, inputs: Inputs, extra_t_q_k2: float = 0.0, extra_at_k2: float = 0.0) -> Estimate:
+    def _advance(
+        self, inputs: Inputs, extra_t_q_k2: float = 0.0, extra_at_k2: float = 0.0, unknown: Vector | None = None
+    ) -> Estimate:
         observer = self._observer
         observer.step(inputs.t_q_k, inputs.at_k, extra_t_q_k2=extra_t_q_k2, extra_at_k2=extra_at_k2)
+        if unknown is not None:
+            observer.widen(unknown)
         dtf, tdtf = observer.shares_um()
         shares = self._step_effects(inputs, dtf, tdtf) if self._effects else ()
         y = dtf + tdtf

@@ -218,7 +218,8 @@ class Observer:
             gain[self._a] = 1.0
         return gain.tolist(), _corrected(p, gain, column, s)
 
-    def _update_t_q(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
+    def _t_q_column(self, p: Matrix, variance: float) -> tuple[Matrix, float]:
+        """Return the covariance of the states with T_Q, and the variance of T_Q as it is measured."""
         column = self._d[0] * p[:, self._q] + p[:, self._a]
         first = self._first[0]
         if first < self.size:
@@ -226,6 +227,10 @@ class Observer:
         s = self._d[0] * float(column[self._q]) + float(column[self._a]) + variance
         if first < self.size:
             s += float(column[first])
+        return column, s
+
+    def _update_t_q(self, p: Matrix, variance: float) -> tuple[list[float], Matrix]:
+        column, s = self._t_q_column(p, variance)
         if self._kalman:
             gain = column / s
         else:
@@ -291,6 +296,37 @@ class Observer:
         dtf = x[self._first[1]] + self._d[1] * x[self._q]
         tdtf = x[self._first[2]] + self._d[2] * x[self._a]
         return dtf, tdtf
+
+    # ------------------------------------------------------------------ after a gap
+
+    def covariance_ahead(self) -> Matrix:
+        """Return the covariance one sample ahead, before its measurements."""
+        return self._moved_covariance(self._P) if self._started else self._P
+
+    def widen(self, ahead: Matrix) -> None:
+        """Take over what is not known after a gap whose inputs were interpolated.
+
+        The errors of an interpolated drive hang together over the whole gap, so they do not average out, as the walk
+        over it counts them. A random walk that is seen again at the end of a gap has the straight line as its mean and
+        the covariance of the optimal filter, which left the gap out: that one stands, whatever the method.
+
+        Parameters
+        ----------
+        ahead : numpy.ndarray, shape (n, n)
+            Covariance before the measurements of the present sample, of an observer that walked over nothing.
+        """
+        column = ahead[:, self._a]
+        gain = column / (float(column[self._a]) + self._r_at)
+        p = _corrected(ahead, gain, column, float(column[self._a]) + self._r_at)
+        column, s = self._t_q_column(p, self._r_tq)
+        gain = column / s
+        walked, walked_var = self._P, self._y_var
+        self._P = _corrected(p, gain, column, s)
+        self._y_var = self._variance_of_y()
+        if self._y_var > walked_var:
+            self._settled = False
+        else:
+            self._P, self._y_var = walked, walked_var
 
     # ------------------------------------------------------------------ state
 

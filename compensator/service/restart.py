@@ -110,11 +110,16 @@ def _last(folder: Path, machine: str, resumed: Resumed) -> _Last | None:
     for path in reversed(recordings(folder, machine)):
         try:
             opening = opening_of(path)
-            state = decode_state(opening["state.json"]) if "state.json" in opening else None
             steps = list(steps_of(path))
         except CompensatorError as error:
             resumed.note(f"a recording cannot be used: {error}")
             continue
+        state = None
+        if "state.json" in opening:
+            try:
+                state = decode_state(opening["state.json"])
+            except DataError as error:
+                resumed.note(f"{path.name}: {error}")
         if state is not None or steps:
             return _Last(path, opening, state, steps)
     return None
@@ -123,7 +128,7 @@ def _last(folder: Path, machine: str, resumed: Resumed) -> _Last | None:
 def _changes(last: _Last, loaded: LoadedConfig, model: ThermalModel) -> list[str]:
     """Say in words why the state of the recording is not that of this configuration and model."""
     if last.state is None:
-        return ["the recording carries no state"]
+        return ["the recording carries no state that can be used"]
     changes = []
     if last.opening.get("config.toml") != loaded.data:
         changes.append("the configuration has changed")

@@ -1,0 +1,143 @@
+"""A service that is ended and started again on one simulated machine, with its recordings on disk."""
+
+from __future__ import annotations
+
+import functools
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from compensator.clock import VirtualClock
+from compensator.config import Config, LoadedConfig
+from compensator.messages import Event, encode, number
+from compensator.model.model_file import parse_model, read_model_bytes
+from compensator.recording import first_sequence, recordings
+from compensator.service.adoption import Adoption, check_model
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.daemon import Daemon
+from compensator.service.model_store import ModelStore
+from compensator.service.recorder import Recorder
+from compensator.service.restart import resume
+from compensator.service.retrace import opening_of, replayed, steps_of
+from sim_hardware.physics import Duty, PublishedQuill, World
+from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
+
+MACHINE = "vmc-07"
+
+
+class Machine:
+    """A machine without sensor noise, so that two runs of it measure the same."""
+
+    def __init__(self, folder: Path, conf: Config | None = None, model: bytes | None = None) -> None:
+        self.folder = folder
+        self.config = conf or config()
+        self.config_bytes = b"the configuration"
+        self.configured = model or read_model_bytes("quill")
+        self.world = World(PublishedQuill(), Duty.working_day(1, hours=72), seed=1)
+        self.device = FakeDevice([functools.partial(self.world.truth, name) for name in CHANNELS])
+        self.outcomes: list[Outcome] = []
+        self.published: list[tuple[str, bytes]] = []
+        self.at_sample: dict[int, Callable[[], Any]] = {}
+        self.daemon: Daemon | None = None
+
+        async def advance(t_s: float) -> None:
+            self.world.advance_to(t_s)
+
+        self.clock = VirtualClock(START_NS, advance)
+
+    @property
+    def recordings(self) -> Path:
+        return self.folder / "rec"
+
+    @property
+    def store(self) -> ModelStore:
+        return ModelStore(self.recordings / "models", self.configured)
+
+    def command(self, name: str, payload: bytes = b"") -> Any:
+        assert self.daemon is not None
+        return self.daemon.command(name, payload)
+
+    async def run(self, samples: int, until: Callable[[Outcome], bool] = lambda outcome: False) -> None:
+        """Start the service, run it, end it cleanly."""
+        data = self.store.in_use()
+        loaded = LoadedConfig(
+            config=self.config, path=self.folder / "machine.toml", data=self.config_bytes, sha256="unused"
+        )
+        resumed = resume(loaded, check_model(self.config, data, source="test"))
+        recorder = Recorder(self.recordings, MACHINE, {"config.toml": self.config_bytes, "model.toml": data})
+        daemon = self.daemon = Daemon(
+            config=self.config, compensation=resumed.compensation, devices={"module": self.device},
+            recorder=recorder, publish=lambda name, sent: self.published.append((name, sent)), clock=self.clock,
+            first_sequence=first_sequence(self.recordings, MACHINE, self.clock.utc_ns(), 60.0),
+            adoption=Adoption(self.config, self.recordings, self.store), notes=resumed.notes,
+        )  # fmt: skip
+
+        def step(outcome: Outcome) -> None:
+            self.outcomes.append(outcome)
+            self.at_sample.pop(len(self.outcomes), lambda: None)()
+            if until(outcome):
+                daemon.stop()
+
+        await daemon.run(samples=samples, on_sample=step)
+
+    async def run_and_kill(self, samples: int, *, torn: int = 0) -> None:
+        """Run the service and leave on disk what a kill after the last sample leaves, less some bytes."""
+        copy = self.folder / "killed"
+        last = len(self.outcomes) + samples
+        self.at_sample[last] = lambda: shutil.copytree(self.recordings, copy)
+        await self.run(samples)
+        shutil.rmtree(self.recordings)
+        copy.rename(self.recordings)
+        path = recordings(self.recordings, MACHINE)[-1]
+        assert not path.read_bytes().endswith(b"\x89MCAP0\r\n")
+        if torn:
+            path.write_bytes(path.read_bytes()[:-torn])
+
+    async def sleep(self, minutes: float) -> None:
+        """Let the machine work on without the service."""
+        await self.clock.sleep(60.0 * minutes)
+
+    def events(self, kind: str) -> list[Event]:
+        sent = [msgspec.json.decode(data, type=Event) for name, data in self.published if name == "event"]
+        return [event for event in sent if event.kind == kind]
+
+    def offsets(self) -> np.ndarray:
+        return np.array([number(o.offset.y_offset_um) for o in self.outcomes])
+
+    def by_time(self) -> dict[int, Outcome]:
+        return {outcome.offset.time_utc_ns: outcome for outcome in self.outcomes}
+
+
+def largest_step(outcomes: list[Outcome]) -> float:
+    """Largest change between two published offsets, µm; once there is one, there always is one."""
+    offsets = [number(o.offset.y_offset_um) for o in outcomes]
+    first = next(i for i, value in enumerate(offsets) if not math.isnan(value))
+    steps = np.abs(np.diff(offsets[first:]))
+    assert not np.any(np.isnan(steps))
+    return float(np.max(steps))
+
+
+def check_files(machine: Machine) -> int:
+    """Work every recording out again from what travels in it alone; return the number of samples."""
+    samples = 0
+    seqs = []
+    for path in recordings(machine.recordings, MACHINE):
+        opening = opening_of(path)
+        compensation = Compensation(machine.config, parse_model(opening["model.toml"], source="attached"))
+        compensation.restore(opening["state.json"])
+        for step in steps_of(path):
+            outcome = replayed(compensation, step)
+            assert encode(outcome.sample) == encode(step.sample), (path.name, step.sample.seq)
+            if step.estimate is not None:
+                assert encode(outcome.estimate) == encode(step.estimate), (path.name, step.sample.seq)
+            if step.offset is not None and "recording_failed" not in step.offset.reasons:
+                assert encode(outcome.offset) == encode(step.offset), (path.name, step.sample.seq)
+            seqs.append(step.sample.seq)
+            samples += 1
+    assert seqs == sorted(set(seqs))
+    return samples

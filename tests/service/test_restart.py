@@ -1,0 +1,244 @@
+"""After any end the service goes on where it was: state, zero, number, offset."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from compensator.messages import number
+from compensator.model.model_file import read_model_bytes
+from compensator.recording import recordings
+from compensator.service.recorder import Recorder
+from drivers.reading import Quality, Reading
+from tests.service.living import MACHINE, Machine, check_files, largest_step
+from tests.service.simulated import config
+
+QUILL = read_model_bytes("quill")
+STRONGER = QUILL.replace(b'name = "quill"', b'name = "stronger"') + (
+    b'\n[[effect]]\nkind = "gain"\npath = "DTF"\nchange = 0.3\n'
+)
+
+
+@pytest.fixture(scope="module")
+def awake(tmp_path_factory: pytest.TempPathFactory) -> Machine:
+    """The machine with a service that nobody interrupts."""
+    machine = Machine(tmp_path_factory.mktemp("awake"))
+    asyncio.run(machine.run(640))
+    return machine
+
+
+async def end(machine: Machine, how: str, samples: int) -> None:
+    if how == "stop":
+        await machine.run(samples)
+    else:
+        # 900 bytes off: the last offset is gone and the estimate torn, the sample whole.
+        await machine.run_and_kill(samples, torn=900 if how == "torn" else 0)
+
+
+@pytest.mark.parametrize("how", ["stop", "kill", "torn"])
+@pytest.mark.parametrize(("gap_min", "tolerance_um"), [(0.0, 0.0), (25.0, 0.6), (120.0, 3.0)])
+async def test_goes_on_as_if_nothing_had_happened(
+    tmp_path: Path, awake: Machine, how: str, gap_min: float, tolerance_um: float
+) -> None:
+    """What is left after the bridge is what changed between its two ends without being measured."""
+    machine = Machine(tmp_path)
+    await end(machine, how, 300)
+    before = machine.outcomes[-1]
+    await machine.sleep(gap_min)
+    await machine.run(120)
+    after = machine.outcomes[300:]
+    whole = awake.by_time()
+    assert after[0].offset.seq > before.offset.seq
+    assert after[0].estimate.t_q_ref_degc == before.estimate.t_q_ref_degc
+    assert after[0].estimate.y_ref_um == before.estimate.y_ref_um
+    assert {o.offset.state for o in after} <= {"ok", "degraded"}
+    assert not any("cold_start" in o.offset.reasons for o in after)
+    # From the last offset that anybody got on, within the rate limit at every step.
+    assert largest_step(machine.outcomes[299:]) <= 8.0 + 1e-9
+    same = [whole[o.offset.time_utc_ns] for o in after]
+    errors = [
+        abs(number(a.estimate.y_pred_um) - number(b.estimate.y_pred_um)) for a, b in zip(after, same, strict=True)
+    ]
+    assert max(errors) <= tolerance_um
+    if gap_min == 0.0 and how != "torn":
+        assert [a.offset.y_offset_um for a in after] == [b.offset.y_offset_um for b in same]
+    else:
+        assert number(after[0].offset.y_offset_std_um) >= number(same[0].offset.y_offset_std_um)
+    told = [event for event in machine.events("restart") if "missing" in event.data]
+    assert told and told[-1].data["bridged"]
+    assert check_files(machine) >= 419
+
+
+async def test_a_gap_too_long_is_said_and_the_offset_moves_by_the_rate_alone(tmp_path: Path, awake: Machine) -> None:
+    machine = Machine(tmp_path, config(restart={"bridge_max_min": 30.0}))
+    await machine.run_and_kill(300)
+    await machine.sleep(60.0)
+    await machine.run(60)
+    after = machine.outcomes[300:]
+    assert all("cold_start" in o.offset.reasons and o.offset.state == "degraded" for o in after)
+    assert largest_step(machine.outcomes[299:]) <= 8.0 + 1e-9
+    told = [event for event in machine.events("restart") if "missing" in event.data]
+    assert len(told) == 1 and not told[0].data["bridged"] and "cannot be bridged" in told[0].text
+    whole = awake.by_time()[after[0].offset.time_utc_ns]
+    assert number(after[0].offset.y_offset_std_um) > 2.0 * number(whole.offset.y_offset_std_um)
+    assert check_files(machine) == 360
+
+
+async def test_a_weekend_away_finds_the_machine_as_it_is(tmp_path: Path) -> None:
+    """Two days are longer than anything that is remembered: the machine counts as it is found, the zero stands."""
+    machine = Machine(tmp_path)
+    await machine.run_and_kill(300)
+    await machine.sleep(2 * 24 * 60.0)
+    await machine.run(30)
+    after = machine.outcomes[300:]
+    assert after[0].estimate.t_q_ref_degc == machine.outcomes[0].estimate.t_q_ref_degc
+    assert largest_step(machine.outcomes[299:]) <= 8.0 + 1e-9
+    residuals = [abs(number(o.estimate.residual_um)) for o in after]
+    assert max(residuals) < 3.0 * max(number(o.offset.y_offset_std_um) for o in after)
+
+
+async def test_an_operator_hold_and_the_guards_survive_a_kill(tmp_path: Path) -> None:
+    machine = Machine(tmp_path)
+    machine.at_sample[100] = lambda: machine.command("hold")
+    await machine.run_and_kill(150)
+    await machine.run(20)
+    held = machine.outcomes[101:]
+    assert all(o.offset.state == "hold" and "operator_hold" in o.offset.reasons for o in held)
+    assert len({o.offset.y_offset_um for o in held}) == 1
+    # The rate guard still knows the last good value: a leap is not believed after a restart either.
+    machine.device.replaced[0] = Reading.good(70.0)
+    await machine.run(1)
+    assert machine.outcomes[-1].sample.channels["t_q_degc"].quality == "too_fast"
+    assert check_files(machine) == 171
+
+
+async def test_a_temperature_that_is_lost_across_the_restart_is_not_predicted_for_ever(tmp_path: Path) -> None:
+    machine = Machine(tmp_path)
+    await machine.run_and_kill(200)
+    machine.device.replaced[0] = Reading.bad(Quality.OPEN, "wire broken")
+    await machine.sleep(30.0)
+    machine.at_sample[210] = machine.device.replaced.clear
+    await machine.run(40)
+    lost = machine.outcomes[200:210]
+    assert all(o.offset.state == "hold" and "prediction_expired" in o.offset.reasons for o in lost)
+    assert {o.offset.y_offset_um for o in lost} == {machine.outcomes[199].offset.y_offset_um}
+    assert machine.outcomes[-1].offset.state == "ok"
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    assert abs(number(machine.outcomes[-1].estimate.residual_um)) < 1.5
+
+
+async def test_another_configuration_takes_the_state_over_by_the_recordings(tmp_path: Path, awake: Machine) -> None:
+    machine = Machine(tmp_path)
+    machine.at_sample[290] = lambda: machine.command("hold")
+    machine.at_sample[295] = lambda: machine.command("resume")
+    await machine.run_and_kill(300)
+    machine.config, machine.config_bytes = config(loss={"predict_for_min": 11.0}), b"changed"
+    await machine.run(60)
+    whole = awake.by_time()
+    after = machine.outcomes[300:]
+    assert [o.estimate.y_pred_um for o in after] == [whole[o.offset.time_utc_ns].estimate.y_pred_um for o in after]
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    assert any("the configuration has changed" in event.text for event in machine.events("restart"))
+
+
+async def test_another_model_is_warmed_up_on_the_recordings(tmp_path: Path) -> None:
+    always = Machine(tmp_path / "always", model=STRONGER)
+    await always.run(400)
+    machine = Machine(tmp_path / "changed")
+    machine.at_sample[250] = lambda: machine.command("hold")
+    await machine.run_and_kill(300)
+    machine.configured = STRONGER
+    machine.at_sample[330] = lambda: machine.command("resume")
+    await machine.run(100)
+    whole = always.by_time()
+    after = machine.outcomes[300:]
+    for outcome in after:
+        expected = whole[outcome.offset.time_utc_ns].estimate
+        assert outcome.estimate.y_pred_um == expected.y_pred_um and outcome.estimate.heat_w == expected.heat_w
+    assert all("operator_hold" in o.offset.reasons for o in after[:30])
+    assert "model_changed" in after[30].offset.reasons and after[30].offset.state == "degraded"
+    assert after[-1].offset.state == "ok"
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    assert any("the model has changed" in event.text for event in machine.events("restart"))
+
+
+async def test_recordings_without_a_state_and_files_that_are_none(
+    tmp_path: Path, awake: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Recordings of an older version carry no state; something else may lie in the folder under such a name."""
+    machine = Machine(tmp_path)
+    write = Recorder.write
+
+    def stateless(self: Recorder, records: Any, time_utc_ns: int, *, state: bytes = b"") -> None:
+        write(self, records, time_utc_ns)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Recorder, "write", stateless)
+        await machine.run_and_kill(300)
+    (machine.recordings / f"{MACHINE}_20260105T230000Z.mcap").write_bytes(b"")
+    await machine.run(30)
+    whole = awake.by_time()
+    after = machine.outcomes[300:]
+    assert [o.estimate.y_pred_um for o in after] == [whole[o.offset.time_utc_ns].estimate.y_pred_um for o in after]
+    assert any("carries no state that can be used" in event.text for event in machine.events("restart"))
+
+
+@pytest.mark.parametrize("state", [b"{}", b"not JSON", b'{"schema": 99}'])
+async def test_a_damaged_state_does_not_keep_the_service_from_starting(
+    tmp_path: Path, state: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Machine(tmp_path)
+    write = Recorder.write
+    with monkeypatch.context() as patch:
+        patch.setattr(Recorder, "write", lambda self, records, ns, **_: write(self, records, ns, state=state))
+        await machine.run_and_kill(100)
+    await machine.run(20)
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    assert any(event.text for event in machine.events("restart"))
+
+
+async def test_every_file_works_out_from_what_travels_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Midnight, restarts, a full disk, a defect, commands: each file alone gives all its outcomes again."""
+    machine = Machine(tmp_path)
+    lost = Reading.bad(Quality.OPEN, "wire broken")
+    machine.at_sample[1060] = lambda: machine.device.replaced.update({0: lost})  # across midnight
+    machine.at_sample[1095] = machine.device.replaced.clear
+    machine.at_sample[50] = lambda: machine.command("zero")
+    machine.at_sample[90] = lambda: machine.command("hold")
+    machine.at_sample[120] = lambda: machine.command("resume")
+    await machine.run_and_kill(500)
+    await machine.sleep(45.0)
+    full = [False]
+    write = Recorder.write
+
+    def failing(self: Recorder, records: Any, time_utc_ns: int, *, state: bytes = b"") -> None:
+        if full[0]:
+            self._give_up()
+            raise OSError(28, "No space left on device")
+        write(self, records, time_utc_ns, state=state)
+
+    def break_off() -> None:
+        compensation = machine.daemon._compensation  # type: ignore[union-attr]
+        original = compensation._decide
+
+        def broken(*_: Any) -> Any:
+            compensation._decide = original  # type: ignore[method-assign]
+            raise ZeroDivisionError("a defect")
+
+        compensation._decide = broken  # type: ignore[method-assign]
+
+    monkeypatch.setattr(Recorder, "write", failing)
+    machine.at_sample[600] = lambda: (full.__setitem__(0, True), machine.command("hold"))
+    machine.at_sample[610] = lambda: (full.__setitem__(0, False), machine.command("resume"))
+    machine.at_sample[700] = break_off
+    machine.at_sample[720] = lambda: machine.command("resume")
+    await machine.run(620)
+    kinds = {reason for o in machine.outcomes for reason in o.offset.reasons}
+    assert {"recording_failed", "internal_error", "operator_hold", "predicting"} <= kinds
+    assert check_files(machine) >= 1100
+    assert len(recordings(machine.recordings, MACHINE)) >= 5
+    assert np.nanmax(np.abs(np.diff(machine.offsets()))) <= 8.0 + 1e-9
