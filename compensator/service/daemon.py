@@ -189,7 +189,8 @@ class Daemon:
         self._stop = True
 
     async def _close(self) -> None:
-        await self._drop_adoption()
+        self._stop = True
+        await self._end_adoption()
         self._note("stop", "the service ends")
         self._record([], self._clock.utc_ns())
         try:
@@ -401,7 +402,7 @@ class Daemon:
             return _refusal(
                 f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back"
             )
-        if self._loop is None or self._commands.full():
+        if self._loop is None or self._stop or self._commands.full():
             return _refusal("the service cannot take a command now")
         if brings_model:
             return self._adopt_later(name, arguments)
@@ -505,8 +506,9 @@ class Daemon:
         except OSError as error:
             self._note("recording", f"the recording could not be finished: {error}")
 
-    async def _drop_adoption(self) -> None:
-        """End with the adoption under way: a model that was kept is used at the next start."""
+    async def _end_adoption(self) -> None:
+        """Let the adoption under way be answered: a model that was kept is used at the next start."""
+        await asyncio.sleep(0)  # one that was asked for just now is refused
         adopting = self._adopting
         if adopting is not None and adopting.task is not None:
             await asyncio.gather(adopting.task, return_exceptions=True)

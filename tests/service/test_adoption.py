@@ -1,0 +1,320 @@
+"""Another model for the running service: without a jump, warmed up, and back again."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from compensator.errors import ServiceError
+from compensator.messages import number
+from compensator.recording import recordings
+from compensator.service.adoption import Adoption
+from compensator.service.compensation import Outcome
+from compensator.service.model_store import ModelStore, sha256_of
+from compensator.service.retrace import opening_of
+from tests.service.living import MACHINE, Machine, check_files, largest_step
+from tests.service.simulated import config
+from tests.service.test_restart import QUILL, STRONGER
+
+SLOW = config(
+    limits={"offset_max_um": 200.0, "offset_rate_max_um_per_min": 2.0,
+            "validity": {"t_q_degc": [10.0, 60.0], "at_degc": [10.0, 35.0]}},
+)  # fmt: skip
+WITH_INPUT = QUILL.replace(b'name = "quill"', b'name = "coolant"') + (
+    b'\n[[effect]]\nkind = "input"\nchannel = "coolant_degc"\ncurve = "linear"\ntau_min = [60.0]\n'
+    b"gain = [3.0]\ndelay_min = 5.0\n"
+)
+
+
+def payload(model: bytes, **more: Any) -> bytes:
+    return json.dumps({"sha256": sha256_of(model), "model": model.decode(), **more}).encode()
+
+
+class Asked:
+    """Sends a command and keeps its answer."""
+
+    def __init__(self, machine: Machine, name: str, data: bytes = b"") -> None:
+        self._machine, self._name, self._data = machine, name, data
+        self.reply: Any = None
+
+    def __call__(self) -> None:
+        self.reply = self._machine.command(self._name, self._data)
+
+    @property
+    def answer(self) -> dict[str, Any]:
+        answer: dict[str, Any] = self.reply.result(timeout=0) if isinstance(self.reply, Future) else self.reply
+        return answer
+
+
+def adopted(model: bytes, then: int = 0) -> Callable[[Outcome], bool]:
+    """Tell when the service has used a model for some samples."""
+    count = [0]
+
+    def arrived(outcome: Outcome) -> bool:
+        count[0] += outcome.offset.model_sha256 == sha256_of(model)
+        return count[0] > then
+
+    return arrived
+
+
+@pytest.mark.parametrize("model", [STRONGER, WITH_INPUT], ids=["gain", "input"])
+async def test_the_running_service_takes_a_model_over_as_if_it_had_run_all_the_time(
+    tmp_path: Path, model: bytes
+) -> None:
+    machine = Machine(tmp_path / "adopting", SLOW)
+    asked = machine.at_sample[200] = Asked(machine, "adopt", payload(model))
+    await machine.run(700, adopted(model, then=80))
+    assert asked.answer["ok"], asked.answer
+    always = Machine(tmp_path / "always", SLOW, model)
+    await always.run(len(machine.outcomes))
+    whole = always.by_time()
+    new = [o for o in machine.outcomes if o.offset.model_sha256 == sha256_of(model)]
+    swap = len(machine.outcomes) - len(new)
+    assert 200 < swap < 620 and len(new) == 81
+    for outcome in new:
+        expected = whole[outcome.offset.time_utc_ns].estimate
+        assert outcome.estimate.y_pred_um == expected.y_pred_um
+        assert outcome.estimate.y_effects_um == expected.y_effects_um
+        assert outcome.estimate.y_ref_um == expected.y_ref_um
+    # Never a jump: not at the swap, not on the way, and the way is said.
+    assert largest_step(machine.outcomes) <= 2.0 + 1e-9
+    event = machine.events("adopt")[-1]
+    assert event.data["old_sha256"] == sha256_of(QUILL) and event.data["new_sha256"] == sha256_of(model)
+    assert event.data["state_known"] and event.data["warm_up_samples"] >= 200
+    difference = event.data["difference_um"]
+    under_way = [o for o in new if "model_changed" in o.offset.reasons]
+    if abs(difference) > 4.0:
+        assert under_way == new[: len(under_way)] and len(under_way) >= abs(difference) / 2.0 - 2
+        assert all(o.offset.state == "degraded" and "rate_limited" in o.offset.reasons for o in under_way)
+    assert "model_changed" not in new[-1].offset.reasons
+    assert number(new[-1].offset.y_offset_um) == whole[new[-1].offset.time_utc_ns].offset.y_offset_um
+    # The new model travels in a file of its own, from which all its outcomes come again.
+    files = recordings(machine.recordings, MACHINE)
+    assert [opening_of(path)["model.toml"] for path in files] == [QUILL, model]
+    assert check_files(machine) == len(machine.outcomes)
+    told = [event for event in machine.events("command") if event.text == "adopt"]
+    assert len(told) == 1 and told[0].data == {"sha256": sha256_of(model), "force": False}
+    # The next start uses it.
+    assert machine.store.in_use() == model
+    await machine.run(3)
+    assert machine.outcomes[-1].offset.model_sha256 == sha256_of(model)
+    assert "cold_start" not in machine.outcomes[-1].offset.reasons
+    assert largest_step(machine.outcomes) <= 2.0 + 1e-9
+
+
+async def test_a_zero_on_a_warm_machine_and_a_restart_lie_in_the_warm_up(tmp_path: Path) -> None:
+    """The deformation counts from the new model's own value at the zero; a pause is bridged by it, too."""
+
+    async def lived(machine: Machine) -> None:
+        machine.at_sample[90] = lambda: machine.command("zero", b'{"mode": "warm"}')
+        await machine.run_and_kill(150)
+        await machine.sleep(20.0)
+
+    machine, always = Machine(tmp_path / "a"), Machine(tmp_path / "b", model=STRONGER)
+    await lived(machine)
+    asked = machine.at_sample[200] = Asked(machine, "adopt", payload(STRONGER))
+    await machine.run(400, adopted(STRONGER, then=5))
+    assert asked.answer["ok"], asked.answer
+    await lived(always)
+    await always.run(len(machine.outcomes) - 150)
+    a, b = machine.outcomes[-1].estimate, always.outcomes[-1].estimate
+    assert (a.time_utc_ns, a.y_pred_um, a.y_base_um) == (b.time_utc_ns, b.y_pred_um, b.y_base_um)
+    assert a.y_base_um != 0.0
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+
+
+async def test_an_operator_hold_stands_and_a_zero_meanwhile_counts(tmp_path: Path) -> None:
+    machine = Machine(tmp_path / "a", SLOW)
+    machine.at_sample[190] = lambda: machine.command("hold")
+    machine.at_sample[200] = Asked(machine, "adopt", payload(STRONGER))
+    machine.at_sample[201] = lambda: machine.command("zero", b'{"mode": "rest"}')
+    await machine.run(500, adopted(STRONGER, then=20))
+    new = machine.outcomes[-21:]
+    assert all(o.offset.state == "hold" and "operator_hold" in o.offset.reasons for o in machine.outcomes[191:])
+    assert len({o.offset.y_offset_um for o in machine.outcomes[191:]}) == 1
+    assert new[-1].estimate.t_q_ref_degc == machine.outcomes[210].estimate.t_q_ref_degc
+    assert new[-1].estimate.t_q_ref_degc != machine.outcomes[150].estimate.t_q_ref_degc
+    machine.at_sample[len(machine.outcomes) + 1] = lambda: machine.command("resume")
+    await machine.run(10)
+    assert "operator_hold" not in machine.outcomes[-1].offset.reasons
+    assert largest_step(machine.outcomes) <= 2.0 + 1e-9
+
+
+async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Machine(tmp_path / "a")
+    held = threading.Event()
+    prepare = Adoption._warmed
+
+    def slow(self: Adoption, *arguments: Any) -> Any:
+        warmed = prepare(self, *arguments)
+        assert held.wait(30.0)
+        return warmed
+
+    monkeypatch.setattr(Adoption, "_warmed", slow)
+    asked = machine.at_sample[150] = Asked(machine, "adopt", payload(STRONGER))
+    second = machine.at_sample[160] = Asked(machine, "back")
+    machine.at_sample[200] = held.set
+    await machine.run(500, adopted(STRONGER))
+    assert asked.answer["ok"]
+    assert not second.answer["ok"] and "another model is under way" in second.answer["text"]
+    swap = len(machine.outcomes) - 1
+    assert swap >= 200
+    times = [o.offset.time_utc_ns for o in machine.outcomes]
+    assert {b - a for a, b in itertools.pairwise(times)} == {60_000_000_000}
+    always = Machine(tmp_path / "b", model=STRONGER)
+    await always.run(len(machine.outcomes))
+    assert machine.outcomes[-1].estimate.y_pred_um == always.outcomes[-1].estimate.y_pred_um
+
+
+async def test_too_little_on_record_is_refused_and_taken_only_by_force(tmp_path: Path) -> None:
+    """The recordings of the day before are gone, and with them the zero."""
+    machine = Machine(tmp_path, SLOW)
+    await machine.run(1100)
+    recordings(machine.recordings, MACHINE)[0].unlink()
+    refused = machine.at_sample[1105] = Asked(machine, "adopt", payload(STRONGER))
+    forced = Asked(machine, "adopt", payload(STRONGER, force=True))
+
+    def when_refused(outcome: Outcome) -> bool:
+        if refused.reply is not None and refused.reply.done() and forced.reply is None:
+            assert machine.store.in_use() == QUILL
+            forced()
+        return arrived(outcome)
+
+    arrived = adopted(STRONGER, then=10)
+    await machine.run(300, when_refused)
+    assert not refused.answer["ok"]
+    assert "the recordings reach back" in refused.answer["text"] and "µm only" in refused.answer["text"]
+    events = machine.events("adopt")
+    assert events[0].text.startswith("refused:") and events[0].data["ok"] is False
+    assert forced.answer["ok"] and forced.answer["state_known"] is False and "too little" in forced.answer["text"]
+    new = machine.outcomes[-11:]
+    before = machine.outcomes[-12]
+    assert all("cold_start" in o.offset.reasons and o.offset.state == "degraded" for o in new)
+    assert number(new[0].offset.y_offset_std_um) > 1.5 * number(before.offset.y_offset_std_um)
+    assert new[0].estimate.t_q_ref_degc == before.estimate.t_q_ref_degc
+    assert largest_step(machine.outcomes) <= 2.0 + 1e-9
+
+
+async def test_back_and_further_back_to_the_configured_one(tmp_path: Path) -> None:
+    machine = Machine(tmp_path)
+    for name, model, expected in (
+        ("adopt", STRONGER, STRONGER), ("adopt", WITH_INPUT, WITH_INPUT), ("back", b"", STRONGER), ("back", b"", QUILL),
+    ):  # fmt: skip
+        asked = machine.at_sample[len(machine.outcomes) + 30] = Asked(
+            machine, name, payload(model) if name == "adopt" else b""
+        )
+        await machine.run(300, adopted(expected, then=2))
+        assert asked.answer["ok"], asked.answer
+        assert machine.store.in_use() == expected
+    asked = machine.at_sample[len(machine.outcomes) + 2] = Asked(machine, "back")
+    await machine.run(60, lambda _: asked.reply is not None and asked.reply.done())
+    assert not asked.answer["ok"] and "none before it" in asked.answer["text"]
+    again = machine.at_sample[len(machine.outcomes) + 2] = Asked(
+        machine, "adopt", json.dumps({"sha256": sha256_of(STRONGER)}).encode()
+    )
+    await machine.run(300, adopted(STRONGER))
+    assert again.answer["ok"]  # by its name in the store
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    check_files(machine)
+
+
+OTHER_PERIOD = QUILL.replace(b"sample_period_s = 60.0", b"sample_period_s = 120.0")
+REFUSED = [
+    (b"not a model", "not a TOML file"),
+    (QUILL, "already"),
+    (OTHER_PERIOD, "the service runs at 60 s"),
+    (QUILL.replace(b"sample_period_s = 60.0", b"sample_period_s = 55.0"), "whole multiple"),
+    (WITH_INPUT.replace(b"coolant_degc", b"oil_degc"), "oil_degc"),
+    (QUILL + b'\n[[effect]]\nkind = "magic"\n', "magic"),
+    (QUILL.replace(b"[0.0002567, 0.01629, 0.008079]", b"[-0.0002567, 0.01629, 0.008079]"), "unstable"),
+]
+
+
+async def test_models_that_cannot_be_run_are_refused_and_nothing_changes(tmp_path: Path) -> None:
+    machine = Machine(tmp_path)
+    asked = [Asked(machine, "adopt", payload(model)) for model, _ in REFUSED]
+    pending = list(asked)
+
+    def one_after_the_other(outcome: Outcome) -> bool:
+        sent = [a for a in asked if a not in pending]
+        if len(machine.outcomes) >= 10 and all(a.reply.done() for a in sent):
+            if not pending:
+                return True
+            pending.pop(0)()
+        return False
+
+    await machine.run(300, one_after_the_other)
+    for one, (_, expected) in zip(asked, REFUSED, strict=True):
+        assert not one.answer["ok"] and expected in one.answer["text"] and "\n" not in one.answer["text"]
+    assert {o.offset.model_sha256 for o in machine.outcomes} == {sha256_of(QUILL)}
+    assert {o.offset.state for o in machine.outcomes} == {"ok"}
+    assert not machine.store.adopted()
+    assert len(recordings(machine.recordings, MACHINE)) == 1
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"{}", b"[]", b"{", b"[" * 100_000, b'{"model": 3}', b'{"sha256": "0"}', b'{"force": "yes"}',
+     b'{"model": "x", "sha256": "y"}', b'{"surprise": 1}', b"x" * 1_000_001, b'{"sha256": "../../etc/passwd"}'],
+)  # fmt: skip
+async def test_payloads_that_are_no_model_are_refused_in_words(tmp_path: Path, data: bytes) -> None:
+    machine = Machine(tmp_path)
+    asked = machine.at_sample[2] = Asked(machine, "adopt", data)
+
+    def answered(_: Outcome) -> bool:
+        return asked.reply is not None and (not isinstance(asked.reply, Future) or asked.reply.done())
+
+    await machine.run(100, answered)
+    assert not asked.answer["ok"] and asked.answer["text"] and "Traceback" not in asked.answer["text"]
+
+
+async def test_a_service_that_ends_meanwhile_still_answers(tmp_path: Path) -> None:
+    machine = Machine(tmp_path)
+    asked = machine.at_sample[20] = Asked(machine, "adopt", payload(STRONGER))
+    await machine.run(20)
+    await machine.run(2)
+    assert isinstance(asked.reply, Future) and asked.reply.done()
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+
+
+async def test_before_the_first_zero_there_is_nothing_to_warm_up(tmp_path: Path) -> None:
+    machine = Machine(tmp_path, config(zero={"rest_rate_um_per_min": 0.2, "at_start": False}))
+    machine.at_sample[5] = Asked(machine, "adopt", payload(STRONGER))
+    await machine.run(100, adopted(STRONGER))
+    assert machine.outcomes[-1].offset.state == "starting"
+    machine.at_sample[len(machine.outcomes) + 1] = lambda: machine.command("zero")
+    await machine.run(5)
+    assert machine.outcomes[-1].offset.state == "ok"
+
+
+def test_the_store_keeps_the_history_and_the_configuration_has_the_last_word(tmp_path: Path) -> None:
+    store = ModelStore(tmp_path / "models", QUILL)
+    assert store.in_use() == QUILL and store.before() is None and not store.adopted()
+    store.adopt(STRONGER, name="stronger", time_utc_ns=1)
+    store.adopt(WITH_INPUT, name="coolant", time_utc_ns=2)
+    store.back(name="stronger", time_utc_ns=3)
+    assert (store.in_use(), store.before()) == (STRONGER, QUILL)
+    history = json.loads((store.folder / "adopted.json").read_bytes())["history"]
+    assert [(h["action"], h["name"]) for h in history] == [
+        ("adopt", "stronger"),
+        ("adopt", "coolant"),
+        ("back", "stronger"),
+    ]
+    assert store.load(sha256_of(WITH_INPUT)) == WITH_INPUT
+    edited = ModelStore(tmp_path / "models", WITH_INPUT)  # somebody has configured another model since
+    assert edited.in_use() == WITH_INPUT and not edited.adopted()
+    (store.folder / f"{sha256_of(STRONGER)}.toml").write_bytes(b"something else")
+    with pytest.raises(ServiceError, match="the file was changed"):
+        store.in_use()
+    (store.folder / "adopted.json").write_bytes(b"{")
+    with pytest.raises(ServiceError, match="remove it to use the configured model"):
+        store.in_use()
