@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from compensator.config import Config
-from compensator.errors import DataError, ServiceError
+from compensator.errors import CompensatorError, DataError, ModelError, ServiceError
 from compensator.messages import Sample
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
@@ -34,19 +34,22 @@ def check_model(config: Config, data: bytes, *, source: str) -> ThermalModel:
 
     Raises
     ------
-    CompensatorError
+    ModelError
         One line that names what is wrong: the file, its dynamics, a channel that it needs, its period.
     """
     model = parse_model(data, source=source)
-    if config.model.alternative:
-        model = model.with_alternative(config.model.alternative)
+    try:
+        if config.model.alternative:
+            model = model.with_alternative(config.model.alternative)
+        Compensation(config, model)
+    except CompensatorError as error:
+        raise ModelError(f"{source}: {error}") from error
     polls = model.period_s / config.sampling.poll_interval_s
     if abs(polls - round(polls)) > 1e-9 or polls < 1:
-        raise ServiceError(
+        raise ModelError(
             f"{source}: sample_period_s = {model.period_s:g}, "
             f"expected a whole multiple of sampling.poll_interval_s = {config.sampling.poll_interval_s:g}"
         )
-    Compensation(config, model)
     return model
 
 

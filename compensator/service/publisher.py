@@ -182,7 +182,7 @@ def ask(settings: Zenoh, command: str, payload: bytes, *, timeout_s: float) -> d
     if not endpoints:
         return None
     config = session_config(msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints))
-    config.insert_json5("connect/timeout_ms", "2000")
+    config.insert_json5("connect/timeout_ms", "0")  # one attempt: a service that runs is there
     config.insert_json5("connect/exit_on_failure", "true")
     key = f"{settings.prefix}/thermal/command/{command}"
     try:
