@@ -103,6 +103,8 @@ class Recomputation:
         #: Names of recordings that events say were removed by the limit of what is kept.
         self.removed: list[str] = []
         self._disk_failed = False
+        #: A sample of which the estimate or the offset is missing: a torn end, or a difference.
+        self._incomplete: Difference | None = None
 
     def group(self, records: list[Record]) -> None:
         """Work one group out again.
@@ -117,6 +119,10 @@ class Recomputation:
         DataError
             If a message is not what its schema says.
         """
+        if self._incomplete is not None:
+            if not (records[0].topic == "seal" and b'"reason":"recovered"' in records[0].body):
+                self._count(self._incomplete)
+            self._incomplete = None
         sample: bytes | None = None
         estimate = offset = b""
         events: list[Event] = []
@@ -135,6 +141,11 @@ class Recomputation:
             self._sample(sample, estimate, offset, events, records)
         elif offset:
             self._held(offset, events, records)
+
+    def finish(self) -> None:
+        """Count what can only be judged at the end."""
+        if self._incomplete is not None:
+            self._count(self._incomplete)
 
     def _act(self, events: list[Event], seq: int) -> None:
         """Do what was asked before this sample; what a full disk held back is in the file's state already."""
@@ -186,6 +197,11 @@ class Recomputation:
             ("offset", offset, expected),
         )
         for topic, recorded, message in pairs:
+            if not recorded:
+                nothing = (Field(name="message", recorded=None, recomputed=msgspec.to_builtins(message)),)
+                self._incomplete = Difference(file=self._file, topic=topic, seq=sample.seq,
+                                              time_utc_ns=sample.time_utc_ns, fields=nothing)  # fmt: skip
+                return
             if encode(message) != recorded:
                 self._differs(topic, sample.seq, sample.time_utc_ns, recorded, encode(message))
                 return

@@ -164,6 +164,8 @@ class _Audit:
         self._classify(error)
         if chained:
             self._check.finish()
+        if self._work is not None:
+            self._work.finish()
         if self._told is not None:
             self._told(self._size - self._position)
         return self._result()

@@ -115,7 +115,7 @@ class ChainCheck:
             Its body.
         """
         if not self.head:
-            self._open(sequence, body)
+            self._open(sequence, time_ns, body)
             if not records:
                 self._next = sequence + 1
                 return
@@ -138,7 +138,8 @@ class ChainCheck:
             f'{{"schema":{SCHEMA},"machine":{self._machine},"time_utc_ns":{time_ns},"before":"{self.head.hex()}",'
             f'"parts":[],"records":[{",".join(entries)}]}}'
         )
-        if whole and number == sequence and body[PAYLOAD:] == expected.encode():
+        whole = whole and number == sequence and body[4:12] == body[12:PAYLOAD]
+        if whole and body[PAYLOAD:] == expected.encode():
             self.head, self._next = value, number + 1
             return
         self._explain(records, value, sequence, time_ns, body)
@@ -163,7 +164,7 @@ class ChainCheck:
 
     # ------------------------------------------------------------------ opening
 
-    def _open(self, sequence: int, body: bytes) -> None:
+    def _open(self, sequence: int, time_ns: int, body: bytes) -> None:
         """Check what the file opens with; name the part that is not what it was."""
         found = {part.name: part.sha256 for part in chain.parts_of(self._contents)}
         try:
@@ -190,6 +191,9 @@ class ChainCheck:
         except ValueError:
             self._findings.add("altered", "a hash that is none", topic="chain", sequence=sequence)
             self.head = chain.opening(self.previous, chain.parts_of(self._contents))
+        if message.time_utc_ns != time_ns or body[4:12] != body[12:PAYLOAD]:
+            self._findings.add("altered", "stands at another time than it says", topic="chain", sequence=sequence,
+                               time_utc_ns=time_ns)  # fmt: skip
         stated_before = self._contents.metadata.get("run", {}).get("previous_chain", "")
         if (stated_before or chain.NOTHING.hex()) != message.before:
             self._findings.add("altered", "names another last value of the file before than the metadata",

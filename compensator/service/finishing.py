@@ -26,7 +26,7 @@ from mcap.writer import CompressionType, Writer
 
 from compensator import __version__, chain
 from compensator.clock import NS
-from compensator.container import PAYLOAD, Container, Damaged, Message
+from compensator.container import PAYLOAD, Container, Damaged, Message, Torn
 from compensator.errors import DataError
 from compensator.messages import encode
 from compensator.recording import end_of_chain, recordings
@@ -233,9 +233,9 @@ def _copy(path: Path, file: BinaryIO, signer: Signer | None, patient: bool) -> t
                     time.sleep(0.0005)
         except Damaged as error:
             # Behind a torn end nothing can be read; what an audit finds damaged must stay as it was found.
-            if error.text != "the file ends inside a record":
+            if not isinstance(error, Torn):
                 raise
-            said = "its torn end was cut off"
+            said = "its torn end was cut off" if error.offset < path.stat().st_size else ""
         if not copied.sealed:
             said = (said or "it had no end") + "; " + copied.recover(signer)
     writer.finish()  # type: ignore[no-untyped-call]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import msgspec
 from mcap.writer import CompressionType, Writer
 
 from compensator import chain
-from compensator.container import PAYLOAD, Attachment, Container, Contents
+from compensator.container import PAYLOAD, Attachment, Container, Contents, Torn
 from compensator.messages import Chain
 
 
@@ -31,10 +32,10 @@ class Line:
 def lines_of(path: Path) -> tuple[list[Line], Contents]:
     with Container(path) as container:
         channels = container.contents.channels
-        lines = [
-            Line(channels[number].topic[1:], sequence, time_ns, body[PAYLOAD:])
-            for number, sequence, time_ns, body in container.messages()
-        ]
+        lines = []
+        with suppress(Torn):
+            for number, sequence, time_ns, body in container.messages():
+                lines.append(Line(channels[number].topic[1:], sequence, time_ns, body[PAYLOAD:]))
         return lines, container.contents
 
 

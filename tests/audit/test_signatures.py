@@ -1,0 +1,148 @@
+"""Signatures: what they add to the chain, and what is said where they are missing or false."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+
+from compensator.audit.series import audit, summary
+from compensator.config import load_config
+from compensator.errors import ConfigError, UsageError
+from compensator.messages import Seal, encode
+from compensator.recording import recordings
+from compensator.service.composition import _signer
+from compensator.signature import Signer, Verifier
+from tests.audit.made import CONFIG, MACHINE, Service
+from tests.audit.tampering import Line, find, lines_of, rewrite, with_new_values
+
+
+def write_key(folder: Path, name: str, number: int) -> tuple[Path, Path]:
+    """A pair of keys that is the same every time."""
+    key = Ed25519PrivateKey.from_private_bytes(bytes([number]) * 32)
+    private, public = folder / f"{name}.pem", folder / f"{name}.pub.pem"
+    private.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    public.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    return private, public
+
+
+@pytest.fixture
+def signed(tmp_path: Path) -> tuple[Path, Path]:
+    """A recording of two hours and a bit, and the public key."""
+    private, public = write_key(tmp_path, "machine", 7)
+    Service(tmp_path / "rec", signer=Signer(private)).run(130).stop()
+    return tmp_path / "rec", public
+
+
+def path_in(folder: Path) -> Path:
+    return recordings(folder, MACHINE)[0]
+
+
+def test_signed_every_hour_and_at_the_end(signed: tuple[Path, Path]) -> None:
+    folder, public = signed
+    found = audit([path_in(folder)], public_key=public)
+    assert found.clean and not found.remarks and found.files[0].signed == 3
+    assert "only a signature" not in summary(found)
+    seals = [msgspec.json.decode(line.data, type=Seal) for line in lines_of(path_in(folder))[0] if line.topic == "seal"]
+    assert [seal.reason for seal in seals] == ["hour", "hour", "stop"]
+
+
+def test_without_the_key_the_signature_is_said_and_not_believed(signed: tuple[Path, Path]) -> None:
+    found = audit([path_in(signed[0])])
+    assert found.clean and "not checked" in found.remarks[0]
+    assert "only a signature" in summary(found)
+
+
+def test_the_key_of_another_machine(signed: tuple[Path, Path], tmp_path: Path) -> None:
+    _, other = write_key(tmp_path, "other", 8)
+    found = audit([path_in(signed[0])], public_key=other)
+    assert [f.kind for f in found.findings] == ["false_signature"] * 3
+
+
+def test_a_recording_that_is_not_signed(tmp_path: Path) -> None:
+    _, public = write_key(tmp_path, "machine", 7)
+    Service(tmp_path / "rec").run(5).stop()
+    found = audit([path_in(tmp_path / "rec")], public_key=public)
+    assert [f.kind for f in found.findings] == ["unsigned"]
+
+
+def forged(lines: list[Line], key: Signer | None) -> list[Line]:
+    """The offset of a sample changed, the chain and the seals made anew with another key or none."""
+    lines = [line for line in lines if not (line.topic == "seal" and b'"hour"' in line.data)]
+    at = find(lines, "offset", 30)
+    lines[at] = lines[at].edited(b'"valid_for_s":150.0', b'"valid_for_s":950.0')
+    seal = msgspec.json.decode(lines[find(lines, "seal", -1)].data, type=Seal)
+    seal = msgspec.structs.replace(seal, public_key="", signature="")
+    lines[find(lines, "seal", -1)] = replace(
+        lines[find(lines, "seal", -1)], data=encode(key.sign(seal) if key else seal)
+    )
+    return lines
+
+
+@pytest.mark.parametrize(("own_key", "kind"), [(True, "false_signature"), (False, "unsigned")])
+def test_who_computes_the_chain_anew_has_no_signature(
+    signed: tuple[Path, Path], tmp_path: Path, own_key: bool, kind: str
+) -> None:
+    folder, public = signed
+    forger = Signer(write_key(tmp_path, "forger", 9)[0]) if own_key else None
+    contents = lines_of(path_in(folder))[1]
+    rewrite(path_in(folder), lambda lines: with_new_values(forged(lines, forger), contents))
+    found = audit([path_in(folder)], public_key=public)
+    assert kind in {f.kind for f in found.findings}
+
+
+def test_what_is_behind_the_last_signature_of_a_live_file_is_said(tmp_path: Path) -> None:
+    private, public = write_key(tmp_path, "machine", 7)
+    service = Service(tmp_path / "rec", signer=Signer(private)).run(70)
+    found = audit([path_in(tmp_path / "rec")], public_key=public)
+    assert found.clean and f"{9 * 3} record(s) behind the last signature" in " ".join(found.remarks)
+    service.kill()
+
+
+def test_a_recovered_end_is_signed(tmp_path: Path) -> None:
+    private, public = write_key(tmp_path, "machine", 7)
+    Service(tmp_path / "rec", signer=Signer(private)).run(5).kill()
+    Service(tmp_path / "rec", signer=Signer(private), seq=5).run(5).stop()
+    found = audit(recordings(tmp_path / "rec", MACHINE), public_key=public)
+    assert found.clean and [file.end for file in found.files] == ["recovered", "finished"], summary(found)
+
+
+# ------------------------------------------------------------------ keys
+
+
+def test_a_key_among_the_recordings_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "rec").mkdir()
+    private, _ = write_key(tmp_path / "rec", "machine", 7)
+    for name, reason in ((private.name, "expected a key"), (f"rec/{private.name}", "among the recordings")):
+        config = tmp_path / "machine.toml"
+        config.write_bytes(
+            CONFIG.replace(b"recording.folder", f'recording.signing_key = "{name}"\nrecording.folder'.encode())
+        )
+        with pytest.raises(ConfigError, match=reason):
+            _signer(load_config(config))
+    private.rename(tmp_path / private.name)
+    config.write_bytes(CONFIG.replace(b"recording.folder", b'recording.signing_key = "machine.pem"\nrecording.folder'))
+    assert _signer(load_config(config)) is not None
+
+
+def test_what_is_no_key_is_said(tmp_path: Path) -> None:
+    private, public = write_key(tmp_path, "machine", 7)
+    wrong = tmp_path / "x25519.pem"
+    key = X25519PrivateKey.from_private_bytes(b"1" * 32)
+    wrong.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    with pytest.raises(ConfigError, match="expected an Ed25519 key"):
+        Signer(wrong)
+    with pytest.raises(ConfigError, match="no PEM private key"):
+        Signer(public)
+    with pytest.raises(UsageError, match="no PEM public key"):
+        Verifier(private)
+    with pytest.raises(UsageError, match="expected a key"):
+        Verifier(tmp_path / "none.pem")
+    wrong.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    with pytest.raises(UsageError, match="expected an Ed25519 public key"):
+        Verifier(wrong)

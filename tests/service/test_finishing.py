@@ -1,0 +1,229 @@
+"""Finished recordings: compact, indexed, checked, kept as long as wanted; until then the live file stays."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+
+from compensator.audit.series import audit
+from compensator.errors import DataError
+from compensator.recording import end_of_chain, read_messages, recordings
+from compensator.service import finishing
+from compensator.service.finishing import Finisher, Retention, compact
+from tests.audit.made import MACHINE, MINUTE_NS, Service
+from tests.audit.tampering import lines_of, rewrite
+from tests.service.simulated import START_NS
+
+DAY_NS = 1440 * MINUTE_NS
+
+
+def live(folder: Path, samples: int = 20) -> Path:
+    """A recording as a kill leaves it."""
+    service = Service(folder).run(samples)
+    service.kill()
+    assert service.recorder.path is not None
+    return service.recorder.path
+
+
+def test_a_finished_file_has_chunks_an_index_and_crcs(tmp_path: Path) -> None:
+    Service(tmp_path).run(50).stop()
+    (path,) = recordings(tmp_path, MACHINE)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert len(summary.chunk_indexes) == summary.statistics.chunk_count == 1
+        assert summary.chunk_indexes[0].compression == "zstd"
+        assert {channel.topic for channel in summary.channels.values()} == {
+            "/sample", "/estimate", "/offset", "/event", "/seal", "/chain",
+        }  # fmt: skip
+        assert len(summary.schemas) == 6 and len(summary.metadata_indexes) == 1
+        assert [a.name for a in reader.iter_attachments()] == ["config.toml", "model.toml", "state.json"]
+        sought = [(channel.topic, message.data) for _, channel, message in reader.iter_messages()]
+        start = START_NS + 10 * MINUTE_NS
+        some = list(reader.iter_messages("/offset", starting_at=start, ending_before=start + 5 * MINUTE_NS))
+    assert len(some) == 5
+    with path.open("rb") as file:
+        walked = NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
+        assert [(channel.topic, message.data) for _, channel, message in walked] == sought
+    assert summary.statistics.message_count == len(sought)
+
+
+def test_the_compact_file_says_what_the_live_one_said(tmp_path: Path) -> None:
+    path = live(tmp_path)
+    before, size, end = list(read_messages(path)), path.stat().st_size, end_of_chain(path)
+    assert end is not None and not end.chunked and not end.whole
+    said = compact(path)
+    assert "it had no end; 0 whole record(s)" in said
+    after, new = list(read_messages(path)), end_of_chain(path)
+    assert after[: len(before)] == before and [m.topic for m in after[len(before) :]] == ["seal", "chain"]
+    assert new is not None and new.value == end.value and new.chunked and new.whole and new.sealed == "recovered"
+    assert path.stat().st_size < 0.6 * size
+    assert not list(tmp_path.glob("*.part"))
+    assert compact(path) == "" and list(read_messages(path)) == after
+
+
+def test_every_whole_record_of_a_torn_end_is_kept(tmp_path: Path) -> None:
+    path = live(tmp_path, 8)
+    data = path.read_bytes()
+    for cut in range(data.index(b'"seq":7,') - 60, len(data), 37):
+        path.write_bytes(data[:cut])
+        before, end = [m for m in read_messages(path) if m.topic != "chain"], end_of_chain(path)
+        compact(path)
+        after = [m for m in read_messages(path) if m.topic != "chain"]
+        assert after[:-1] == before and after[-1].topic == "seal"
+        new = end_of_chain(path)
+        assert end is not None and new is not None and new.value == end.value
+        assert audit([path]).clean
+
+
+@pytest.mark.parametrize("what", ["write", "read back", "kill"])
+def test_whatever_happens_meanwhile_the_live_file_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    path = live(tmp_path)
+    data = path.read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    def killed(*_: object) -> None:
+        raise SystemExit
+
+    if what == "write":
+        monkeypatch.setattr(finishing.os, "fsync", full)
+    elif what == "read back":
+        monkeypatch.setattr(finishing, "_digest", lambda *_: "another")
+    else:
+        monkeypatch.setattr(finishing, "_digest", killed)
+    with pytest.raises((OSError, DataError, SystemExit)):
+        compact(path)
+    assert path.read_bytes() == data and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_kill_leaves_of_a_copy_is_written_anew(tmp_path: Path) -> None:
+    path = live(tmp_path)
+    part = path.with_suffix(".mcap.part")
+    part.write_bytes(b"half a copy")
+    assert recordings(tmp_path, MACHINE) == [path]
+    compact(path)
+    assert not part.exists() and audit([path]).clean
+
+
+def test_a_failure_is_said_and_the_recording_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finishing, "_digest", lambda *_: "another")
+    service = Service(tmp_path).run(5)
+    service.recorder.start_new()
+    service.run(5).stop()
+    remarks = service.recorder.remarks()
+    assert len(remarks) == 2 and "could not be made compact and stays as it is" in remarks[0][0]
+    found = audit(recordings(tmp_path, MACHINE))
+    assert found.clean and found.samples == 10
+
+
+def test_a_file_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    service = Service(tmp_path).run(5)
+    path = service.recorder.path
+    assert path is not None
+    data = path.read_bytes()
+    assert compact(path) == "" and path.read_bytes() == data
+    service.run(5).stop()
+    assert audit([path]).samples == 10
+
+
+def test_older_and_damaged_files_are_left_alone(tmp_path: Path) -> None:
+    path = live(tmp_path)
+    data = bytearray(path.read_bytes())
+    data[data.index(b'{"schema":1,"machine":"vmc-07","seq":5,') - 27] = 0xFF  # a length beyond all bounds
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="a record of"):
+        compact(path)
+    assert path.read_bytes() == data
+    other = live(tmp_path / "older")
+    rewrite(other, lambda lines: [line for line in lines if line.topic not in ("chain", "seal")], chunked=False)
+    data = bytearray(other.read_bytes())
+    assert compact(other) == "" and other.read_bytes() == data
+
+
+def test_samples_do_not_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(*_: object, **__: object) -> str:
+        begun.set()
+        assert go_on.wait(10.0)
+        return ""
+
+    monkeypatch.setattr(finishing, "compact", slow)
+    service = Service(tmp_path).run(5)
+    service.recorder.start_new()
+    assert begun.wait(10.0)
+    service.run(5)  # on disk while the file before is still being worked on
+    assert [len(lines_of_live(path)) for path in recordings(tmp_path, MACHINE)] == [5, 5]
+    go_on.set()
+    service.stop()
+    assert not [thread for thread in threading.enumerate() if thread.name == "finish recordings"]
+
+
+def lines_of_live(path: Path) -> list[bytes]:
+    return [record.data for record in read_messages(path, ("sample",))]
+
+
+# ------------------------------------------------------------------ retention
+
+
+def days(folder: Path, count: int, **keep: float) -> Service:
+    """A recording a day."""
+    service = Service(folder, retention=Retention(**keep))
+    for day in range(count):
+        service.start_ns = START_NS + day * DAY_NS - service.seq * MINUTE_NS
+        service.run(5)
+        service.recorder._finisher.wait()
+    return service
+
+
+def test_without_a_limit_everything_is_kept(tmp_path: Path) -> None:
+    days(tmp_path, 5).stop()
+    assert len(recordings(tmp_path, MACHINE)) == 5
+
+
+def test_old_files_are_removed_and_the_audit_says_where_it_begins(tmp_path: Path) -> None:
+    service = days(tmp_path, 6, keep_days=2.5)
+    remarks = service.recorder.remarks()
+    assert [remark[1]["removed"][0][:15] for remark in remarks] == ["vmc-07_20260105", "vmc-07_20260106"]
+    for text, data in remarks:
+        service.note("recording", text, data)
+    service.run(1).kill()
+    names = [path.name[7:15] for path in recordings(tmp_path, MACHINE)]
+    assert names == ["20260107", "20260108", "20260109", "20260110"]
+    found = audit(recordings(tmp_path, MACHINE))
+    assert found.clean
+    assert "begins after vmc-07_20260106T060000Z.mcap, which the limit of what is kept removed" in " ".join(
+        found.remarks
+    )
+
+
+def test_the_size_of_all_files_is_limited_and_the_newest_stay(tmp_path: Path) -> None:
+    service = days(tmp_path, 6, keep_mb=0.05)
+    service.stop()
+    left = recordings(tmp_path, MACHINE)
+    assert 2 <= len(left) < 6 and left[-1] == service.recorder.path
+    tiny = days(tmp_path / "tiny", 5, keep_mb=0.000001)
+    tiny.stop()
+    assert len(recordings(tmp_path / "tiny", MACHINE)) == 2  # the newest and the one before it: a restart needs them
+
+
+def test_files_of_others_are_not_touched(tmp_path: Path) -> None:
+    tmp_path.mkdir(exist_ok=True)
+    others = [tmp_path / "notes.txt", tmp_path / "vmc-08_20200101T000000Z.mcap"]
+    for path in others:
+        path.write_bytes(b"not ours")
+    finisher = Finisher(tmp_path, MACHINE, Retention(keep_days=1.0), None)
+    service = days(tmp_path, 4, keep_days=1.0)
+    finisher.put(others[1], service.now_ns)
+    finisher.wait()
+    service.stop()
+    assert all(path.read_bytes() == b"not ours" for path in others)
+    assert lines_of(recordings(tmp_path, MACHINE)[-1])[0]
