@@ -211,14 +211,14 @@ class _Audit:
         return "/chain" in {channel.topic for channel in self._contents.channels.values()}
 
     def _again(self, records: list[Record]) -> None:
-        if self._work is None or not records:
+        if self._work is None or self._why_not or not records:
             return
         try:
             self._work.group(records)
         except DataError as error:
             self._findings.add("unreadable", str(error).removeprefix(f"{self._name}: "))
             # Without this message all that follows would come out differently.
-            self._why_not, self._work = f"not worked out from here on: {error}", None
+            self._why_not = f"not worked out from here on: {error}"
 
     def _tell(self) -> None:
         if self._told is not None:

@@ -208,7 +208,7 @@ class _Judge:
                     "reordered", file, f"its name is that of another file: it was begun as {file.machine}_{stamp}"
                 )
         if file.not_worked_out:
-            self.remarks.append(f"{file.file}: samples not worked out again: {file.not_worked_out}")
+            self.remarks.append(f"{file.file}: not all samples were worked out again: {file.not_worked_out}")
         if not file.last and file.end in ("open", "torn"):
             self.remarks.append(f"{file.file}: torn before anything was recorded")
             return

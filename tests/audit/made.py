@@ -99,7 +99,6 @@ class Service:
         self.seq, self.start_ns = seq, start_ns
         self.events: list[Event] = []
         self.commands: list[tuple[str, dict[str, Any]]] = []
-        self.published: list[bytes] = []
         self._failing = False
         self.note("start", "compensator test")
 
@@ -150,7 +149,6 @@ class Service:
         if self._failing:
             offset = msgspec.structs.replace(offset, state="degraded" if offset.state == "ok" else offset.state,
                                              reasons=[*offset.reasons, "recording_failed"])  # fmt: skip
-        self.published.append(encode(offset))
         records = [
             ("sample", encode(outcome.sample)),
             ("estimate", encode(outcome.estimate)),

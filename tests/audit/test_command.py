@@ -1,0 +1,91 @@
+"""`compensator replay` as an auditor calls it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from compensator.cli import main
+from compensator.recording import recordings
+from tests.audit.made import MACHINE, Service
+from tests.audit.tampering import find, lines_of, rewrite
+
+
+@pytest.fixture
+def rec(tmp_path: Path) -> Path:
+    Service(tmp_path / "rec").run(30).stop()
+    return recordings(tmp_path / "rec", MACHINE)[0]
+
+
+def tampered(path: Path) -> None:
+    at = find(lines_of(path)[0], "offset", 20)
+    edited = lines_of(path)[0][at].edited(b'"valid_for_s":150.0', b'"valid_for_s":950.0')
+    rewrite(path, lambda lines: [*lines[:at], edited, *lines[at + 1 :]])
+
+
+def test_a_clean_recording_is_stated_shortly(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(rec)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("30 samples of vmc-07 in 1 file(s), 2026-01-05T06:00:00Z to 2026-01-05T06:29:00Z")
+    assert lines[1] == "Every estimate and every offset comes out again, bit for bit."
+    assert lines[2].startswith("The hash chain holds over 94 records") and len(lines) == 4
+
+
+def test_a_difference_is_exit_code_3_and_named_field_by_field(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tampered(rec)
+    assert main(["replay", str(rec)]) == 3
+    out = capsys.readouterr().out
+    assert "/offset of sample 20, 2026-01-05T06:20:00Z, comes out differently:" in out
+    assert "  valid_for_s: recorded 950.0, recomputed 150.0" in out
+    assert f"{rec.name}: altered: /offset record" in out and "comes out again, bit for bit" not in out
+
+
+def test_the_result_as_json(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", "--json", str(rec.parent)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["clean"], found["samples"], found["files"][0]["end"]) == (True, 30, "finished")
+    tampered(rec)
+    assert main(["replay", "--json", str(rec)]) == 3
+    found = json.loads(capsys.readouterr().out)
+    assert found["findings"][0]["kind"] == "altered" and found["findings"][0]["topic"] == "offset"
+    assert found["difference"]["fields"] == [{"field": "valid_for_s", "recorded": 950.0, "recomputed": 150.0}]
+    assert main(["replay", "--json", str(rec), "--model", "quill"]) == 0
+    assert json.loads(capsys.readouterr().out)["offset_difference_um"]["samples"] == 30
+
+
+def test_what_cannot_be_read_is_one_line_and_exit_code_2(
+    rec: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text, random = tmp_path / "day.csv", tmp_path / "random.mcap"
+    text.write_text("t_s,t_q_degc\n0,20\n")
+    random.write_bytes(bytes(range(256)) * 50)
+    no_config = tmp_path / "no-config.mcap"
+    no_config.write_bytes(rec.read_bytes())
+    rewrite(no_config, lambda lines: [line for line in lines if line.topic not in ("chain", "seal")],
+            contents=lambda contents: contents.attachments.pop("config.toml") and None)  # type: ignore[func-returns-value]  # fmt: skip
+    (tmp_path / "empty").mkdir()
+    for arguments, expected in (
+        ([str(text)], "day.csv: not an MCAP file"),
+        ([str(random)], "random.mcap: not an MCAP file"),
+        ([str(tmp_path / "none.mcap")], "none.mcap: No such file or directory; expected a recording"),
+        ([str(tmp_path / "empty")], "empty: no recordings in it"),
+        ([str(rec), "--out", "x.csv"], "--out: is for --model"),
+        ([str(rec), "--public-key", str(text)], "day.csv: no PEM public key"),
+        ([str(rec), "--public-key", str(text), "--model", "quill"], "--public-key: belongs to the audit"),
+        ([str(rec), "--model", str(tmp_path / "none.toml")], "none.toml"),
+        ([str(no_config), "--model", "quill"], "attachment config.toml is missing"),
+    ):
+        assert main(["replay", *arguments]) == 2, arguments
+        said = capsys.readouterr()
+        assert not said.out and said.err.count("\n") == 1 and expected in said.err
+
+
+def test_an_intact_recording_that_says_nonsense_is_named(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    at = find(lines_of(rec)[0], "sample", 20)
+    broken = lines_of(rec)[0][at].edited(b'"mean":', b'"mean":"x",')
+    rewrite(rec, lambda lines: [*lines[:at], broken, *lines[at + 1 :]])
+    assert main(["replay", str(rec)]) == 3
+    out = capsys.readouterr().out
+    assert "unreadable: /sample record" in out and "20 samples" in out
