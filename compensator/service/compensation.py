@@ -269,6 +269,11 @@ class Compensation:
         else:
             self._memory.estimate = self._engine.skip(samples)
 
+    def pause_of_unknown_length(self) -> None:
+        """Pass over a pause whose length nobody knows, as over one that is too long to be bridged."""
+        longest = max(KNOWN_AFTER * self.slowest_min, self.bridge_max_min)
+        self.pause(math.floor(longest / self._period_min) + 1)
+
     def _pass_cold(self, samples: int) -> None:
         self._memory.estimate = self._engine.skip(samples, held=True)
         self._memory.cold_min = KNOWN_AFTER * self.slowest_min

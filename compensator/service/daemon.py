@@ -293,17 +293,20 @@ class Daemon:
         period_s = self._compensation.model.period_s
         missing, bridged = samples_between(last_ns, label_ns, period_s), self._compensation.bridge_max_min
         minutes = missing * period_s / 60.0
-        self._compensation.pause(missing)
+        data: dict[str, Any] = {"missing": missing, "minutes": minutes, "bridged": minutes <= bridged}
         text = f"{missing} sample(s) are missing between the last recording and now; "
         if label_ns <= last_ns:
             text = (
-                "the wall clock stands before the end of the last recording; how long the service was away is unknown"
+                "the wall clock stands before the end of the last recording: how long the service was away is unknown"
             )
-        elif minutes > bridged:
-            text += f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
+            data = {"missing": None, "minutes": None, "bridged": False}
+            self._compensation.pause_of_unknown_length()
         else:
-            text += f"{minutes:.0f} min are bridged"
-        data = {"missing": missing, "minutes": minutes, "bridged": minutes <= bridged}
+            self._compensation.pause(missing)
+            text += (
+                f"{minutes:.0f} min are bridged" if minutes <= bridged
+                else f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
+            )  # fmt: skip
         self._note("restart", text, data | {"y_std_um": self._compensation.std_um})
 
     def _record(self, records: list[tuple[str, bytes]], time_utc_ns: int, state: bytes | None = None) -> bool:

@@ -14,11 +14,11 @@ from typing import Any
 
 from compensator.config import Config, LoadedConfig
 from compensator.errors import CompensatorError, DataError
-from compensator.messages import Offset, number
+from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording import recordings
 from compensator.service.compensation import Compensation
-from compensator.service.retrace import Step, opening_of, replayed, steps_of, warm_up
+from compensator.service.retrace import opening_of, replayed, steps_of, warm_up
 from compensator.service.state import CompensationState, decode_state
 
 
@@ -44,33 +44,26 @@ class Resumed:
 
 @dataclass(slots=True)
 class _Last:
-    """The last file with a sample or a state."""
+    """The last file with a sample or a state, and what stands at its end."""
 
     path: Path
     opening: dict[str, bytes]
     state: CompensationState | None
-    steps: list[Step]
+    samples: int = 0
+    #: What was published last, µm; a control that never got an offset applies none.
+    offset_um: float = 0.0
+    operator_hold: bool = False
 
-    @property
-    def offset(self) -> Offset | None:
-        """The last offset on disk that is a number."""
-        known = [s.offset for s in self.steps if s.offset is not None and not math.isnan(number(s.offset.y_offset_um))]
-        return known[-1] if known else None
-
-    @property
-    def offset_um(self) -> float:
-        """What was published last, µm."""
-        if self.offset is not None:
-            return number(self.offset.y_offset_um)
-        return self.state.offset_um if self.state is not None else 0.0
-
-    @property
-    def operator_hold(self) -> bool:
-        """Whether an operator has frozen the offset."""
-        held = self.state is not None and self.state.memory.operator_hold
-        for name in (name for step in self.steps for name, _ in step.commands):
-            held = name == "hold" or (held and name != "resume")
-        return held
+    def read(self) -> None:
+        """Read the file through; what it holds of a day at one sample a second is too much to be kept."""
+        if self.state is not None:
+            self.offset_um, self.operator_hold = self.state.offset_um, self.state.memory.operator_hold
+        for step in steps_of(self.path):
+            self.samples += 1
+            if step.offset is not None and not math.isnan(number(step.offset.y_offset_um)):
+                self.offset_um = number(step.offset.y_offset_um)
+            for name, _ in step.commands:
+                self.operator_hold = name == "hold" or (self.operator_hold and name != "resume")
 
 
 def resume(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
@@ -109,20 +102,24 @@ def resume(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
 def _last(folder: Path, machine: str, resumed: Resumed) -> _Last | None:
     for path in reversed(recordings(folder, machine)):
         try:
-            opening = opening_of(path)
-            steps = list(steps_of(path))
+            last = _Last(path, opening_of(path), None)
+            if "state.json" in last.opening:
+                last.state = _state(last, resumed)
+            last.read()
         except CompensatorError as error:
             resumed.note(f"a recording cannot be used: {error}")
             continue
-        state = None
-        if "state.json" in opening:
-            try:
-                state = decode_state(opening["state.json"])
-            except DataError as error:
-                resumed.note(f"{path.name}: {error}")
-        if state is not None or steps:
-            return _Last(path, opening, state, steps)
+        if last.state is not None or last.samples:
+            return last
     return None
+
+
+def _state(last: _Last, resumed: Resumed) -> CompensationState | None:
+    try:
+        return decode_state(last.opening["state.json"])
+    except DataError as error:
+        resumed.note(f"{last.path.name}: {error}")
+        return None
 
 
 def _changes(last: _Last, loaded: LoadedConfig, model: ThermalModel) -> list[str]:
@@ -141,7 +138,7 @@ def _restore(resumed: Resumed, last: _Last, config: Config) -> None:
     compensation = Compensation(config, resumed.compensation.model)
     compensation.restore(last.opening["state.json"])
     outcome, differing = None, 0
-    for step in last.steps:
+    for step in steps_of(last.path):
         outcome = replayed(compensation, step)
         if step.offset is not None:
             # The daemon adds to the reasons when the disk fails; the numbers are the compensation's alone.
@@ -158,8 +155,8 @@ def _restore(resumed: Resumed, last: _Last, config: Config) -> None:
     seq, _ = compensation.last
     resumed.compensation = compensation
     resumed.note(
-        f"goes on from {last.path.name}: {len(last.steps)} sample(s) run again, the last one {seq}",
-        file=last.path.name, samples=len(last.steps), last_seq=seq, offset_um=compensation.offset_um,
+        f"goes on from {last.path.name}: {last.samples} sample(s) run again, the last one {seq}",
+        file=last.path.name, samples=last.samples, last_seq=seq, offset_um=compensation.offset_um,
     )  # fmt: skip
 
 

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from compensator.config import LoadedConfig
 from compensator.messages import number
-from compensator.model.model_file import read_model_bytes
-from compensator.recording import recordings
+from compensator.model.model_file import load_model, read_model_bytes
+from compensator.recording import decode, read_messages, recordings
 from compensator.service.recorder import Recorder
+from compensator.service.restart import resume
 from drivers.reading import Quality, Reading
 from tests.service.living import MACHINE, Machine, check_files, largest_step
 from tests.service.simulated import config
@@ -101,6 +103,19 @@ async def test_a_weekend_away_finds_the_machine_as_it_is(tmp_path: Path) -> None
     assert max(residuals) < 3.0 * max(number(o.offset.y_offset_std_um) for o in after)
 
 
+async def test_a_clock_that_stands_before_the_recording_tells_no_gap(tmp_path: Path) -> None:
+    """The battery of the host's clock is empty: how long it was off, nobody knows."""
+    machine = Machine(tmp_path)
+    await machine.run_and_kill(200)
+    machine.clock.set_wall_clock(-7 * 24 * 3600.0)
+    await machine.run(20)
+    after = machine.outcomes[200:]
+    assert all("cold_start" in o.offset.reasons for o in after)
+    assert [o.offset.seq for o in after] == list(range(machine.outcomes[199].offset.seq + 1, after[-1].offset.seq + 1))
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    assert any("wall clock stands before" in event.text for event in machine.events("restart"))
+
+
 async def test_an_operator_hold_and_the_guards_survive_a_kill(tmp_path: Path) -> None:
     machine = Machine(tmp_path)
     machine.at_sample[100] = lambda: machine.command("hold")
@@ -185,6 +200,23 @@ async def test_recordings_without_a_state_and_files_that_are_none(
     after = machine.outcomes[300:]
     assert [o.estimate.y_pred_um for o in after] == [whole[o.offset.time_utc_ns].estimate.y_pred_um for o in after]
     assert any("carries no state that can be used" in event.text for event in machine.events("restart"))
+
+
+async def test_cut_anywhere_every_whole_record_counts(tmp_path: Path) -> None:
+    """A power cut may end the file at any byte: what is whole is used, and the service starts."""
+    machine = Machine(tmp_path)
+    await machine.run_and_kill(40)
+    path = recordings(machine.recordings, MACHINE)[-1]
+    data = path.read_bytes()
+    loaded = LoadedConfig(config=machine.config, path=tmp_path / "machine.toml", data=machine.config_bytes, sha256="")
+    model = load_model("quill")
+    for cut in [*np.random.default_rng(5).integers(0, len(data), 60).tolist(), 0, 5, len(data) - 1]:
+        path.write_bytes(data[:cut])
+        samples = [decode(r, path) for r in read_messages(path, ("sample",))]
+        offsets = [decode(r, path) for r in read_messages(path, ("offset",))]
+        compensation = resume(loaded, model).compensation
+        assert compensation.last[0] == (samples[-1].seq if samples else -1)  # type: ignore[attr-defined]
+        assert compensation.offset_um == (number(offsets[-1].y_offset_um) if offsets else 0.0)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("state", [b"{}", b"not JSON", b'{"schema": 99}'])
