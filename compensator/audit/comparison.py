@@ -185,7 +185,7 @@ def compare(
 
 
 def _in_order(paths: Sequence[Path]) -> list[Path]:
-    began: dict[Path, tuple[int, str]] = {}
+    began: dict[Path, str] = {}
     machines = set()
     for path in dict.fromkeys(paths):
         with Container(path) as container:
@@ -193,8 +193,7 @@ def _in_order(paths: Sequence[Path]) -> list[Path]:
                 break
             run = container.contents.metadata.get("run", {})
         machines.add(run.get("machine", ""))
-        stamp = run.get("started_utc_ns", "")
-        began[path] = (int(stamp) if stamp.isascii() and stamp.isdigit() else 0, path.name)
+        began[path] = run.get("file", path.name).removesuffix(".mcap")
     if len(machines) > 1:
         raise DataError(f"recordings of {', '.join(sorted(machines))}; expected those of one machine")
     return sorted(began, key=began.__getitem__)

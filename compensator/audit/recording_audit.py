@@ -34,8 +34,8 @@ class RecordingAudit:
     ----------
     file : str
         Name.
-    machine, began, previous_file : str
-        As its metadata say.
+    original, machine, began, previous_file : str
+        As its metadata say: the name that it was begun with, the machine, why it began, the file before.
     previous, last : str
         Value of the hash chain that it goes on from, and the one it hands on; empty where it has no chain.
     end : str
@@ -68,8 +68,6 @@ class RecordingAudit:
         Why its samples could not be worked out again; empty where they were.
     model : str
         SHA-256 of the model.
-    started_ns : int
-        When the file was begun.
     removed : tuple of str
         Recordings that its events say were removed by the limit of what is kept.
     size : int
@@ -77,6 +75,7 @@ class RecordingAudit:
     """
 
     file: str
+    original: str = ""
     machine: str = ""
     began: str = ""
     previous_file: str = ""
@@ -104,7 +103,6 @@ class RecordingAudit:
     state_after: str = ""
     not_worked_out: str = ""
     model: str = ""
-    started_ns: int = 0
     removed: tuple[str, ...] = ()
     size: int = 0
 
@@ -278,8 +276,8 @@ class _Audit:
             part = contents.attachments.get(name)
             identity.update(hashlib.sha256(part.data if part else b"").digest())
         return RecordingAudit(
-            file=self._name, machine=run.get("machine", ""), began=run.get("began", ""),
-            previous_file=run.get("previous_file", ""), previous=check.previous.hex() if check.head else "",
+            file=self._name, original=run.get("file", self._name), machine=run.get("machine", ""),
+            began=run.get("began", ""), previous_file=run.get("previous_file", ""), previous=check.previous.hex() if check.head else "",
             last=check.handed_on.hex(), end=self._end, records=check.records,
             samples=work.samples if work else 0, skipped=work.skipped if work else 0,
             first_seq=work.first_seq if work else -1, last_seq=work.last_seq if work else -1,
@@ -292,13 +290,9 @@ class _Audit:
             state_before=hashlib.sha256(state.data).hexdigest() if state else "",
             state_after=hashlib.sha256(work.compensation.state()).hexdigest() if work else "",
             not_worked_out=self._why_not, model=work.compensation.model.sha256 if work else "",
-            started_ns=_whole(run.get("started_utc_ns", "")), removed=tuple(work.removed) if work else (),
+            removed=tuple(work.removed) if work else (),
             size=self._size,
         )  # fmt: skip
-
-
-def _whole(text: str) -> int:
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else 0
 
 
 def recorded_groups(container: Container) -> Iterator[list[Record]]:

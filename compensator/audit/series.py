@@ -8,7 +8,6 @@ import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from compensator.signature import Verifier
 #: Less than so many bytes are audited in this process; starting others takes as long.
 ALONE = 8_000_000
 
-_NAME = re.compile(r"^(?P<machine>.+)_(?P<stamp>\d{8}T\d{6}Z)(-\d{3})?\.mcap$")
+_NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,7 +159,8 @@ def judge(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
     signed : bool
         Whether seals were checked against a key.
     """
-    files = sorted(map(_named, audits), key=lambda f: (f.machine, f.started_ns, f.file))
+    # By the names that they were begun with: these tell the order, also where the clock was set back.
+    files = sorted(map(_named, audits), key=lambda f: (f.machine, f.original.removesuffix(".mcap")))
     judged = _Judge(files, signed)
     for before, after in zip([None, *files[:-1]], files, strict=True):
         judged.file(after)
@@ -173,22 +173,16 @@ def judge(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
 
 
 def _named(file: RecordingAudit) -> RecordingAudit:
-    """Return the file with machine and time of its name where nothing is left of them in it."""
+    """Return the file with the machine of its name where nothing is left of it in it."""
     name = _NAME.match(file.file)
-    if name is None or file.machine:
-        return file
-    try:
-        began = datetime.strptime(name["stamp"], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
-    except ValueError:
-        return file
-    return replace(file, machine=name["machine"], started_ns=int(began.timestamp()) * 10**9)
+    return file if name is None or file.machine else replace(file, machine=name["machine"])
 
 
 class _Judge:
     """Looks at files one after the other, and at what joins them."""
 
     def __init__(self, files: Sequence[RecordingAudit], signed: bool) -> None:
-        self._names = {file.file: file for file in files}
+        self._names = {file.original: file for file in files}
         self._removed = {name for file in files for name in file.removed}
         self._newest = {file.machine: file.file for file in files}
         self._signed = signed
@@ -200,13 +194,8 @@ class _Judge:
 
     def file(self, file: RecordingAudit) -> None:
         """Look at one file by itself."""
-        name = _NAME.match(file.file)
-        if name is not None and file.machine:
-            stamp = datetime.fromtimestamp(file.started_ns // 10**9, UTC).strftime("%Y%m%dT%H%M%SZ")
-            if (name["machine"], name["stamp"]) != (file.machine, stamp):
-                self._find(
-                    "reordered", file, f"its name is that of another file: it was begun as {file.machine}_{stamp}"
-                )
+        if file.original != file.file and _NAME.match(file.file):
+            self._find("reordered", file, f"its name is that of another file: it was begun as {file.original}")
         if file.not_worked_out:
             self.remarks.append(f"{file.file}: not all samples were worked out again: {file.not_worked_out}")
         if not file.last and file.end in ("open", "torn"):
@@ -265,7 +254,7 @@ class _Judge:
             lost = "removed by the limit of what is kept" if after.previous_file in self._removed else "missing"
             self._find("missing_file", after, f"{after.previous_file}, which it goes on from, is {lost}; "
                        f"it stood behind {before.file}")  # fmt: skip
-        elif named.file != before.file:
+        elif named.original != before.original:
             self._find("reordered", after, f"goes on from {named.file}, and {before.file} stands between")
         elif before.end == "damaged":
             return

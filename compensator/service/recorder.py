@@ -150,8 +150,10 @@ class Recorder:
         if previous and not before:
             end = end_of_chain(previous[-1])
             before = end.value if end else b""
+        self.path, descriptor = self._create(time_utc_ns, previous[-1] if previous else None)
         metadata = {
             "machine": self._machine,
+            "file": self.path.name,
             "compensator": __version__,
             "mcap": mcap.__version__,
             "python": platform.python_version(),
@@ -164,7 +166,6 @@ class Recorder:
                        for name, data in self.attachments.items()]  # fmt: skip
         if state:
             attachments.append(_attached("state.json", "application/json", state, time_utc_ns))
-        self.path, descriptor = self._create(time_utc_ns)
         live = self._live = _Live(self.path, descriptor, self._machine, before or chain.NOTHING, time_utc_ns)
         live.begin(metadata, attachments)
         live.sync()
@@ -179,12 +180,18 @@ class Recorder:
             for path in previous if self._reason == "start" else previous[-1:]:
                 self._finisher.put(path, time_utc_ns)
 
-    def _create(self, time_utc_ns: int) -> tuple[Path, int]:
+    def _create(self, time_utc_ns: int, newest: Path | None) -> tuple[Path, int]:
         """Create a file that did not exist, named by machine and UTC time."""
         stamp = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
-        for number in range(1000):
-            suffix = f"-{number:03d}" if number else ""
-            path = self._folder / f"{self._machine}_{stamp}{suffix}.mcap"
+        number = 0
+        if newest is not None:
+            # Names tell in which order files were begun, also where the clock was set back between them.
+            last, _, suffix = newest.stem.removeprefix(f"{self._machine}_").partition("-")
+            if last >= stamp:
+                stamp, number = last, int(suffix or 0) + 1
+        for count in range(number, number + 1000):
+            ending = f"-{count:03d}" if count else ""
+            path = self._folder / f"{self._machine}_{stamp}{ending}.mcap"
             try:
                 descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
             except FileExistsError:

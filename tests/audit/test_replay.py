@@ -228,6 +228,20 @@ def test_an_error_of_the_services_own(tmp_path: Path) -> None:
     assert found.clean and found.samples == 40, summary(found)
 
 
+def test_a_clock_that_was_set_back_does_not_mix_up_the_files(tmp_path: Path) -> None:
+    service = Service(tmp_path).run(20)
+    service.stop()
+    state, before = service.compensation.state(), START_NS - 120 * MINUTE_NS
+    for start_ns, seq in ((before, 20), (before, 30), (START_NS + 600 * MINUTE_NS, 40)):
+        service = Service(tmp_path, seq=seq, start_ns=start_ns, state=state).run(10)
+        service.stop()
+        state = service.compensation.state()
+    found = look(tmp_path)
+    assert found.clean and not found.remarks, summary(found)
+    assert [file.first_seq for file in found.files] == [0, 20, 30, 40]
+    assert [path.stem[-4:] for path in recordings(tmp_path, MACHINE)] == ["000Z", "-001", "-002", "000Z"]
+
+
 def test_samples_that_nobody_took_are_said(tmp_path: Path) -> None:
     service = Service(tmp_path).run(20)
     for values in readings(5, 20):
