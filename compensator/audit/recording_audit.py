@@ -277,7 +277,8 @@ class _Audit:
             identity.update(hashlib.sha256(part.data if part else b"").digest())
         return RecordingAudit(
             file=self._name, original=run.get("file", self._name), machine=run.get("machine", ""),
-            began=run.get("began", ""), previous_file=run.get("previous_file", ""), previous=check.previous.hex() if check.head else "",
+            began=run.get("began", ""), previous_file=run.get("previous_file", ""),
+            previous=check.previous.hex() if check.head else "",
             last=check.handed_on.hex(), end=self._end, records=check.records,
             samples=work.samples if work else 0, skipped=work.skipped if work else 0,
             first_seq=work.first_seq if work else -1, last_seq=work.last_seq if work else -1,
