@@ -30,12 +30,17 @@ from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
 MACHINE = "vmc-07"
 
 
+def settings(**changes: Any) -> Config:
+    """The usual configuration, polled twice a minute: a device without noise says no more when it is asked more."""
+    return config(**{"sampling": {"poll_interval_s": 30.0}, **changes})
+
+
 class Machine:
     """A machine without sensor noise, so that two runs of it measure the same."""
 
     def __init__(self, folder: Path, conf: Config | None = None, model: bytes | None = None) -> None:
         self.folder = folder
-        self.config = conf or config()
+        self.config = conf or settings()
         self.config_bytes = b"the configuration"
         self.configured = model or read_model_bytes("quill")
         self.world = World(PublishedQuill(), Duty.working_day(1, hours=72), seed=1)

@@ -19,11 +19,10 @@ from compensator.service.adoption import Adoption
 from compensator.service.compensation import Outcome
 from compensator.service.model_store import ModelStore, sha256_of
 from compensator.service.retrace import opening_of
-from tests.service.living import MACHINE, Machine, check_files, largest_step
-from tests.service.simulated import config
+from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.test_restart import QUILL, STRONGER
 
-SLOW = config(
+SLOW = settings(
     limits={"offset_max_um": 200.0, "offset_rate_max_um_per_min": 2.0,
             "validity": {"t_q_degc": [10.0, 60.0], "at_degc": [10.0, 35.0]}},
 )  # fmt: skip
@@ -176,11 +175,12 @@ async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
 
 
 async def test_too_little_on_record_is_refused_and_taken_only_by_force(tmp_path: Path) -> None:
-    """The recordings of the day before are gone, and with them the zero."""
+    """The first recording is gone, and with it the zero."""
     machine = Machine(tmp_path, SLOW)
-    await machine.run(1100)
+    await machine.run(200)
+    await machine.run(40)
     recordings(machine.recordings, MACHINE)[0].unlink()
-    refused = machine.at_sample[1105] = Asked(machine, "adopt", payload(STRONGER))
+    refused = machine.at_sample[245] = Asked(machine, "adopt", payload(STRONGER))
     forced = Asked(machine, "adopt", payload(STRONGER, force=True))
 
     def when_refused(outcome: Outcome) -> bool:
@@ -287,7 +287,7 @@ async def test_a_service_that_ends_meanwhile_still_answers(tmp_path: Path) -> No
 
 
 async def test_before_the_first_zero_there_is_nothing_to_warm_up(tmp_path: Path) -> None:
-    machine = Machine(tmp_path, config(zero={"rest_rate_um_per_min": 0.2, "at_start": False}))
+    machine = Machine(tmp_path, settings(zero={"rest_rate_um_per_min": 0.2, "at_start": False}))
     machine.at_sample[5] = Asked(machine, "adopt", payload(STRONGER))
     await machine.run(100, adopted(STRONGER))
     assert machine.outcomes[-1].offset.state == "starting"
