@@ -58,7 +58,7 @@ def parts_of(contents: Contents) -> list[ChainPart]:
     """Return what a file opens with, each by name and hash."""
     parts = [(f"metadata {name}", _texts(table)) for name, table in contents.metadata.items()]
     parts += [(f"attachment {name}", _attachment(part)) for name, part in contents.attachments.items()]
-    parts += [(f"channel {channel.topic}", _channel(channel)) for channel in contents.channels.values()]
+    parts += [(f"channel {channel.topic}", _channel(number, channel)) for number, channel in contents.channels.items()]
     return [ChainPart(name=name, sha256=_sha256(data).hexdigest()) for name, data in parts]
 
 
@@ -89,8 +89,8 @@ def _attachment(part: Attachment) -> bytes:
     return _prefixed(part.name.encode(), part.media_type.encode(), times, part.data)
 
 
-def _channel(channel: Channel) -> bytes:
-    texts = (channel.topic, channel.encoding, channel.schema_name, channel.schema_encoding)
+def _channel(number: int, channel: Channel) -> bytes:
+    texts = (str(number), channel.topic, channel.encoding, channel.schema_name, channel.schema_encoding)
     return _prefixed(*(text.encode() for text in texts), channel.schema, _texts(channel.metadata))
 
 

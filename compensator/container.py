@@ -23,6 +23,7 @@ MAGIC = b"\x89MCAP0\r\n"
 #: Longest record and chunk that is believed, bytes; ours are below 2 MiB.
 LONGEST = 64 * 2**20
 _WINDOW = 2**20
+_LONGEST_HEADER = 4096
 
 _T = TypeVar("_T")
 
@@ -285,6 +286,7 @@ class Container:
         if code == _HEADER:
             fields.text()
             contents.library = fields.text()
+            fields.done()
         elif code == _SCHEMA:
             number = fields.number("<H")
             self._schemas[number] = (fields.text(), fields.text(), fields.bytes4())
@@ -354,7 +356,7 @@ class Container:
         rest = self._buffer[self._at : self._at + len(MAGIC) + 1]
         if rest != MAGIC:
             if MAGIC.startswith(rest):
-                raise Torn(self.path, self._base + self._at)
+                raise self._torn(self._base + self._at)
             more = self._size - self._base - self._at - len(MAGIC)
             raise Damaged(self.path, self._base + self._at, f"{more} bytes behind the end of the file")
         self.contents.ended = True
@@ -380,18 +382,26 @@ class Container:
             code = self._buffer[self._at] if len(self._buffer) > self._at else _MESSAGE_CODE
             if not (code == 0 or _HEADER <= code <= _DATA_END):
                 raise Damaged(self.path, offset, f"a record of kind {code}")
-            raise Torn(self.path, offset)
+            raise self._torn(offset)
         code, length = _FRAME.unpack_from(self._buffer, self._at)
         if code == 0 and self._only_zeros():
-            raise Torn(self.path, offset)
+            raise self._torn(offset)
         if not _HEADER <= code <= _DATA_END:
             raise Damaged(self.path, offset, f"a record of kind {code}")
-        if not _SHORTEST.get(code, 0) <= length <= LONGEST:
-            raise Damaged(self.path, offset, f"a record of {length} bytes, expected at most {LONGEST}")
+        longest = _LONGEST_HEADER if code == _HEADER else LONGEST
+        if not _SHORTEST.get(code, 0) <= length <= longest:
+            raise Damaged(self.path, offset, f"a record of {length} bytes, expected at most {longest}")
         self._need(9 + length)
         if len(self._buffer) - self._at < 9 + length:
-            raise Torn(self.path, offset, self._buffer[self._at : self._at + _WINDOW])
+            raise self._torn(offset, self._buffer[self._at : self._at + _WINDOW])
         return code, length
+
+    def _torn(self, offset: int, rest: bytes = b"") -> Damaged:
+        """Return what to raise where the file ends inside a record: one that has its own end is not torn."""
+        self._file.seek(max(0, self._size - len(MAGIC)))
+        if offset > 0 and self._file.read(len(MAGIC)) == MAGIC:
+            return Damaged(self.path, offset, "a record that leads beyond the end of the file")
+        return Torn(self.path, offset, rest)
 
     def _only_zeros(self) -> bool:
         """Tell whether nothing but zeros follows: what a power cut leaves of a file that had grown."""

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+
 from compensator.audit.findings import Difference, Finding, Findings
 from compensator.audit.recomputation import Recomputation
 from compensator.audit.verification import ChainCheck, Record
@@ -23,7 +25,9 @@ End = Literal["finished", "recovered", "open", "torn", "truncated", "damaged"]
 
 #: Messages between two calls of `told`.
 _STEP = 2000
-_CHUNK, _ATTACHMENT, _METADATA = b"\x06", b"\x09", b"\x0c"
+_MESSAGE, _CHUNK, _ATTACHMENT, _METADATA = b"\x05", b"\x06", b"\x09", b"\x0c"
+#: Bytes of a message before its payload.
+_MESSAGE_HEAD = 31
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -249,9 +253,9 @@ class _Audit:
         elif self._was_compact(error):
             self._end = "truncated"
             self._findings.add("truncated", f"a finished file that ends at byte {error.offset}; its end is missing")
-        elif error.rest.count(b'{"schema":') > 1 or len(error.rest) >= 2**20:
+        elif _covers_others(error.rest):
             self._end = "damaged"
-            text = "a record whose length leads beyond the end of the file, with other records behind it"
+            text = "a record whose length leads beyond the end of the file, and what stands there is whole"
             self._findings.add("damaged", f"byte {error.offset}: {text}")
         elif sealed:
             self._end = "finished"
@@ -294,6 +298,17 @@ class _Audit:
             removed=tuple(work.removed) if work else (),
             size=self._size,
         )  # fmt: skip
+
+
+def _covers_others(rest: bytes) -> bool:
+    """Tell a length that was changed from a torn end: there, the one message behind it is not whole."""
+    if rest.count(b'{"schema":') > 1 or len(rest) >= 2**20:
+        return True
+    try:
+        msgspec.json.decode(rest[_MESSAGE_HEAD:])
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return False
+    return rest[:1] == _MESSAGE
 
 
 def recorded_groups(container: Container) -> Iterator[list[Record]]:

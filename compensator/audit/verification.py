@@ -17,7 +17,7 @@ import msgspec
 from compensator import chain
 from compensator.audit.findings import Finding, Findings
 from compensator.container import PAYLOAD, Contents
-from compensator.messages import SCHEMA, Chain, ChainLink, Seal
+from compensator.messages import SCHEMA, Chain, ChainLink, Seal, encode
 from compensator.signature import Verifier
 
 _sha256 = hashlib.sha256
@@ -191,9 +191,12 @@ class ChainCheck:
         except ValueError:
             self._findings.add("altered", "a hash that is none", topic="chain", sequence=sequence)
             self.head = chain.opening(self.previous, chain.parts_of(self._contents))
-        if message.time_utc_ns != time_ns or body[4:12] != body[12:PAYLOAD]:
-            self._findings.add("altered", "stands at another time than it says", topic="chain", sequence=sequence,
-                               time_utc_ns=time_ns)  # fmt: skip
+        machine = self._contents.metadata.get("run", {}).get("machine", "")
+        expected = Chain(schema=SCHEMA, machine=machine, time_utc_ns=time_ns, before=message.before,
+                         parts=message.parts, records=[])  # fmt: skip
+        if body[PAYLOAD:] != encode(expected) or body[4:12] != body[12:PAYLOAD]:
+            self._findings.add("altered", "says something else than follows from the file", topic="chain",
+                               sequence=sequence, time_utc_ns=time_ns)  # fmt: skip
         stated_before = self._contents.metadata.get("run", {}).get("previous_chain", "")
         if (stated_before or chain.NOTHING.hex()) != message.before:
             self._findings.add("altered", "names another last value of the file before than the metadata",
