@@ -26,7 +26,7 @@ from compensator.model.engine import Engine
 from compensator.model.model_file import load_model
 from compensator.service.composition import run_service
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
-from tests.bench import diagnosis, identification
+from tests.bench import audit, diagnosis, identification
 
 PORT = 17461
 
@@ -177,6 +177,7 @@ def main() -> None:
     service_process()
     calibrations()
     diagnoses()
+    audit.measurements()
 
 
 if __name__ == "__main__":

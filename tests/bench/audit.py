@@ -69,7 +69,7 @@ def measure(folder: Path) -> None:
     paths = recordings(folder, MACHINE)
     size = sum(path.stat().st_size for path in paths)
     workers = os.cpu_count() or 1
-    print(f"{len(paths)} files, {size / 1e6:.0f} MB, {workers} processes")
+    print(f"\na year audited: {len(paths)} files, {size / 1e6:.0f} MB, {workers} processes")
     for _ in range(3):
         library, messages = over_all(read_with_library, paths, workers)
         own, _ = over_all(read_by_ourselves, paths, workers)
