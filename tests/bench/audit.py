@@ -31,7 +31,7 @@ DECODERS = {topic: msgspec.json.Decoder(kind) for topic, kind in MESSAGES.items(
 
 def make(folder: Path, samples: int = SAMPLES) -> None:
     """Record a year, faster than real time: nothing is synced."""
-    with mock.patch("os.fsync"):
+    with mock.patch("os.fsync", lambda descriptor: None):
         Service(folder).run(samples).stop()
 
 
