@@ -101,6 +101,11 @@ class Evidence:
             block[at[low:high]] = True
             yield block
 
+    @property
+    def floor(self) -> float:
+        """Sum of squares of noise and the base model's own error, as they are known, µm²."""
+        return CLEAN_TIMES * self.count * (self.noise_um**2 + self.own_error_um**2)
+
     def is_noise(self, cost: float) -> bool:
         """Tell whether a sum of squares is no more than noise and own error."""
         return cost < CLEAN_TIMES * (self.count * self.noise_um**2 + self.allowance)
@@ -253,6 +258,7 @@ def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -
             if path is not None
         },
         spans=moving, zeroed=frozenset(zeroed),
+        rough="folds_rms_um" in model.provenance,
         functions={name: (path.sampled.b, path.sampled.a) for name, path in paths.items() if path is not None},
     )  # fmt: skip
 

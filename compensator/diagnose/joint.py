@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,11 +29,14 @@ class Part:
         Its free parameters.
     amplitudes : tuple of float
         Its linear parameters.
+    companion : bool
+        Whether it only rounds off what the others leave: it is deployed with them and not named beside them.
     """
 
     hypothesis: Hypothesis
     values: tuple[float, ...]
     amplitudes: tuple[float, ...] = ()
+    companion: bool = False
 
     @property
     def named(self) -> dict[str, float]:
@@ -102,6 +106,7 @@ class _Problem:
         self.evidence, self.hypotheses = evidence, hypotheses
         self.y = evidence.without_nuisances(evidence.residual)
         self.free = [free for hypothesis in hypotheses for free in hypothesis.free]
+        self.ridge = np.array([h.ridge for h in hypotheses for _ in h.amplitudes])
         self._known: list[tuple[tuple[float, ...], tuple[Matrix, Vector | None]] | None] = [None] * len(hypotheses)
 
     def values(self, x: Vector) -> list[tuple[float, ...]]:
@@ -129,7 +134,11 @@ class _Problem:
             return target, np.zeros(0)
         scale = np.linalg.norm(whole, axis=0)
         scale[scale == 0.0] = 1.0
-        amplitudes = np.linalg.lstsq(whole / scale, target, rcond=1e-9)[0] / scale
+        table, aim = whole / scale, target
+        if self.ridge.any():
+            table = np.concatenate([table, np.diag(np.sqrt(self.ridge))])
+            aim = np.concatenate([target, np.zeros(self.ridge.size)])
+        amplitudes = np.linalg.lstsq(table, aim, rcond=1e-9)[0] / scale
         return target - whole @ amplitudes, amplitudes
 
     def fun(self, x: Vector) -> Vector:
@@ -182,38 +191,58 @@ def fit_joint(
 
 
 def standard_errors(evidence: Evidence, joint: Joint, colour: float) -> list[dict[str, float]]:
-    """Return the standard error of every parameter of every effect, the residual's colour counted in."""
+    """Return the standard error of everything that each effect is named by, the residual's colour counted in."""
     natural = np.array([v for part in joint.parts for v in (*part.values, *part.amplitudes)])
     if natural.size == 0:
         return []
+    ridge = np.array([r for part in joint.parts for r in _ridges(part)])
 
-    def predicted(values: Vector) -> Vector:
-        total, at = np.zeros(evidence.used.size), 0
+    def moved(values: Vector) -> list[Part]:
+        result, at = [], 0
         for part in joint.parts:
             n, m = len(part.values), len(part.amplitudes)
-            moved = Part(hypothesis=part.hypothesis, values=tuple(values[at : at + n]),
-                         amplitudes=tuple(values[at + n : at + n + m]))  # fmt: skip
-            total += response(evidence, moved)
+            own = values[at : at + n + m].tolist()
+            result.append(dataclasses.replace(part, values=tuple(own[:n]), amplitudes=tuple(own[n:])))
             at += n + m
+        return result
+
+    def predicted(values: Vector) -> Vector:
+        total = np.zeros(evidence.used.size)
+        for part in moved(values):
+            total += response(evidence, part)
         total[~evidence.used] = 0.0
         return evidence.without_nuisances(total)
 
-    jacobian = np.empty((evidence.used.size, natural.size))
-    for i, value in enumerate(natural):
-        step = 1e-3 * abs(value) + 1e-9
-        above, below = natural.copy(), natural.copy()
-        above[i] += step
-        below[i] -= step
-        jacobian[:, i] = (predicted(above) - predicted(below)) / (2.0 * step)
+    def named(values: Vector) -> Vector:
+        return np.array([v for part in moved(values) for v in part.named.values()])
+
+    steps = 1e-3 * np.abs(natural) + 1e-9
+    jacobian = _slopes(predicted, natural, steps)
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
-    _, s, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    _, s, vt = np.linalg.svd(np.concatenate([jacobian / scale, np.diag(np.sqrt(ridge))]), full_matrices=False)
     inverse = vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None]
     sigma2 = joint.cost / max(evidence.count - natural.size, 1) * colour
-    errors = np.sqrt(np.maximum(np.diag(inverse @ inverse.T) * sigma2, 0.0)).tolist()
+    spread = _slopes(named, natural, steps) @ inverse
+    errors = np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread) * sigma2, 0.0)).tolist()
     result, at = [], 0
     for part in joint.parts:
         names = list(part.named)
         result.append(dict(zip(names, errors[at : at + len(names)], strict=True)))
         at += len(names)
     return result
+
+
+def _ridges(part: Part) -> list[float]:
+    return [*(0.0 for _ in part.values), *(part.hypothesis.ridge for _ in part.amplitudes)]
+
+
+def _slopes(function: Callable[[Vector], Vector], at: Vector, steps: Vector) -> Matrix:
+    """Return the derivatives of a function by each of its arguments, shape (values, arguments)."""
+    columns = []
+    for i, step in enumerate(steps.tolist()):
+        above, below = at.copy(), at.copy()
+        above[i] += step
+        below[i] -= step
+        columns.append((function(above) - function(below)) / (2.0 * step))
+    return np.stack(columns, axis=1)

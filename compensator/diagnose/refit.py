@@ -24,15 +24,13 @@ import numpy.typing as npt
 
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.joint import Part
-from compensator.model.effects.hypothesis import lag_pole
-from compensator.model.effects.input import BankHypothesis, bank, banks
+from compensator.model.effects.hypothesis import ROW, lag_pole, row
+from compensator.model.effects.input import RowHypothesis, rows
 from compensator.model.transfer_function import SampledTransferFunction
 
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
 
-#: Lags in a row, and the longest of them, min.
-LAGS, LONGEST_MIN = 6, 600.0
 #: Weight of the ridge, as a share of the samples.
 RIDGE = 0.03
 #: Weights of the last fit, the heaviest first; the one with the least error on held-out blocks is taken.
@@ -49,7 +47,7 @@ class Tried:
 
     Parameters
     ----------
-    hypothesis : BankHypothesis
+    hypothesis : RowHypothesis
         The channel and its curve.
     rms_um : float
         Free-run error on the blocks, µm.
@@ -57,7 +55,7 @@ class Tried:
         Sum of squares of each block, µm².
     """
 
-    hypothesis: BankHypothesis
+    hypothesis: RowHypothesis
     rms_um: float
     blocks_um2: Vector
 
@@ -109,7 +107,7 @@ def refit(evidence: Evidence) -> Refit:
         Residual and signals; only the samples used are looked at.
     """
     fitting = _Fitting(evidence)
-    chosen: list[BankHypothesis] = []
+    chosen: list[RowHypothesis] = []
     best, blocks = fitting.held_out(chosen)
     errors, rivals = [best], []
     while len(chosen) < MOST:
@@ -136,9 +134,8 @@ class _Fitting:
     def __init__(self, evidence: Evidence) -> None:
         self.evidence = evidence
         setting, period = evidence.setting, evidence.setting.period_min
-        longest = min(LONGEST_MIN, max(setting.minutes / 3.0, 20.0 * period))
-        self.taus = tuple(float(t) for t in np.geomspace(period, longest, LAGS))
-        self.hypotheses = banks(setting, self.taus)
+        self.taus = setting.row_min
+        self.hypotheses = rows(setting)
         self.paths = ["drive", *(["ambient_k"] if setting.has_ambient else [])]
         runs = np.zeros((evidence.used.size, len(evidence.waves)))
         start = 0
@@ -147,7 +144,7 @@ class _Fitting:
             start += wave.size
         groups = [
             *(
-                np.concatenate([bank(getattr(w, name), self.taus, period) for w in evidence.waves])
+                np.concatenate([row(getattr(w, name), self.taus, period) for w in evidence.waves])
                 for name in self.paths
             ),
             *(np.concatenate([h.columns(w, ()) for w in evidence.waves]) for h in self.hypotheses),
@@ -157,7 +154,7 @@ class _Fitting:
         scale[: runs.shape[1]] = 1.0
         scale[scale == 0.0] = 1.0
         self.scale, self.table = scale, whole / scale
-        self.base = runs.shape[1] + LAGS * len(self.paths)
+        self.base = runs.shape[1] + ROW * len(self.paths)
         self.y = deformation(evidence)
         self.blocks = [self._grams(mask) for mask in self._masks()]
         self.all = self._grams([evidence.used])
@@ -173,15 +170,15 @@ class _Fitting:
             found.append((x.T @ x, x.T @ y, float(y @ y), int(mask.sum())))
         return found
 
-    def columns_of(self, chosen: Sequence[BankHypothesis]) -> npt.NDArray[np.int_]:
+    def columns_of(self, chosen: Sequence[RowHypothesis]) -> npt.NDArray[np.int_]:
         """Return which columns a fit has: zeros and paths, then each channel's."""
         at = [np.arange(self.base)]
         for hypothesis in chosen:
-            first = self.base + LAGS * self.hypotheses.index(hypothesis)
-            at.append(np.arange(first, first + LAGS))
+            first = self.base + ROW * self.hypotheses.index(hypothesis)
+            at.append(np.arange(first, first + ROW))
         return np.concatenate(at)
 
-    def held_out(self, chosen: Sequence[BankHypothesis], ridge: float = RIDGE) -> tuple[float, Vector]:
+    def held_out(self, chosen: Sequence[RowHypothesis], ridge: float = RIDGE) -> tuple[float, Vector]:
         """Return the error on blocks that were held out, µm rms, and the sum of squares of each."""
         at = self.columns_of(chosen)
         cut = np.ix_(at, at)
@@ -195,7 +192,7 @@ class _Fitting:
             squares.append(sum(e for e, _ in errors[-len(blocks) :]) / sum(n for _, n in errors[-len(blocks) :]))
         return float(np.sqrt(np.mean(squares))), np.array([e for e, _ in errors])
 
-    def weights(self, chosen: Sequence[BankHypothesis], ridge: float, without: int | None = None) -> Vector:
+    def weights(self, chosen: Sequence[RowHypothesis], ridge: float, without: int | None = None) -> Vector:
         """Return the weights of the fit to everything that is used, or to all but one of the shortest blocks."""
         at = self.columns_of(chosen)
         gram, moment, _, count = self.all[0]
@@ -205,7 +202,7 @@ class _Fitting:
         return _solved(gram[np.ix_(at, at)], moment[at], ridge * count)
 
     def result(
-        self, chosen: Sequence[BankHypothesis], errors: tuple[float, ...], rivals: tuple[tuple[Tried, ...], ...]
+        self, chosen: Sequence[RowHypothesis], errors: tuple[float, ...], rivals: tuple[tuple[Tried, ...], ...]
     ) -> Refit:
         """Fit to everything that is used, and take the pieces apart."""
         at = self.columns_of(chosen)
@@ -215,12 +212,12 @@ class _Fitting:
         others = [self.weights(chosen, ridge, i) / self.scale[at] for i in range(len(self.blocks[0]))]
         parts, std = [], []
         for i, hypothesis in enumerate(chosen):
-            own = slice(self.base + LAGS * i, self.base + LAGS * (i + 1))
+            own = slice(self.base + ROW * i, self.base + ROW * (i + 1))
             parts.append(Part(hypothesis=hypothesis, values=(), amplitudes=tuple(gains[own].tolist())))
             std.append(_jackknife(parts[-1], [other[own] for other in others]))
         paths = [
-            self._function(gains[first : first + LAGS])
-            for first in range(len(self.evidence.waves), self.base, LAGS)
+            self._function(gains[first : first + ROW])
+            for first in range(len(self.evidence.waves), self.base, ROW)
         ]  # fmt: skip
         return Refit(
             parts=tuple(parts), std=tuple(std), dtf=paths[0], tdtf=paths[1] if len(paths) > 1 else None,

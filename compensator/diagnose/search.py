@@ -11,6 +11,7 @@ fewer independent samples than its length says.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,11 +22,13 @@ import numpy.typing as npt
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.joint import Joint, Part, columns_of, fit_joint
 from compensator.diagnose.switching import switchings
+from compensator.model.effects.dynamics import ChangedPaths, changed_paths
 from compensator.model.effects.hypothesis import Hypothesis, proposals
 from compensator.model.effects.unobserved import Unobserved
 
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
+Start = tuple[Hypothesis, Sequence[float]]
 
 #: Most effects looked for.
 MOST = 4
@@ -33,6 +36,10 @@ MOST = 4
 POLISHED, EXCHANGED = 12, 6
 #: Parts of an effect that are larger than their sum by this much cancel each other.
 CANCELS = 6.0
+#: Effects that take this share of what all take explain it; the rest rounds it off.
+MOSTLY = 0.7
+#: What a hidden source may leave of what channels leave, where forms are not exact.
+HIDDEN_LEAVES = 0.5
 #: A residual with less colour than this is noise, and no hidden source is looked for in it.
 CLEAN = 1.3
 
@@ -50,7 +57,7 @@ class Tried:
     index : int
         Which of its parts was tried.
     score : float
-        *J*, white.
+        *J*.
     """
 
     joint: Joint
@@ -105,13 +112,14 @@ class Search:
         """
         before = fit_joint(self.evidence, [])
         path = self._forward([before])
-        last = path[-1]
+        beside = self._beside_changed_paths(path[-1])
+        last = min([path[-1], *beside], key=lambda joint: self.score(joint, 1.0))
         coloured = hidden and not self.evidence.is_noise(last.cost) and self.evidence.colour(last.residual) > CLEAN
-        others = self._with_hidden(path) if coloured else []
-        ends = [last, *others]
-        last = min(ends, key=lambda joint: self.score(joint, 1.0))
+        others = [*beside, *(self._with_hidden(path, last) if coloured else [])]
+        last = min([last, *others], key=lambda joint: self.score(joint, 1.0))
         colour = self.evidence.colour(last.residual)
         best = self._thinned(min([*path, *others], key=lambda joint: self.score(joint, colour)), colour)
+        best = self._named(best, before)
         rivals = tuple(self._rivals(best, i) for i in range(len(best.parts)))
         return Found(before=before, joint=best, colour=colour, rivals=rivals, places=self.places)
 
@@ -125,13 +133,63 @@ class Search:
             if not step:
                 break
             better = self._improved(step[0].joint)
-            if self.score(better, 1.0) >= self.score(last, 1.0):
+            colour = self._colour(better)
+            if self.score(better, colour) >= self.score(last, colour):
                 break
             path.append(better)
         return path
 
-    def _with_hidden(self, path: Sequence[Joint]) -> list[Joint]:
-        """Return fits with a hidden source beside what was found before it, or instead of it."""
+    def _colour(self, joint: Joint) -> float:
+        """Return the colour that counts while something may still be missing.
+
+        On a real machine no effect is exactly of any form, and what it leaves is no noise: few independent samples,
+        so that the simpler of two wins. Where forms are exact, what is left is the effect that comes next.
+        """
+        return self.evidence.colour(joint.residual) if self.evidence.setting.rough else 1.0
+
+    def _beside_changed_paths(self, last: Joint) -> list[Joint]:
+        """Return what is found beside paths that answer otherwise; nothing where one effect leaves mere noise.
+
+        A real machine that is altered answers otherwise to its heat and to the air, whatever else the alteration
+        does: what is looked for beside that is not mistaken for it.
+        """
+        clean = len(last.parts) < 2 and last.cost < self.evidence.floor
+        if clean or not self.evidence.setting.rough:
+            return []
+        return self._forward([fit_joint(self.evidence, [(changed_paths(self.evidence.setting), ())])])
+
+    def _named(self, joint: Joint, before: Joint) -> Joint:
+        """Say of paths that answer otherwise whether that is an effect of its own, and by its simplest name.
+
+        Where other effects explain most without it, it only rounds off what they leave. Where it stands alone and other
+        strengths explain most of it, the strength is what is wrong.
+        """
+        at = [i for i, part in enumerate(joint.parts) if isinstance(part.hypothesis, ChangedPaths)]
+        if not at:
+            return joint
+        others = [(p.hypothesis, p.values) for i, p in enumerate(joint.parts) if i != at[0]]
+        rounded = (joint.parts[at[0]].hypothesis, ())
+        if not others:
+            gains = [(h, ()) for h in self.hypotheses if h.kind == "gain"]
+            if not self._explain_most(gains, joint, before):
+                return joint
+            others = [gain for gain in gains if gain[0].path == "DTF"]
+        elif not self._explain_most(others, joint, before):
+            return joint
+        fitted = fit_joint(self.evidence, [*others, rounded])
+        *named, last = fitted.parts
+        return dataclasses.replace(fitted, parts=(*named, dataclasses.replace(last, companion=True)))
+
+    def _explain_most(self, some: Sequence[Start], joint: Joint, before: Joint) -> bool:
+        """Tell whether some effects alone take most of what all of them take."""
+        return before.cost - fit_joint(self.evidence, some).cost > MOSTLY * (before.cost - joint.cost)
+
+    def _with_hidden(self, path: Sequence[Joint], shown: Joint) -> list[Joint]:
+        """Return fits with a hidden source beside what was found before it, or instead of it.
+
+        Steps at any time follow much that is none of theirs. On a real machine, where forms are never exact, they must
+        leave half of what the best explanation by channels leaves.
+        """
         found = []
         for base in path[:3]:
             hidden = switchings(self.evidence, base.residual)
@@ -139,7 +197,11 @@ class Search:
                 starts = [(part.hypothesis, part.values) for part in base.parts]
                 found.append(fit_joint(self.evidence, [*starts, hidden]))
         found.sort(key=lambda joint: self.score(joint, 1.0))
-        return [self._improved(joint) for joint in found[:1]]
+        improved = [self._improved(joint) for joint in found[:1]]
+        if not self.evidence.setting.rough:
+            return improved
+        allowance = self.evidence.allowance
+        return [joint for joint in improved if joint.cost + allowance < HIDDEN_LEAVES * (shown.cost + allowance)]
 
     def _is_worth(self, hypothesis: Hypothesis, without: Joint, joint: Joint) -> bool:
         """Tell whether an effect takes enough to be of use, the base model's own error counted as still there."""
@@ -168,6 +230,10 @@ class Search:
             fitted = fit_joint(self.evidence, [*starts, (hypothesis, values)])
             if self._is_plausible(fitted.parts[-1]):
                 found.append(Tried(joint=fitted, index=len(starts), score=self.score(fitted, 1.0)))
+        if not found:
+            return []
+        colour = self._colour(min(found, key=lambda item: item.score).joint)
+        found = [dataclasses.replace(item, score=self.score(item.joint, colour)) for item in found]
         return sorted(found, key=lambda item: item.score)
 
     def _scan(self, base: Joint, candidates: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis, tuple[float, ...]]]:
@@ -211,10 +277,15 @@ class Search:
         for _ in range(2):
             changed = False
             for i, part in enumerate(joint.parts):
+                if isinstance(part.hypothesis, ChangedPaths):
+                    continue
                 others = (
                     self._hidden_again(joint, i) if isinstance(part.hypothesis, Unobserved) else self._add(joint, i)
                 )
-                if others and others[0].score < self.score(joint, 1.0) - 1e-6:
+                if not others:
+                    continue
+                colour = self._colour(others[0].joint)
+                if self.score(others[0].joint, colour) < self.score(joint, colour) - 1e-6:
                     joint, changed = others[0].joint, True
             if not changed:
                 break
@@ -245,13 +316,15 @@ class Search:
 
     def _is_plausible(self, part: Part) -> bool:
         """Refuse an effect whose columns cancel: two lags that stand for a derivative or a ramp are no physics."""
-        if len(part.amplitudes) < 2:
+        if len(part.amplitudes) < 2 or part.hypothesis.ridge:
             return True
         table = columns_of(self.evidence, part.hypothesis, part.values)[0] * np.array(part.amplitudes)
         return bool(np.max(np.linalg.norm(table, axis=0)) < CANCELS * np.linalg.norm(table.sum(axis=1)))
 
     def _rivals(self, joint: Joint, index: int) -> tuple[Tried, ...]:
         """Return what else explains an effect's part, one for each place, best first."""
+        if joint.parts[index].companion:
+            return ()
         kept = [(p.hypothesis, p.values) for i, p in enumerate(joint.parts) if i != index]
         taken = {part.hypothesis.place for part in joint.parts}
         base = fit_joint(self.evidence, kept)

@@ -9,7 +9,6 @@ from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.joint import Part, response
 from compensator.errors import ModelError
 from compensator.model.effects.hypothesis import proposals
-from compensator.model.effects.input import banks
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
@@ -34,8 +33,8 @@ def evidence(day):
 
 def forms(evidence):
     wanted = ("coolant_degc", "fan_rpm", "")
-    rows = banks(evidence.setting, (1.0, 20.0, 300.0))
-    return [h for h in [*proposals(evidence.setting), *rows] if h.deployable and h.channel in wanted]
+    rough = dataclasses.replace(evidence.setting, rough=True)
+    return [h for h in proposals(rough) if h.deployable and h.channel in wanted]
 
 
 def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):

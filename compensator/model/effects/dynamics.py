@@ -2,10 +2,15 @@
 
 missing    y += gain · L(τ) · drive
 mistimed   y += change · [(1 + τ₀ s) / (1 + τ s) − 1] · y_path,   τ₀ a time constant of the path
+changed    y += Σ_i gain_i · L(τ_i) · drive + Σ_i gain_ambient_i · L(τ_i) · ambient
+
+A machine that was altered answers otherwise to its heat and to the air, both at once: the row of lags of `changed` can
+be any such difference.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -13,11 +18,23 @@ from typing import Any, ClassVar
 import numpy as np
 
 from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import Hypothesis, Matrix, Setting, Vector, Waves, lowpass, proposes, shown
-from compensator.model.effects.stream import Lag
+from compensator.model.effects.hypothesis import (
+    ROW_RIDGE,
+    Hypothesis,
+    Matrix,
+    Setting,
+    Vector,
+    Waves,
+    lowpass,
+    proposes,
+    row,
+    shown,
+)
+from compensator.model.effects.stream import Lag, Row
 from compensator.model.effects.table import Table
 
 FORMS = ("missing", "mistimed")
+CHANGED = "changed"
 
 
 @register("dynamics")
@@ -39,7 +56,7 @@ class DynamicsEffect:
     @classmethod
     def from_table(cls, table: Mapping[str, Any], period_s: float) -> Effect:
         """Make the effect from its table in the model file."""
-        return cls(table, period_s)
+        return ChangedEffect(table, period_s) if table.get("form") == CHANGED else cls(table, period_s)
 
     def step(self, signals: Signals) -> float:
         """Advance by one sample."""
@@ -56,6 +73,32 @@ class DynamicsEffect:
     def restore(self, state: tuple[float, ...]) -> None:
         """Take a state back."""
         self._lag.state = state
+
+
+class ChangedEffect:
+    """The streaming side of paths that answer otherwise."""
+
+    kind = "dynamics"
+    channels: tuple[str, ...] = ()
+
+    def __init__(self, table: Mapping[str, Any], period_s: float) -> None:
+        keys = Table("dynamics", table, ("path", "tau_min", "gain", "gain_ambient"))
+        keys.text("path", ("DTF",))
+        taus = keys.numbers("tau_min", 0.0, 1e5)
+        self._rows = tuple(Row(taus, keys.numbers(key), period_s / 60.0) for key in ("gain", "gain_ambient"))
+
+    def step(self, signals: Signals) -> float:
+        """Advance by one sample."""
+        return self._rows[0].step(signals.drive) + self._rows[1].step(signals.ambient_k)
+
+    def snapshot(self) -> tuple[float, ...]:
+        """Return the state."""
+        return (*self._rows[0].state, *self._rows[1].state)
+
+    def restore(self, state: tuple[float, ...]) -> None:
+        """Take a state back."""
+        half = len(state) // 2
+        self._rows[0].state, self._rows[1].state = state[:half], state[half:]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,6 +147,52 @@ class MistimedMode(Hypothesis):
             f"{shown(self.instead_of_min)} min ({rms_um:.2g} µm rms): it stores or loses heat otherwise than at the "
             "calibration."
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangedPaths(Hypothesis):
+    """Paths that answer otherwise than at the calibration, in any linear way."""
+
+    kind: ClassVar[str] = "dynamics"
+    ridge: ClassVar[float] = ROW_RIDGE
+    taus_min: tuple[float, ...] = ()
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters that the data spends on it: fewer than gains, because they are held together."""
+        return 6
+
+    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+        """Return what drives the paths, behind each lag."""
+        return np.hstack([row(u, self.taus_min, waves.period_min) for u in (waves.drive, waves.ambient_k)])
+
+    def named(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, float]:
+        """Return the change of each path's gain at rest."""
+        count = len(self.taus_min)
+        names = self.amplitudes[0].rpartition("_")[0], self.amplitudes[count].rpartition("_")[0]
+        return {names[0]: math.fsum(amplitudes[:count]), names[1]: math.fsum(amplitudes[count:])}
+
+    def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
+        """Return the table that the engine runs."""
+        count = len(self.taus_min)
+        return {"path": "DTF", "form": CHANGED, "tau_min": list(self.taus_min), "gain": list(amplitudes[:count]),
+                "gain_ambient": list(amplitudes[count:])}  # fmt: skip
+
+    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
+        """Say what is changed."""
+        return (
+            f"The DTF, and the TDTF with it, has another course of time than at the calibration ({rms_um:.2g} µm rms): "
+            "a mass or a contact was added, removed or altered."
+        )
+
+
+def changed_paths(setting: Setting) -> ChangedPaths:
+    """Return the hypothesis that the paths answer otherwise."""
+    taus = setting.row_min
+    unit = "w" if setting.has_ttf else "k"
+    names = (f"change_um_per_{unit}", "change_ambient_um_per_k")
+    amplitudes = tuple(f"{name}_{i}" for name in names for i in range(1, len(taus) + 1))
+    return ChangedPaths(path="DTF", form=CHANGED, taus_min=taus, amplitudes=amplitudes)
 
 
 @proposes

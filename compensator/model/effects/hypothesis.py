@@ -18,6 +18,11 @@ import numpy.typing as npt
 from compensator.model.effects.base import kinds
 from compensator.model.transfer_function import SampledTransferFunction
 
+#: Lags in a row, and the longest of them, min.
+ROW, ROW_LONGEST_MIN = 6, 600.0
+#: Weight that holds the gains of a row together.
+ROW_RIDGE = 1e-3
+
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
 
@@ -106,6 +111,8 @@ class Hypothesis:
     deployable: ClassVar[bool] = True
     #: Least share of the residual's sum of squares that it must take: less is of no use to anybody.
     worth: ClassVar[float] = 0.05
+    #: Weight that holds its amplitudes small, against columns of norm 1; 0 leaves them free.
+    ridge: ClassVar[float] = 0.0
     path: str = ""
     channel: str = ""
     form: str = ""
@@ -174,6 +181,9 @@ class Setting:
         Channels with a zero of their own: they come near 0 and go far from it.
     functions : mapping of str to (tuple of float, tuple of float)
         Coefficients b and a of each path.
+    rough : bool
+        Whether the model was identified on a machine: effects there are only roughly of any form, so that rows of
+        lags are proposed beside the exact forms.
     """
 
     channels: tuple[str, ...]
@@ -186,11 +196,18 @@ class Setting:
     spans: Mapping[str, float] = field(default_factory=dict)
     zeroed: frozenset[str] = frozenset()
     functions: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
+    rough: bool = False
 
     @property
     def paths(self) -> tuple[str, ...]:
         """Paths that lead to the deformation and move it."""
         return tuple(name for name, size in self.sizes_um.items() if size > 0.0)
+
+    @property
+    def row_min(self) -> tuple[float, ...]:
+        """Return the time constants of a row of lags, from a sample to a third of the record."""
+        longest = min(ROW_LONGEST_MIN, max(self.minutes / 3.0, 20.0 * self.period_min))
+        return tuple(float(t) for t in np.geomspace(self.period_min, longest, ROW))
 
     def tau(self, name: str = "tau_min", low: float = 0.6) -> Free:
         """Return a time constant, from a sample to a third of the record."""
@@ -213,6 +230,11 @@ def lowpass(u: Vector, tau_min: float, period_min: float) -> Vector:
     p = lag_pole(tau_min, period_min)
     half = (1.0 - p) / 2.0
     return np.asarray(lfilter([half, half], [1.0, -p], u - u[0]) + u[0])
+
+
+def row(u: Vector, taus_min: Sequence[float], period_min: float) -> Matrix:
+    """Return a signal behind each of a row of lags, shape (n, len(taus_min))."""
+    return np.column_stack([lowpass(u, tau, period_min) for tau in taus_min])
 
 
 def lag_pole(tau_min: float, period_min: float) -> float:

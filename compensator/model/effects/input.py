@@ -17,6 +17,7 @@ import numpy as np
 
 from compensator.model.effects.base import Effect, Signals, register
 from compensator.model.effects.hypothesis import (
+    ROW_RIDGE,
     Free,
     Hypothesis,
     Matrix,
@@ -26,6 +27,7 @@ from compensator.model.effects.hypothesis import (
     late,
     lowpass,
     proposes,
+    row,
     shown,
 )
 from compensator.model.effects.stream import Delay, Lag
@@ -124,7 +126,7 @@ class InputHypothesis(Hypothesis):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BankHypothesis(InputHypothesis):
+class RowHypothesis(InputHypothesis):
     """A channel behind a row of lags that are given: what is fitted where the path's shape is not known.
 
     Parameters
@@ -133,12 +135,18 @@ class BankHypothesis(InputHypothesis):
         The lags, min.
     """
 
+    ridge: ClassVar[float] = ROW_RIDGE
     taus_min: tuple[float, ...] = ()
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters that the data spends on it: fewer than gains, because they are held together."""
+        return 5
 
     def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
         """Return the channel behind each lag."""
         curved = _BATCH[self.curve](waves.channels[self.channel])
-        return bank(curved - curved[0], self.taus_min, waves.period_min)
+        return row(curved - curved[0], self.taus_min, waves.period_min)
 
     def named(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, float]:
         """Return what the lags make together: the gain at rest, and when half of it is there after a step."""
@@ -170,19 +178,15 @@ class BankHypothesis(InputHypothesis):
         return float(np.exp(np.interp(0.5, part[there - 1 : there + 1], np.log(t[there - 1 : there + 1]))))
 
 
-def bank(u: Vector, taus_min: Sequence[float], period_min: float) -> Matrix:
-    """Return a signal behind each of a row of lags, shape (n, len(taus_min))."""
-    return np.column_stack([lowpass(u, tau, period_min) for tau in taus_min])
-
-
-def banks(setting: Setting, taus_min: tuple[float, ...]) -> list[BankHypothesis]:
+def rows(setting: Setting) -> list[RowHypothesis]:
     """Return every channel that moves behind a row of lags; one with a zero of its own also through the curves."""
+    taus = setting.row_min
+    names = tuple(f"gain_{i}" for i in range(1, len(taus) + 1))
     return [
-        BankHypothesis(channel=channel, form=curve, curve=curve, taus_min=taus_min,
-                       amplitudes=tuple(f"gain_{i}" for i in range(1, len(taus_min) + 1)))
+        RowHypothesis(channel=channel, form=f"row, {curve}", curve=curve, taus_min=taus, amplitudes=names)
         for channel in setting.channels
         for curve in (("linear", "power 5/3", "square") if channel in setting.zeroed else ("linear",))
-    ]  # fmt: skip
+    ]
 
 
 @proposes
@@ -201,6 +205,8 @@ def propose(setting: Setting) -> Iterator[Hypothesis]:
                               amplitudes=(f"gain_1_um_per_{unit}", f"gain_2_um_per_{unit}"))  # fmt: skip
         yield InputHypothesis(channel=channel, form="square", curve="square", free=one,
                               amplitudes=(f"gain_um_per_{unit}2",))  # fmt: skip
+    if setting.rough:
+        yield from rows(setting)
 
 
 def unit_of(channel: str) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+from compensator.errors import ModelError
 from compensator.model.effects.hypothesis import lag_pole
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -24,6 +26,33 @@ class Lag:
         y = u if math.isnan(before) else self._p * y + self._half * (u + before)
         self.state = (u, y)
         return y
+
+
+class Row:
+    """A row of lags of one input, weighted and summed."""
+
+    def __init__(self, taus_min: Sequence[float], gains: Sequence[float], period_min: float) -> None:
+        if len(taus_min) != len(gains):
+            raise ModelError(f"a row of lags: {len(taus_min)} tau_min for {len(gains)} gain, expected as many")
+        self._lags = tuple(Lag(tau, period_min) for tau in taus_min)
+        self._gains = tuple(gains)
+
+    @property
+    def state(self) -> tuple[float, ...]:
+        """The states of all lags."""
+        return tuple(value for lag in self._lags for value in lag.state)
+
+    @state.setter
+    def state(self, values: tuple[float, ...]) -> None:
+        for i, lag in enumerate(self._lags):
+            lag.state = tuple(values[2 * i : 2 * i + 2])
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        total = 0.0
+        for gain, lag in zip(self._gains, self._lags, strict=True):
+            total += gain * lag.step(u)
+        return total
 
 
 class Delay:
