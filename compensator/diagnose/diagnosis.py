@@ -88,10 +88,11 @@ def _by_search(model: ThermalModel, evidence: Evidence, told: Told) -> Diagnosis
     found = Search(evidence).run()
     before, after = _held_out(evidence, found, told)
     helps = rms_of(after) <= rms_of(before)
-    effects = _effects(evidence, found)
-    extended = dataclasses.replace(
-        model, effects=(*model.effects, *(table_of(e) for e in effects if e.deployable and helps)), sha256=""
-    )
+    everything = _effects(evidence, found)
+    effects = tuple(effect for effect in everything if not effect.part.companion)
+    # What rounds off an effect is of no use where the effect itself cannot be deployed.
+    deployed = [e for e in everything if e.deployable] if any(e.deployable for e in effects) and helps else []
+    extended = dataclasses.replace(model, effects=(*model.effects, *map(table_of, deployed)), sha256="")
     y = np.concatenate([run.y_um for run in evidence.runs])
     return Diagnosis(
         verdict=_verdict(evidence, found), effects=effects,
@@ -99,7 +100,8 @@ def _by_search(model: ThermalModel, evidence: Evidence, told: Told) -> Diagnosis
         noise_floor_um=evidence.noise_um, model=extended, evidence=evidence,
         residual_before=np.where(evidence.used, found.before.residual, np.nan),
         residual_after=np.where(evidence.used, found.joint.residual, np.nan), held_out_before=before,
-        held_out_after=after, tried=_tried(found, evidence), warnings=warnings_of(effects, before, after),
+        held_out_after=after, tried=_tried(found, evidence),
+        warnings=(*warnings_of(effects, before, after), *_rounded(everything)),
     )  # fmt: skip
 
 
@@ -149,6 +151,16 @@ def _effects(evidence: Evidence, found: Found) -> tuple[Effect, ...]:
             )
         )  # fmt: skip
     return tuple(sorted(effects, key=lambda e: -e.rms_before_um))
+
+
+def _rounded(everything: Sequence[Effect]) -> tuple[str, ...]:
+    """Say that something unnamed is deployed beside what is named."""
+    return tuple(
+        "What the effect leaves is rounded off by a row of lags on heat and ambient "
+        f"({float(np.std(e.wave)):.2g} µm rms), an effect of the kind dynamics in model.toml."
+        for e in everything
+        if e.part.companion
+    )
 
 
 def _rivals(others: Sequence[Tried], part: Part, after: float, count: int) -> tuple[Rival, ...]:

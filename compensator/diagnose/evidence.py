@@ -34,7 +34,9 @@ STATE_PRIOR = 1e-3
 #: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
 OWN_SHARE = 0.02
 #: Below this many times the base model's own error nothing is looked for.
-OWN_TIMES = 2.0
+OWN_TIMES = 1.3
+#: A residual up to this many times the base model's own error may come by itself on another day.
+EXPECTED_TIMES = 1.4
 #: A sum of squares up to this many times that of noise and own error is noise.
 CLEAN_TIMES = 1.3
 #: A displacement is what a cause does, never a cause: another probe follows Y whatever moves it.
@@ -105,6 +107,12 @@ class Evidence:
     def floor(self) -> float:
         """Sum of squares of noise and the base model's own error, as they are known, µm²."""
         return CLEAN_TIMES * self.count * (self.noise_um**2 + self.own_error_um**2)
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether the residual as it stands is no larger than a calibration that misses by as much leads to expect."""
+        left = self.without_nuisances(self.residual)
+        return float(left @ left) < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
 
     def is_noise(self, cost: float) -> bool:
         """Tell whether a sum of squares is no more than noise and own error."""

@@ -111,6 +111,8 @@ class Search:
             Whether a hidden source is looked for.
         """
         before = fit_joint(self.evidence, [])
+        if self.evidence.is_expected:
+            return Found(before=before, joint=before, colour=1.0, rivals=(), places=self.places)
         path = self._forward([before])
         beside = self._beside_changed_paths(path[-1])
         last = min([path[-1], *beside], key=lambda joint: self.score(joint, 1.0))
@@ -200,8 +202,8 @@ class Search:
         improved = [self._improved(joint) for joint in found[:1]]
         if not self.evidence.setting.rough:
             return improved
-        allowance = self.evidence.allowance
-        return [joint for joint in improved if joint.cost + allowance < HIDDEN_LEAVES * (shown.cost + allowance)]
+        own = self.evidence.count * self.evidence.own_error_um**2
+        return [joint for joint in improved if joint.cost + own < HIDDEN_LEAVES * (shown.cost + own)]
 
     def _is_worth(self, hypothesis: Hypothesis, without: Joint, joint: Joint) -> bool:
         """Tell whether an effect takes enough to be of use, the base model's own error counted as still there."""
