@@ -28,6 +28,7 @@ from compensator.model.effects.unobserved import Unobserved
 
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
+Rough = npt.NDArray[np.float32]
 Start = tuple[Hypothesis, Sequence[float]]
 
 #: Most effects looked for.
@@ -38,6 +39,8 @@ POLISHED, EXCHANGED = 12, 6
 CANCELS = 6.0
 #: Effects that take this share of what all take explain it; the rest rounds it off.
 MOSTLY = 0.7
+#: What effects leave up to this share of the sum of squares is their form's, where forms are not exact.
+FORM_LEAVES = 0.08
 #: What a hidden source may leave of what channels leave, where forms are not exact.
 HIDDEN_LEAVES = 0.5
 #: A residual with less colour than this is noise, and no hidden source is looked for in it.
@@ -100,7 +103,7 @@ class Search:
         self.evidence = evidence
         self.hypotheses = proposals(evidence.setting)
         self.places = len({hypothesis.place for hypothesis in self.hypotheses}) + 1
-        self._grids: dict[int, list[tuple[tuple[float, ...], Matrix]]] = {}
+        self._grids: dict[int, list[tuple[tuple[float, ...], Rough]]] = {}
 
     def run(self, *, hidden: bool = True) -> Found:
         """Search: what the inputs explain first, then whether a source that no channel shows explains it better.
@@ -117,6 +120,8 @@ class Search:
         beside = self._beside_changed_paths(path[-1])
         last = min([path[-1], *beside], key=lambda joint: self.score(joint, 1.0))
         coloured = hidden and not self.evidence.is_noise(last.cost) and self.evidence.colour(last.residual) > CLEAN
+        if self.evidence.setting.rough and last.cost < FORM_LEAVES * before.cost:
+            coloured = False
         others = [*beside, *(self._with_hidden(path, last) if coloured else [])]
         last = min([last, *others], key=lambda joint: self.score(joint, 1.0))
         colour = self.evidence.colour(last.residual)
@@ -241,14 +246,16 @@ class Search:
     def _scan(self, base: Joint, candidates: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis, tuple[float, ...]]]:
         """Rank hypotheses by what their best grid point would take off the residual."""
         known = [columns_of(self.evidence, part.hypothesis, part.values)[0] for part in base.parts]
-        q = np.linalg.qr(np.concatenate(known, axis=1))[0] if known and sum(k.shape[1] for k in known) else None
+        whole = np.concatenate(known, axis=1) if known and sum(k.shape[1] for k in known) else None
+        q = None if whole is None else np.linalg.qr(whole)[0].astype(np.float32)
+        residual = base.residual.astype(np.float32)
         count, log_count = self.evidence.count, math.log(self.evidence.count)
         ranked = []
         for hypothesis in candidates:
             best: tuple[float, tuple[float, ...]] | None = None
             for values, table in self._grid(hypothesis):
                 x = table if q is None else table - q @ (q.T @ table)
-                gain = _taken(x, base.residual)
+                gain = _taken(x, residual)
                 if best is None or gain > best[0]:
                     best = (gain, values)
             if best is not None:
@@ -256,7 +263,7 @@ class Search:
                 ranked.append((count * math.log(left) + hypothesis.parameters * log_count, hypothesis, best[1]))
         return ranked
 
-    def _grid(self, hypothesis: Hypothesis) -> list[tuple[tuple[float, ...], Matrix]]:
+    def _grid(self, hypothesis: Hypothesis) -> list[tuple[tuple[float, ...], Rough]]:
         key = id(hypothesis)
         if key not in self._grids:
             points: list[tuple[float, ...]] = [()]
@@ -268,7 +275,8 @@ class Search:
             for values in points:
                 table = np.concatenate([hypothesis.trial(wave, values) for wave in self.evidence.waves])
                 table[~self.evidence.used] = 0.0
-                tables.append((values, self.evidence.without_nuisances(table)))
+                # Half the memory, and more digits than a first ranking needs.
+                tables.append((values, self.evidence.without_nuisances(table).astype(np.float32)))
             self._grids[key] = tables
         return self._grids[key]
 
@@ -341,12 +349,12 @@ class Search:
         return tuple(sorted(found.values(), key=lambda item: item.joint.cost))
 
 
-def _taken(x: Matrix, residual: Vector) -> float:
+def _taken(x: Rough, residual: Rough) -> float:
     """Return how much of the residual's sum of squares some columns take."""
     if x.shape[1] == 1:
         size = float(x[:, 0] @ x[:, 0])
         return float((x[:, 0] @ residual) ** 2 / size) if size > 1e-12 else 0.0
     q, r = np.linalg.qr(x)
-    good = np.abs(np.diag(r)) > 1e-9
+    good = np.abs(np.diag(r)) > 1e-5 * np.linalg.norm(r, axis=0) + 1e-9
     part = q.T @ residual
     return float(np.sum(part[good] ** 2))
