@@ -39,7 +39,7 @@ POLISHED, EXCHANGED = 12, 6
 CANCELS = 6.0
 #: Effects that take this share of what all take explain it; the rest rounds it off.
 MOSTLY = 0.7
-#: What effects leave up to this share of the sum of squares is their form's, where forms are not exact.
+#: What one effect leaves up to this share of the sum of squares is its form's, where forms are not exact.
 FORM_LEAVES = 0.08
 #: What a hidden source may leave of what channels leave, where forms are not exact.
 HIDDEN_LEAVES = 0.5
@@ -120,7 +120,8 @@ class Search:
         beside = self._beside_changed_paths(path[-1])
         last = min([path[-1], *beside], key=lambda joint: self.score(joint, 1.0))
         coloured = hidden and not self.evidence.is_noise(last.cost) and self.evidence.colour(last.residual) > CLEAN
-        if self.evidence.setting.rough and last.cost < FORM_LEAVES * before.cost:
+        effects = sum(not isinstance(part.hypothesis, ChangedPaths) for part in last.parts)
+        if self.evidence.setting.rough and effects <= 1 and last.cost < FORM_LEAVES * before.cost:
             coloured = False
         others = [*beside, *(self._with_hidden(path, last) if coloured else [])]
         last = min([last, *others], key=lambda joint: self.score(joint, 1.0))

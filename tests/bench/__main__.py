@@ -26,7 +26,7 @@ from compensator.model.engine import Engine
 from compensator.model.model_file import load_model
 from compensator.service.composition import run_service
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
-from tests.bench import audit, diagnosis, identification
+from tests.bench import audit, diagnosis, identification, machines, spindle
 
 PORT = 17461
 
@@ -160,6 +160,8 @@ def diagnoses() -> None:
     rows("diagnosis, published machine, 10 seeds a kind; targets 98 % named, removed 99 (97) %, under 10 s",
          ["effect", "named, nothing else", "removed %, median (tenth)", "s, median (most)"],
          diagnosis.table(10))  # fmt: skip
+    machines.report(1000, 26)
+    spindle.report()
 
 
 def main() -> None:

@@ -1,0 +1,86 @@
+"""Machines that are no transfer function: how often the effect is named, and what is left of it on another day.
+
+The conduction machine is calibrated by `identify` on a run without any effect; then an effect drawn by a seed acts for
+36 h of another duty, and the model that the diagnosis writes runs on a day that nothing saw. Excess: mean square over
+the noise and the calibration's own error, left of what the first model leaves; where the effect can be deployed.
+"""
+
+import dataclasses
+import time
+
+import numpy as np
+
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.search import Search
+from compensator.identify.calibration import calibrate, predict
+from compensator.identify.settings import Settings
+from compensator.model.thermal_model import EffectTable
+from sim_hardware.physics import Duty, QuillMachine, World, draw_effect, usual_sensors
+from tests.identify.quill_runs import runs_from
+
+#: About how much the effects move Y, µm standard deviation.
+SIZES_UM = (5.0, 2.5, 1.2)
+LASTING = ("input", "gain", "dynamics", "nonlinear", "scheduled", "hysteresis")
+HOURS = 36.0
+
+
+def runs(duty, seed, effects=(), heat=False):
+    sensors = usual_sensors(duty.extra_names, heat_known=heat, temperature_noise_k=0.02)
+    columns = World(QuillMachine(effects=effects), duty, sensors, seed).record(60.0)
+    columns.pop("t_s")
+    return runs_from(columns)
+
+
+def calibrated():
+    """The first model, as the command writes it."""
+    data = runs(Duty.working_day(5, hours=48.0), 11, heat=True)
+    calibration = calibrate(data, Settings(), period_s=60.0, name="conduction")
+    provenance = {"folds_rms_um": calibration.folds_rms_um}
+    return dataclasses.replace(calibration.model, provenance=provenance), calibration.folds_rms_um
+
+
+def one(model, own_um, seed, size_um):
+    """Return what acted, what was named, the excess left (NaN where nothing can be deployed), and seconds."""
+    effects = [draw_effect(seed, size_um, HOURS)] if size_um else []
+    evidence = evidence_of(model, runs(Duty.working_day(200 + seed, hours=HOURS), 300 + seed, effects))
+    began = time.perf_counter()
+    parts = Search(evidence).run().joint.parts
+    seconds = time.perf_counter() - began
+    named = [part.hypothesis.place for part in parts if not part.companion]
+    if not effects:
+        return None, named, np.nan, seconds
+    truth = effects[0].reveal().describe()
+    place = tuple(str(truth.get(key) or "") for key in ("kind", "path", "channel"))
+    deployed = [p for p in parts if p.hypothesis.deployable]
+    if all(part.companion for part in deployed):
+        deployed = []
+    tables = [EffectTable(kind=p.hypothesis.kind, table=p.hypothesis.table(p.values, p.amplitudes)) for p in deployed]
+    fresh = runs(Duty.working_day(700 + seed, hours=24.0), 800 + seed, effects)[0]
+
+    def error(candidate):
+        return float(np.var(fresh.y_um - predict(candidate, fresh)))
+
+    before = error(model) - own_um**2
+    if place[0] not in LASTING or before < 0.5 * own_um**2:
+        return place, named, np.nan, seconds
+    return place, named, (error(dataclasses.replace(model, effects=tuple(tables))) - own_um**2) / before, seconds
+
+
+def report(first, count):
+    """Print a row for each size, and one without an effect."""
+    model, own_um = calibrated()
+    print(f"\nconduction machine, effects drawn by seeds {first} to {first + count - 1}:")
+    print(f"{'size µm':<10}{'named':>12}{'alone':>12}{'excess left %':>28}{'s':>14}")
+    for size in (*SIZES_UM, 0.0):
+        results = [one(model, own_um, seed, size) for seed in range(first, first + count)]
+        named = sum((r[0] in r[1]) if r[0] else not r[1] for r in results)
+        alone = sum((r[1] == [r[0]]) if r[0] else not r[1] for r in results)
+        left = [100.0 * r[2] for r in results if np.isfinite(r[2])]
+        share = f"{np.median(left):.0f} (90 %: {np.quantile(left, 0.9):.0f})" if left else ""
+        seconds = [r[3] for r in results]
+        print(f"{size or 'none':<10}{f'{named} of {count}':>12}{f'{alone}':>12}{share:>28}"
+              f"{f'{np.median(seconds):.1f} ({max(seconds):.1f})':>14}", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    report(1000, 39)

@@ -1,0 +1,39 @@
+"""The loop closed on a machine that is no transfer function: effects of every kind, drawn by a seed and sealed."""
+
+import numpy as np
+import pytest
+
+from tests.bench import machines
+
+#: Thirteen seeds in a row draw thirteen kinds.
+SEEDS = range(400, 413)
+
+
+@pytest.fixture(scope="module")
+def first():
+    return machines.calibrated()
+
+
+@pytest.fixture(scope="module")
+def results(first):
+    model, own_um = first
+    return [machines.one(model, own_um, seed, 3.0) for seed in SEEDS]
+
+
+def test_effects_of_every_kind_are_named(results):
+    kinds = {place[0] for place, *_ in results}
+    assert len(kinds) == 11
+    missed = [(place, named) for place, named, *_ in results if place not in named]
+    assert len(missed) <= 2, missed
+
+
+def test_the_extended_model_takes_the_error_off_a_day_that_nothing_saw(results):
+    left = [excess for *_, excess, _ in results if np.isfinite(excess)]
+    assert len(left) >= 6
+    assert np.median(left) < 0.15
+    assert max(left) <= 1.05
+
+
+def test_nothing_is_named_where_nothing_acts(first):
+    model, own_um = first
+    assert [machines.one(model, own_um, seed, 0.0)[1] for seed in (500, 501, 502)] == [[], [], []]
