@@ -65,7 +65,8 @@ def commanded(compensation: Compensation, seq: int) -> None:
 
 
 def test_every_kind_of_effect_that_streams_is_among_them() -> None:
-    assert {kind for kind, _ in EFFECTS} == set(kinds())
+    """Other tests register kinds of their own."""
+    assert {kind for kind, _ in EFFECTS} == {kind for kind in kinds() if not kind.startswith("test-")}
 
 
 @pytest.mark.parametrize("name", MODELS)
