@@ -16,6 +16,9 @@ from compensator.report.page import Block, Details, Figure, Line, Page, Section,
 
 Vector = npt.NDArray[np.float64]
 
+#: Parameters of an effect that are shown at once; the others are there to open.
+SHOWN = 6
+
 _TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
 
 
@@ -77,7 +80,8 @@ def _errors(diagnosis: Diagnosis) -> Table:
 
 
 def _effect(t: Vector, effect: Effect) -> Section:
-    rows = [[key, with_std(value, effect.std[key])] for key, value in effect.part.named.items()]
+    parameters = [[key, with_std(value, effect.std[key])] for key, value in effect.part.named.items()]
+    rows = parameters[:SHOWN]
     rows.append(["residual without it, µm rms", f"{effect.rms_before_um:.3f}"])
     rows.append(["residual with it, µm rms", f"{effect.rms_after_um:.3f}"])
     deploy = "Runs in the service." if effect.deployable else "Cannot be deployed; the extended model leaves it out."
@@ -87,6 +91,9 @@ def _effect(t: Vector, effect: Effect) -> Section:
                lines=(Line("effect", t, effect.wave),), height=2.6),
         Table(head=["parameter", "value ± standard error"], rows=rows),
     ]  # fmt: skip
+    if len(parameters) > SHOWN:
+        head = ["parameter", "value ± standard error"]
+        blocks.append(Details(title=f"All {len(parameters)} parameters", blocks=[Table(head=head, rows=parameters)]))
     if effect.rivals:
         blocks.append(
             Words(
