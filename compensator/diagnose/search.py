@@ -120,8 +120,7 @@ class Search:
         beside = self._beside_changed_paths(path[-1])
         last = min([path[-1], *beside], key=lambda joint: self.score(joint, 1.0))
         coloured = hidden and not self.evidence.is_noise(last.cost) and self.evidence.colour(last.residual) > CLEAN
-        effects = sum(not isinstance(part.hypothesis, ChangedPaths) for part in last.parts)
-        if self.evidence.setting.rough and effects <= 1 and last.cost < FORM_LEAVES * before.cost:
+        if self.evidence.setting.rough and any(self._is_one(joint, before) for joint in (*path, *beside)):
             coloured = False
         others = [*beside, *(self._with_hidden(path, last) if coloured else [])]
         last = min([last, *others], key=lambda joint: self.score(joint, 1.0))
@@ -146,6 +145,11 @@ class Search:
                 break
             path.append(better)
         return path
+
+    def _is_one(self, joint: Joint, before: Joint) -> bool:
+        """Tell whether a single effect explains so much that the rest is its form's."""
+        effects = sum(not isinstance(part.hypothesis, ChangedPaths) for part in joint.parts)
+        return effects <= 1 and joint.cost < FORM_LEAVES * before.cost
 
     def _colour(self, joint: Joint) -> float:
         """Return the colour that counts while something may still be missing.
