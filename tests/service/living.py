@@ -94,7 +94,7 @@ class Machine:
         """Run the service and leave on disk what a kill after the last sample leaves, less some bytes."""
         copy = self.folder / "killed"
         last = len(self.outcomes) + samples
-        self.at_sample[last] = lambda: shutil.copytree(self.recordings, copy)
+        self.at_sample[last] = lambda: shutil.copytree(self.recordings, copy, ignore=shutil.ignore_patterns("*.part"))
         await self.run(samples)
         shutil.rmtree(self.recordings)
         copy.rename(self.recordings)
