@@ -9,23 +9,22 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any
-
-import msgspec
 
 from compensator import __version__
 from compensator.clock import Clock
 from compensator.config import Config
-from compensator.errors import CompensatorError, ServiceError
-from compensator.messages import SCHEMA, Event, Sample, Status, encode
-from compensator.service.adoption import LONGEST_MODEL, Adoption, Prepared, Wanted
+from compensator.messages import SCHEMA, Offset, Sample, Status, encode
+from compensator.service.adoption import Adoption
+from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.grid import Grid
-from compensator.service.publisher import COMMANDS, Reply
-from compensator.service.retrace import obey, samples_between
+from compensator.service.journal import Journal
+from compensator.service.publisher import Reply
+from compensator.service.retrace import samples_between
 from compensator.service.sampling import ChannelCollector
+from compensator.service.takeover import Takeover
 from drivers.errors import DriverError
 from drivers.reading import Device, Reading
 
@@ -33,8 +32,6 @@ log = logging.getLogger("compensator")
 
 #: Part of the poll interval that a sample waits for devices at most.
 WAIT_PART = 0.5
-#: Longest payload of a command that brings no model, bytes.
-LONGEST_COMMAND = 10_000
 
 
 @dataclass(slots=True)
@@ -58,17 +55,6 @@ class Latency:
         self.seconds.append(value)
         if len(self.seconds) > keep:
             del self.seconds[: keep // 2]
-
-
-@dataclass(slots=True)
-class _Adopting:
-    """A model that is being taken over, with the samples that came meanwhile."""
-
-    wanted: Wanted
-    reply: Future[dict[str, Any]]
-    since: list[Outcome] = field(default_factory=list)
-    prepared: Prepared | None = None
-    task: asyncio.Task[None] | None = None
 
 
 class Daemon:
@@ -104,21 +90,18 @@ class Daemon:
         self._config = config
         self._compensation = compensation
         self._devices = {name: _DeviceState(device) for name, device in devices.items()}
-        self._recorder = recorder
         self._publish = publish
         self._clock = clock
-        self._sequence = first_sequence
         fraction = config.sampling.min_good_fraction
         self._collectors = {channel.name: ChannelCollector(fraction) for channel in config.channel}
-        self._events: list[Event] = []
-        self._commands: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue(maxsize=100)
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._journal = Journal(
+            machine=config.machine.name, recorder=recorder, publish=publish, clock=clock, sequence=first_sequence
+        )
+        self._takeover = Takeover(adoption, self._journal, clock, lambda: self._compensation)
+        self._commands = Commands(self._journal, self._takeover)
         self._stop = False
-        self._recording_failed = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
-        self._adoption = adoption
-        self._adopting: _Adopting | None = None
         self._earlier = notes
         self._first = True
         #: Whether a sample broke off half-way, so that its file cannot give the state after it.
@@ -137,13 +120,13 @@ class Daemon:
         on_sample : callable, optional
             Called with the outcome after each sample was published.
         """
-        self._loop = asyncio.get_running_loop()
+        self._commands.open()
         period_s = self._compensation.model.period_s
         polls = max(1, round(period_s / self._config.sampling.poll_interval_s))
         grid = Grid(self._clock, period_s, polls)
-        self._note("start", f"compensator {__version__} with model {self._compensation.model.name}")
+        self._journal.note("start", f"compensator {__version__} with model {self._compensation.model.name}")
         for kind, text, data in self._earlier:
-            self._note(kind, text, data)
+            self._journal.note(kind, text, data)
         done = 0
         try:
             while not self._stop and (samples is None or done < samples):
@@ -171,7 +154,7 @@ class Daemon:
             return self._sample(label_ns) if label_ns is not None else None
         except Exception as error:
             log.exception("internal error")
-            self._note("error", f"internal error: {type(error).__name__}: {error}")
+            self._journal.note("error", f"internal error: {type(error).__name__}: {error}")
             self._compensation.fail()
             if label_ns is not None:
                 self._hold(label_ns)
@@ -179,24 +162,20 @@ class Daemon:
 
     def _hold(self, label_ns: int) -> None:
         """Publish that the last offset stands, without the sample that could not be worked on."""
-        offset = encode(self._compensation.held(self._config.machine.name, self._sequence, label_ns))
-        self._record([("offset", offset)], label_ns)
+        offset = encode(self._compensation.held(self._config.machine.name, self._journal.sequence, label_ns))
+        self._journal.record([("offset", offset)], label_ns, self._compensation.state())
         self._publish("offset", offset)
-        self._sequence += 1
+        self._journal.sequence += 1
 
     def stop(self) -> None:
         """End the run after the poll under way; the recording is finished."""
         self._stop = True
 
     async def _close(self) -> None:
-        self._stop = True
-        await self._end_adoption()
-        self._note("stop", "the service ends")
-        self._record([], self._clock.utc_ns())
-        try:
-            self._recorder.close()
-        except OSError as error:
-            self._publish_event("recording", f"the recording could not be finished: {error}")
+        self.stop()
+        self._commands.close()
+        await self._takeover.end()
+        self._journal.close(self._compensation.state())
         for state in self._devices.values():
             if state.task is not None:
                 state.task.cancel()
@@ -241,7 +220,7 @@ class Daemon:
         """Note once when a device goes, and once when it comes back."""
         if bool(error) != bool(state.error):
             name = state.device.name
-            self._note("device", error or f"{name}: answers again", {"device": name, "ok": not error})
+            self._journal.note("device", error or f"{name}: answers again", {"device": name, "ok": not error})
         state.error = error
 
     # ------------------------------------------------------------------ one sample
@@ -249,39 +228,38 @@ class Daemon:
     def _sample(self, label_ns: int) -> Outcome:
         began = time.perf_counter()
         self._pass_pause(label_ns)
-        self._swap()
+        self._compensation = self._takeover.swap()
         if self._broken_off:
-            self._start_new_file()
+            self._journal.start_new_file()
         state = self._compensation.state()
         self._broken_off = True
-        self._obey()
+        self._commands.obey(self._compensation)
         raw = Sample(
-            schema=SCHEMA, machine=self._config.machine.name, seq=self._sequence, time_utc_ns=label_ns,
+            schema=SCHEMA, machine=self._config.machine.name, seq=self._journal.sequence, time_utc_ns=label_ns,
             period_s=self._compensation.model.period_s,
             channels={name: collector.close() for name, collector in self._collectors.items()},
         )  # fmt: skip
         outcome = self._compensation.process(raw)
         self._broken_off = False
         for kind, text in outcome.notes:
-            self._note(kind, text)
-        outcome = self._with_recording_state(outcome)
-        self._tell_state(outcome)
+            self._journal.note(kind, text)
+        offset = self._journal.marked(outcome.offset)
+        self._tell_state(offset)
         records = [
             ("sample", encode(outcome.sample)),
             ("estimate", encode(outcome.estimate)),
-            ("offset", encode(outcome.offset)),
+            ("offset", encode(offset)),
         ]
-        if not self._record(records, label_ns, state):
-            outcome = self._with_recording_state(outcome)
-            records[2] = ("offset", encode(outcome.offset))
-        self._publish("offset", records[2][1])
+        if not self._journal.record(records, label_ns, state):
+            offset = self._journal.marked(offset)
+        outcome = Outcome(outcome.sample, outcome.estimate, offset, outcome.notes)
+        self._publish("offset", encode(offset))
         self.latency.add(time.perf_counter() - began)
         self._publish("sample", records[0][1])
         self._publish("estimate", records[1][1])
         self._publish("status", encode(self._status(outcome)))
-        self._sequence += 1
-        if self._adopting is not None:
-            self._adopting.since.append(outcome)
+        self._journal.sequence += 1
+        self._takeover.follow(outcome)
         return outcome
 
     def _pass_pause(self, label_ns: int) -> None:
@@ -307,38 +285,7 @@ class Daemon:
                 f"{minutes:.0f} min are bridged" if minutes <= bridged
                 else f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
             )  # fmt: skip
-        self._note("restart", text, data | {"y_std_um": self._compensation.std_um})
-
-    def _record(self, records: list[tuple[str, bytes]], time_utc_ns: int, state: bytes | None = None) -> bool:
-        """Bring records and waiting events to disk; tell whether it worked.
-
-        `state` is that before the sample among the records; without one it is as it is now.
-        """
-        events = [("event", encode(event)) for event in self._events]
-        state = self._compensation.state() if state is None else state
-        try:
-            self._recorder.write([*events, *records], time_utc_ns, state=state)
-        except OSError as error:
-            if not self._recording_failed:
-                self._recording_failed = True
-                self._note("recording", f"the disk does not take the recording: {error}")
-            return False
-        if self._recording_failed:
-            self._recording_failed = False
-            self._note("recording", "the disk takes the recording again")
-        self._events = self._events[len(events) :]
-        for text, data in self._recorder.remarks():
-            self._note("recording", text, data)
-        return True
-
-    def _with_recording_state(self, outcome: Outcome) -> Outcome:
-        """Say in the offset that the disk does not take the recording."""
-        offset = outcome.offset
-        if not self._recording_failed or "recording_failed" in offset.reasons:
-            return outcome
-        state = "degraded" if offset.state == "ok" else offset.state
-        changed = msgspec.structs.replace(offset, state=state, reasons=[*offset.reasons, "recording_failed"])
-        return Outcome(outcome.sample, outcome.estimate, changed, outcome.notes)
+        self._journal.note("restart", text, data | {"y_std_um": self._compensation.std_um})
 
     def _status(self, outcome: Outcome) -> Status:
         model = self._compensation.model
@@ -347,35 +294,21 @@ class Daemon:
             time_utc_ns=outcome.offset.time_utc_ns, state=outcome.offset.state, reasons=outcome.offset.reasons,
             version=__version__, model=model.name, model_kind=model.kind, model_sha256=model.sha256,
             started_utc_ns=self._started_utc_ns,
-            recording=self._recorder.path.name if self._recorder.path else "",
+            recording=self._journal.file,
             devices={name: state.error or "ok" for name, state in self._devices.items()},
         )  # fmt: skip
 
     # ------------------------------------------------------------------ events and commands
 
-    def _note(self, kind: str, text: str, data: dict[str, Any] | None = None) -> None:
-        """Keep an event for the recording and publish it."""
-        event = Event(
-            schema=SCHEMA, machine=self._config.machine.name, seq=self._sequence,
-            time_utc_ns=self._clock.utc_ns(), kind=kind, text=text, data=data or {},
-        )  # fmt: skip
-        # Bounded, so that a disk that is gone for long costs no memory; the newest are kept.
-        self._events = [*self._events[-999:], event]
-        self._publish("event", encode(event))
-
-    def _publish_event(self, kind: str, text: str) -> None:
-        self._note(kind, text)
-
-    def _tell_state(self, outcome: Outcome) -> None:
-        offset = outcome.offset
+    def _tell_state(self, offset: Offset) -> None:
         now = " ".join([offset.state, *offset.reasons])
         if now != self._last_state:
-            self._note("state", now, {"state": offset.state, "reasons": offset.reasons})
+            self._journal.note("state", now, {"state": offset.state, "reasons": offset.reasons})
             self._last_state = now
 
     def _tell_clock_step(self, seconds: float) -> None:
         if seconds:
-            self._note("clock", f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
+            self._journal.note("clock", f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
 
     def command(self, name: str, payload: bytes) -> Reply:
         """Take a command from another thread; it acts at the next sample.
@@ -393,129 +326,4 @@ class Daemon:
         dict or Future of dict
             `ok` and `text`; a promise of them for `adopt` and `back`, whose warm-up takes its time.
         """
-        brings_model = name in ("adopt", "back")
-        if len(payload) > (LONGEST_MODEL if brings_model else LONGEST_COMMAND):
-            return _refusal(f"{name}: the payload has {len(payload)} bytes, more than a command may have")
-        try:
-            arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            return _refusal(f"{name}: the payload is no JSON object")
-        mode = arguments.get("mode", "auto")
-        if name not in COMMANDS or (name == "zero" and mode not in ("auto", "rest", "warm")):
-            return _refusal(
-                f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back"
-            )
-        if self._loop is None or self._stop or self._commands.full():
-            return _refusal("the service cannot take a command now")
-        if brings_model:
-            return self._adopt_later(name, arguments)
-        self._loop.call_soon_threadsafe(self._enqueue, name, arguments)
-        return {"ok": True, "text": f"{name}: acts at the next sample"}
-
-    def _enqueue(self, name: str, arguments: dict[str, Any]) -> None:
-        if not self._commands.full():
-            self._commands.put_nowait((name, arguments))
-
-    def _obey(self) -> None:
-        while not self._commands.empty():
-            name, arguments = self._commands.get_nowait()
-            self._note("command", name, arguments)
-            obey(self._compensation, name, arguments)
-
-    # ------------------------------------------------------------------ another model
-
-    def _adopt_later(self, name: str, arguments: dict[str, Any]) -> Reply:
-        assert self._loop is not None
-        try:
-            wanted = Wanted.of(name, arguments)
-        except ServiceError as error:
-            return _refusal(str(error))
-        reply: Future[dict[str, Any]] = Future()
-        self._loop.call_soon_threadsafe(self._begin_adoption, wanted, reply)
-        return reply
-
-    def _begin_adoption(self, wanted: Wanted, reply: Future[dict[str, Any]]) -> None:
-        if self._adoption is None or self._stop or self._adopting is not None:
-            why = "another model is under way" if self._adopting is not None else "this service takes no model now"
-            reply.set_result(_refusal(f"{wanted.action}: {why}"))
-            return
-        # The text of the model is not repeated here: it travels in the recording that begins with it.
-        self._note("command", wanted.action, {"sha256": wanted.sha256, "force": wanted.force})
-        self._adopting = _Adopting(wanted, reply)
-        self._adopting.task = asyncio.create_task(self._prepare(self._adoption, self._adopting))
-        self._adopting.task.add_done_callback(self._tell_refusal)
-
-    async def _prepare(self, adoption: Adoption, adopting: _Adopting) -> None:
-        """Have the model made ready on another thread; then answer. The swap is the next sample's."""
-        running = self._compensation
-        zero = running.zero_that_stands if running.has_reference else None
-        prepared = await asyncio.to_thread(adoption.prepare, adopting.wanted, running.model, zero, self._clock.utc_ns())
-        adopting.prepared = prepared
-        model = prepared.compensation.model
-        how = f"warmed up on {prepared.samples} sample(s) of {prepared.minutes / 60.0:.1f} h"
-        if not prepared.known:
-            how += f", too little to know its state: standard deviation {prepared.compensation.std_um:.1f} µm for now"
-        adopting.reply.set_result({
-            "ok": True, "text": f"model {model.name} ({model.sha256[:12]}) is taken over at the next sample, {how}",
-            "model": model.name, "model_sha256": model.sha256, "warm_up_min": prepared.minutes,
-            "warm_up_samples": prepared.samples, "state_known": prepared.known,
-        })  # fmt: skip
-
-    def _tell_refusal(self, task: asyncio.Task[None]) -> None:
-        """Answer that nothing comes of it, whatever the reason: the running model goes on."""
-        adopting, error = self._adopting, None if task.cancelled() else task.exception()
-        if adopting is None or error is None:
-            return
-        self._adopting = None
-        text = str(error)
-        if not isinstance(error, CompensatorError):
-            log.error("internal error", exc_info=error)
-            text = f"internal error: {type(error).__name__}: {error}"
-        self._note("adopt", f"refused: {text}", {"ok": False, "action": adopting.wanted.action})
-        adopting.reply.set_result(_refusal(text))
-
-    def _swap(self) -> None:
-        """Put a model that is ready in the place of the running one."""
-        adopting = self._adopting
-        if adopting is None or adopting.prepared is None:
-            return
-        self._adopting = None
-        old, prepared = self._compensation, adopting.prepared
-        new = prepared.compensation
-        for outcome in adopting.since:
-            zeroed = any(kind == "zero" for kind, _ in outcome.notes)
-            how = "rest" if outcome.estimate.y_base_um == 0.0 else "warm"
-            prepared.catch_up(outcome.sample, how if zeroed else None)  # type: ignore[arg-type]
-        difference = new.target_um - old.target_um
-        new.succeed(old)
-        self._compensation = new
-        self._recorder.attachments = {**self._recorder.attachments, "model.toml": prepared.data}
-        self._start_new_file()
-        named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
-        self._note(
-            "adopt",
-            f"model {named[0]} in the place of {named[1]}, "
-            f"warm-up {prepared.minutes / 60.0:.1f} h, the offset is to move by {difference:+.2f} µm",
-            {
-                "ok": True, "action": adopting.wanted.action, "old_sha256": old.model.sha256,
-                "new_sha256": new.model.sha256, "warm_up_min": prepared.minutes, "warm_up_samples": prepared.samples,
-                "state_known": prepared.known, "difference_um": difference, "y_std_um": new.std_um,
-            },
-        )  # fmt: skip
-
-    def _start_new_file(self) -> None:
-        try:
-            self._recorder.start_new()
-        except OSError as error:
-            self._note("recording", f"the recording could not be finished: {error}")
-
-    async def _end_adoption(self) -> None:
-        """Let the adoption under way be answered: a model that was kept is used at the next start."""
-        await asyncio.sleep(0)  # one that was asked for just now is refused
-        adopting = self._adopting
-        if adopting is not None and adopting.task is not None:
-            await asyncio.gather(adopting.task, return_exceptions=True)
-
-
-def _refusal(text: str) -> dict[str, Any]:
-    return {"ok": False, "text": text}
+        return self._commands.take(name, payload)

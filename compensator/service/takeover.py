@@ -1,0 +1,142 @@
+"""Another model in the place of the running one: prepared on a thread, swapped in between two samples."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any
+
+from compensator.clock import Clock
+from compensator.errors import CompensatorError
+from compensator.service.adoption import Adoption, Prepared, Wanted
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.journal import Journal
+
+log = logging.getLogger("compensator")
+
+
+@dataclass(slots=True)
+class _Adopting:
+    """A model that is being taken over, with the samples that came meanwhile."""
+
+    wanted: Wanted
+    reply: Future[dict[str, Any]]
+    since: list[Outcome] = field(default_factory=list)
+    prepared: Prepared | None = None
+    task: asyncio.Task[None] | None = None
+
+
+class Takeover:
+    """Takes one model over at a time.
+
+    Parameters
+    ----------
+    adoption : Adoption or None
+        Prepares models; without it every one is refused.
+    journal : Journal
+        Where it is noted.
+    clock : Clock
+        For the history of models.
+    running : callable
+        Returns the compensation that runs.
+    """
+
+    def __init__(
+        self, adoption: Adoption | None, journal: Journal, clock: Clock, running: Callable[[], Compensation]
+    ) -> None:
+        self._adoption = adoption
+        self._journal = journal
+        self._clock = clock
+        self._running = running
+        self._adopting: _Adopting | None = None
+        self._ended = False
+
+    def begin(self, wanted: Wanted, reply: Future[dict[str, Any]]) -> None:
+        """Begin to make a model ready; the reply comes once it is, or is refused. In the loop only."""
+        if self._adoption is None or self._ended or self._adopting is not None:
+            why = "another model is under way" if self._adopting is not None else "this service takes no model now"
+            reply.set_result(refusal(f"{wanted.action}: {why}"))
+            return
+        # The text of the model is not repeated here: it travels in the recording that begins with it.
+        self._journal.note("command", wanted.action, {"sha256": wanted.sha256, "force": wanted.force})
+        self._adopting = _Adopting(wanted, reply)
+        self._adopting.task = asyncio.create_task(self._prepare(self._adoption, self._adopting))
+        self._adopting.task.add_done_callback(self._tell_refusal)
+
+    def follow(self, outcome: Outcome) -> None:
+        """Take note of a sample that comes while a model is made ready."""
+        if self._adopting is not None:
+            self._adopting.since.append(outcome)
+
+    def swap(self) -> Compensation:
+        """Return the compensation to go on with: the running one, or one with a model that is ready."""
+        adopting, old = self._adopting, self._running()
+        if adopting is None or adopting.prepared is None:
+            return old
+        self._adopting = None
+        prepared = adopting.prepared
+        new = prepared.compensation
+        for outcome in adopting.since:
+            zeroed = any(kind == "zero" for kind, _ in outcome.notes)
+            how = "rest" if outcome.estimate.y_base_um == 0.0 else "warm"
+            prepared.catch_up(outcome.sample, how if zeroed else None)  # type: ignore[arg-type]
+        difference = new.target_um - old.target_um
+        new.succeed(old)
+        self._journal.start_new_file(prepared.data)
+        named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
+        self._journal.note(
+            "adopt",
+            f"model {named[0]} in the place of {named[1]}, "
+            f"warm-up {prepared.minutes / 60.0:.1f} h, the offset is to move by {difference:+.2f} µm",
+            {
+                "ok": True, "action": adopting.wanted.action, "old_sha256": old.model.sha256,
+                "new_sha256": new.model.sha256, "warm_up_min": prepared.minutes, "warm_up_samples": prepared.samples,
+                "state_known": prepared.known, "difference_um": difference, "y_std_um": new.std_um,
+            },
+        )  # fmt: skip
+        return new
+
+    async def end(self) -> None:
+        """Let what is under way be answered: a model that was kept is used at the next start."""
+        self._ended = True
+        await asyncio.sleep(0)  # one that was asked for just now is refused
+        adopting = self._adopting
+        if adopting is not None and adopting.task is not None:
+            await asyncio.gather(adopting.task, return_exceptions=True)
+
+    async def _prepare(self, adoption: Adoption, adopting: _Adopting) -> None:
+        """Have the model made ready on another thread; then answer. The swap is the next sample's."""
+        running = self._running()
+        zero = running.zero_that_stands if running.has_reference else None
+        prepared = await asyncio.to_thread(adoption.prepare, adopting.wanted, running.model, zero, self._clock.utc_ns())
+        adopting.prepared = prepared
+        model = prepared.compensation.model
+        how = f"warmed up on {prepared.samples} sample(s) of {prepared.minutes / 60.0:.1f} h"
+        if not prepared.known:
+            how += f", too little to know its state: standard deviation {prepared.compensation.std_um:.1f} µm for now"
+        adopting.reply.set_result({
+            "ok": True, "text": f"model {model.name} ({model.sha256[:12]}) is taken over at the next sample, {how}",
+            "model": model.name, "model_sha256": model.sha256, "warm_up_min": prepared.minutes,
+            "warm_up_samples": prepared.samples, "state_known": prepared.known,
+        })  # fmt: skip
+
+    def _tell_refusal(self, task: asyncio.Task[None]) -> None:
+        """Answer that nothing comes of it, whatever the reason: the running model goes on."""
+        adopting, error = self._adopting, None if task.cancelled() else task.exception()
+        if adopting is None or error is None:
+            return
+        self._adopting = None
+        text = str(error)
+        if not isinstance(error, CompensatorError):
+            log.error("internal error", exc_info=error)
+            text = f"internal error: {type(error).__name__}: {error}"
+        self._journal.note("adopt", f"refused: {text}", {"ok": False, "action": adopting.wanted.action})
+        adopting.reply.set_result(refusal(text))
+
+
+def refusal(text: str) -> dict[str, Any]:
+    """Return the answer to a command that is not taken."""
+    return {"ok": False, "text": text}
