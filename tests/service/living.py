@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import math
 import shutil
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,8 @@ from sim_hardware.physics import Duty, PublishedQuill, World
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
 
 MACHINE = "vmc-07"
+#: Real seconds that a poll takes at least while the service works on a command.
+PATIENCE_S = 0.01
 
 
 def settings(**changes: Any) -> Config:
@@ -50,8 +54,14 @@ class Machine:
         self.at_sample: dict[int, Callable[[], Any]] = {}
         self.daemon: Daemon | None = None
 
+        #: Promises of commands; while one is open simulated time does not run away from the thread that works on it.
+        self.promised: list[Future[Any]] = []
+
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
+            self.promised = [promise for promise in self.promised if not promise.done()]
+            if self.promised:
+                await asyncio.sleep(PATIENCE_S)
 
         self.clock = VirtualClock(START_NS, advance)
 
@@ -65,7 +75,10 @@ class Machine:
 
     def command(self, name: str, payload: bytes = b"") -> Any:
         assert self.daemon is not None
-        return self.daemon.command(name, payload)
+        reply = self.daemon.command(name, payload)
+        if isinstance(reply, Future):
+            self.promised.append(reply)
+        return reply
 
     async def run(self, samples: int, until: Callable[[Outcome], bool] = lambda outcome: False) -> None:
         """Start the service, run it, end it cleanly."""

@@ -87,11 +87,18 @@ async def test_the_running_service_takes_a_model_over_as_if_it_had_run_all_the_t
     event = machine.events("adopt")[-1]
     assert event.data["old_sha256"] == sha256_of(QUILL) and event.data["new_sha256"] == sha256_of(model)
     assert event.data["state_known"] and event.data["warm_up_samples"] >= 200
-    difference = event.data["difference_um"]
-    under_way = [o for o in new if "model_changed" in o.offset.reasons]
-    if abs(difference) > 4.0:
-        assert under_way == new[: len(under_way)] and len(under_way) >= abs(difference) / 2.0 - 2
-        assert all(o.offset.state == "degraded" and "rate_limited" in o.offset.reasons for o in under_way)
+    # It goes the whole way at the limit, towards what the new model wants at that moment, and says so until then.
+    at_um, limit_um, on_the_way = number(machine.outcomes[swap - 1].offset.y_offset_um), 2.0, True
+    for outcome in new:
+        wanted_um = -number(whole[outcome.offset.time_utc_ns].estimate.y_pred_um)
+        on_the_way = on_the_way and abs(wanted_um - at_um) > limit_um
+        at_um += min(max(wanted_um - at_um, -limit_um), limit_um)
+        assert number(outcome.offset.y_offset_um) == pytest.approx(at_um, abs=1e-9)
+        assert ("model_changed" in outcome.offset.reasons) == on_the_way
+        assert outcome.offset.state == "degraded" or not on_the_way
+    last = machine.outcomes[swap - 1]
+    change_um = number(last.estimate.y_pred_um) - number(whole[last.offset.time_utc_ns].estimate.y_pred_um)
+    assert event.data["difference_um"] == pytest.approx(change_um, abs=1e-9)
     assert "model_changed" not in new[-1].offset.reasons
     assert number(new[-1].offset.y_offset_um) == whole[new[-1].offset.time_utc_ns].offset.y_offset_um
     # The new model travels in a file of its own, from which all its outcomes come again.
