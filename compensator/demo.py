@@ -6,6 +6,7 @@ service. Time is handed in, so that the day takes seconds.
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import csv
 import hashlib
@@ -28,6 +29,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from compensator.clock import NS, VirtualClock
+from compensator.commands import Answer
 from compensator.commands.diagnose import diagnose_files
 from compensator.commands.identify import Request, identify
 from compensator.config import Zenoh, load_config
@@ -97,6 +99,11 @@ class Day:
     truth: Mapping[str, Vector]
     seconds: float
     adopted_at: int = 0
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command `demo`."""
+    return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed))
 
 
 def run_demo(out: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], str]:
@@ -195,7 +202,7 @@ def paper_case(folder: Path, *, seed: int) -> dict[str, Any]:
     settings = Settings(order=(3, 3, 2), drive="known")
     return identify(
         Request(data=[table], out=folder / "model.toml", name="paper", settings=settings, reference="quill")
-    )[0]
+    ).result
 
 
 # ---------------------------------------------------------------------------- the loop
@@ -225,7 +232,7 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> dict[str, Any]:
     before = folder / "with-effect"
     run_day(before, machine="conduction", hours=hours, seed=seed + 1, model=first, effects=[effect])
     recordings = sorted((before / "recordings").glob("*.mcap"))
-    found = diagnose_files(recordings, folder / "calibration" / "model.toml", folder / "diagnosis")[0]
+    found = diagnose_files(recordings, folder / "calibration" / "model.toml", folder / "diagnosis").result
     # An adequate model is left as it was: there is nothing to take over.
     adopt = (
         folder / "diagnosis" / "model.toml"
@@ -668,4 +675,4 @@ def _pictures(name: str, day: Day) -> list[Figure]:
     ]  # fmt: skip
 
 
-__all__ = ["Day", "Scores", "configuration", "hardware", "run_day", "run_demo"]
+__all__ = ["Day", "Scores", "configuration", "hardware", "run", "run_day", "run_demo"]

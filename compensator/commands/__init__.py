@@ -1,1 +1,23 @@
-"""Commands that are more than a few lines: one file each, called by `compensator.cli`."""
+"""The commands: one file each, named in `compensator.cli` and loaded when they are called."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+
+class Answer(NamedTuple):
+    """What a command answers.
+
+    Parameters
+    ----------
+    result : dict
+        For `--json`.
+    text : str
+        For people.
+    code : int
+        Exit code: 0 done, 1 failed, 3 an audit found a difference.
+    """
+
+    result: dict[str, Any]
+    text: str
+    code: int = 0

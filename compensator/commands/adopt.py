@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 from compensator.clock import SystemClock
+from compensator.commands import Answer
 from compensator.config import LoadedConfig
 from compensator.errors import ServiceError
 from compensator.model.model_file import read_model_bytes
@@ -18,13 +19,8 @@ from compensator.service.publisher import ask
 NOT_REACHED = "The service was not reached; it uses the model from its next start on."
 
 
-def adopt(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def adopt(arguments: argparse.Namespace) -> Answer:
     """Check a model, have the running service take it over, or keep it for the next start.
-
-    Returns
-    -------
-    dict, str
-        Result and text.
 
     Raises
     ------
@@ -43,7 +39,7 @@ def adopt(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return _answered(reply, f"model {model.name} ({model.sha256[:12]}) is kept in {loaded.store()}.", model.sha256)
 
 
-def back(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
+def back(arguments: argparse.Namespace) -> Answer:
     """Have the running service go back to the model before, or keep that for the next start.
 
     Raises
@@ -69,10 +65,10 @@ def _store(loaded: LoadedConfig) -> ModelStore:
     return ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
 
 
-def _answered(reply: dict[str, Any] | None, kept: str, sha256: str) -> tuple[dict[str, Any], str]:
+def _answered(reply: dict[str, Any] | None, kept: str, sha256: str) -> Answer:
     if reply is None:
         text = f"{kept} {NOT_REACHED}"
-        return {"ok": True, "service_reached": False, "model_sha256": sha256, "text": text}, text
+        return Answer({"ok": True, "service_reached": False, "model_sha256": sha256, "text": text}, text)
     if not reply.get("ok"):
         raise ServiceError(f"the service refuses: {reply.get('text', 'no reason given')}")
-    return {**reply, "service_reached": True}, str(reply.get("text", ""))
+    return Answer({**reply, "service_reached": True}, str(reply.get("text", "")))

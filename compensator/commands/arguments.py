@@ -1,9 +1,44 @@
-"""Arguments of the larger commands; apart from them, so that asking for help loads no numbers."""
+"""Arguments of the commands; apart from them, so that asking for help loads no numbers."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+
+_COLUMN = "role of a column of another name"
+
+
+def demo(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `demo`."""
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder for the results")
+    add("--hours", type=float, default=24.0, help="length of the simulated run, h (default 24)")
+    add("--seed", type=int, default=1, help="seed of the simulated day (default 1)")
+
+
+def of_service(parser: argparse.ArgumentParser) -> None:
+    """Describe the argument of `run`, `check` and `probe`."""
+    parser.add_argument("--config", required=True, metavar="FILE", help="configuration of the service")
+
+
+def simulate(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `simulate`."""
+    add = parser.add_argument
+    add("data", type=Path, metavar="DATA", help="CSV, or a recording")
+    add("--model", required=True, help="a model file, or quill")
+    add("--out", type=Path, required=True, metavar="CSV")
+    add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
+
+
+def export(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `export`."""
+    parser.add_argument("recording", type=Path, metavar="FILE.mcap")
+    parser.add_argument("--out", type=Path, required=True, metavar="CSV")
+
+
+def explain(parser: argparse.ArgumentParser) -> None:
+    """Describe the argument of `explain`."""
+    parser.add_argument("code", metavar="CODE", help="such as degraded, or t_q_missing")
 
 
 def identify(parser: argparse.ArgumentParser) -> None:
@@ -11,7 +46,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
     add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html comes beside it")
-    add("--column", action="append", default=[], metavar="ROLE=NAME", help="role of a column of another name")
+    add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
     add("--name", help="name of the model (default: that of the file)")
     words = "with a TTF, or from T_Q - AT straight to y (default: with one where heat_w is known)"
     add("--kind", choices=("auto", "heat", "direct"), default="auto", help=words)
@@ -40,7 +75,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="DIR", help="diagnosis.json, model.toml and report.html come there")
-    add("--column", action="append", default=[], metavar="ROLE=NAME", help="role of a column of another name")
+    add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
 
 
 def replay(parser: argparse.ArgumentParser) -> None:
@@ -60,8 +95,8 @@ def adopt(parser: argparse.ArgumentParser) -> None:
 
 def back(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `back`, which `adopt` has too."""
+    of_service(parser)
     add = parser.add_argument
-    add("--config", required=True, metavar="FILE", help="configuration of the service")
     words = "take it even where the recordings do not determine its state; the standard deviation says what that costs"
     add("--force", action="store_true", help=words)
     add("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the service's reply, s (60)")

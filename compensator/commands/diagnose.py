@@ -8,9 +8,9 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from compensator import __version__
+from compensator.commands import Answer
 from compensator.commands.identify import progress, read_runs
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.outcome import Diagnosis
@@ -21,8 +21,8 @@ from compensator.report.diagnosis import write_report
 from compensator.tables import roles_of
 
 
-def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    """Run the command; return its result and its text.
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command.
 
     Raises
     ------
@@ -32,9 +32,7 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return diagnose_files(arguments.data, arguments.model, arguments.out, columns=arguments.column)
 
 
-def diagnose_files(
-    data: Sequence[Path], model: str | Path, out: Path, *, columns: Sequence[str] = ()
-) -> tuple[dict[str, Any], str]:
+def diagnose_files(data: Sequence[Path], model: str | Path, out: Path, *, columns: Sequence[str] = ()) -> Answer:
     """Diagnose files and write `diagnosis.json`, `model.toml` and `report.html` into a folder."""
     base = load_model(model)
     remarks: list[str] = []
@@ -44,10 +42,8 @@ def diagnose_files(
     return write(diagnosis, base.sha256, data, out, remarks)
 
 
-def write(
-    diagnosis: Diagnosis, base_sha256: str, data: Sequence[Path], out: Path, remarks: Sequence[str]
-) -> tuple[dict[str, Any], str]:
-    """Write what was found; return it and its text."""
+def write(diagnosis: Diagnosis, base_sha256: str, data: Sequence[Path], out: Path, remarks: Sequence[str]) -> Answer:
+    """Write what was found."""
     out.mkdir(parents=True, exist_ok=True)
     found = figures(diagnosis)
     provenance = dict(diagnosis.model.provenance) | {
@@ -64,4 +60,4 @@ def write(
     files = {"model": str(out / "model.toml"), "model_sha256": model.sha256, "report": str(page)}
     words = [text(diagnosis), *([f"remarks: {'; '.join(remarks)}"] if remarks else []),
              f"model: {files['model']}\npage: {page}"]  # fmt: skip
-    return {**found, **files}, "\n\n".join(words)
+    return Answer({**found, **files}, "\n\n".join(words))

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from compensator import __version__
+from compensator.commands import Answer
 from compensator.commands.progress import progress
 from compensator.errors import UsageError
 from compensator.identify.calibration import Calibration, calibrate
@@ -74,8 +75,8 @@ class Request:
                 raise UsageError(f"--validate {path}: takes part in the fit, expected a run that does not")
 
 
-def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    """Run the command; return its result and its text.
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command.
 
     Raises
     ------
@@ -95,8 +96,8 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return identify(request)
 
 
-def identify(request: Request) -> tuple[dict[str, Any], str]:
-    """Make a model of files, write it and its page; return the result and its text.
+def identify(request: Request) -> Answer:
+    """Make a model of files, write it and its page.
 
     Raises
     ------
@@ -116,10 +117,8 @@ def identify(request: Request) -> tuple[dict[str, Any], str]:
     return write(calibration, criticise(calibration), request.out, reference=request.reference)
 
 
-def write(
-    calibration: Calibration, criticism: Criticism, out: Path, *, reference: str | None = None
-) -> tuple[dict[str, Any], str]:
-    """Write the model file and the page beside it; return the result and its text."""
+def write(calibration: Calibration, criticism: Criticism, out: Path, *, reference: str | None = None) -> Answer:
+    """Write the model file and the page beside it."""
     from compensator.report.identification import write_report
 
     model = write_model(out, finished(calibration, criticism))
@@ -130,7 +129,7 @@ def write(
         result["comparison"] = [
             {"path": r.path, "figure": r.figure, "found": r.found, "std": r.std, "reference": r.reference} for r in rows
         ]
-    return result, f"{text(calibration, criticism)}\n\nmodel: {out}\npage: {page}"
+    return Answer(result, f"{text(calibration, criticism)}\n\nmodel: {out}\npage: {page}")
 
 
 def finished(calibration: Calibration, criticism: Criticism) -> ThermalModel:

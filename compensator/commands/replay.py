@@ -6,10 +6,10 @@ import argparse
 import csv
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
+from compensator.commands import Answer
 from compensator.commands.progress import progress
 from compensator.errors import UsageError
 from compensator.model.model_file import load_model
@@ -18,8 +18,8 @@ from compensator.model.model_file import load_model
 FOUND = 3
 
 
-def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str, int]:
-    """Run the command; return its result, its text and the exit code.
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command.
 
     Raises
     ------
@@ -35,10 +35,10 @@ def run(arguments: argparse.Namespace) -> tuple[dict[str, Any], str, int]:
         raise UsageError("--out: is for --model, which is not given")
     with progress("auditing") as told:
         found = audit(paths, public_key=arguments.public_key, told=told)
-    return found.as_json(), summary(found), 0 if found.clean else FOUND
+    return Answer(found.as_json(), summary(found), 0 if found.clean else FOUND)
 
 
-def _compare(paths: list[Path], name: str, out: Path | None) -> tuple[dict[str, Any], str, int]:
+def _compare(paths: list[Path], name: str, out: Path | None) -> Answer:
     model = load_model(name)
     with progress("comparing") as told, out.open("w", newline="", encoding="utf-8") if out else nullcontext() as file:
         row = None
@@ -47,7 +47,7 @@ def _compare(paths: list[Path], name: str, out: Path | None) -> tuple[dict[str, 
             row(COLUMNS)
         found = compare(paths, model, told=told, row=row)
     text = found.text() + (f"\nboth offsets: {out}" if out else "")
-    return found.as_json() | ({"out": str(out)} if out else {}), text, 0
+    return Answer(found.as_json() | ({"out": str(out)} if out else {}), text)
 
 
 def _files(given: list[Path]) -> list[Path]:

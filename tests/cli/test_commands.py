@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import os
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensator.cli import main
+from compensator.cli import COMMANDS, load, main
 from compensator.demo import START_NS, configuration, hardware, run_day
 from compensator.model.model_file import load_model
 from compensator.recording import read_messages, recordings
@@ -309,3 +310,21 @@ def test_explain_knows_every_state_and_refuses_others(capsys: pytest.CaptureFixt
         assert main(["explain", code]) == 0
     assert main(["explain", "nonsense"]) == 2
     assert START_NS % 60_000_000_000 == 0
+
+
+def test_every_command_is_there_and_its_example_parses(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in COMMANDS:
+        assert callable(load(command))
+        with pytest.raises(SystemExit) as ended:
+            main([command.name, "--help"])
+        assert ended.value.code == 0
+        assert f"example: compensator {command.example}" in " ".join(capsys.readouterr().out.split())
+        parser = argparse.ArgumentParser()
+        command.describe(parser)
+        parser.parse_args(command.example.split()[1:])
+
+
+def test_asking_for_help_loads_no_numbers() -> None:
+    code = "import sys\nfrom compensator.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    code += "sys.exit(any(name in sys.modules for name in ('numpy', 'scipy', 'zenoh', 'matplotlib')))"
+    assert subprocess.run([sys.executable, "-c", code], check=False, stdout=subprocess.DEVNULL).returncode == 0

@@ -1,0 +1,23 @@
+"""`compensator explain`: a state or reason in words."""
+
+from __future__ import annotations
+
+import argparse
+
+from compensator.commands import Answer
+from compensator.errors import UsageError
+from compensator.reasons import WORDS, explain
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command.
+
+    Raises
+    ------
+    UsageError
+        If there is no such code.
+    """
+    words = explain(arguments.code)
+    if words is None:
+        raise UsageError(f"{arguments.code}: unknown, expected one of: {', '.join(WORDS)}")
+    return Answer({"code": arguments.code, "means": words[0], "do": words[1]}, f"{words[0]}\n{words[1]}")

@@ -1,0 +1,43 @@
+"""`compensator probe`: one reading of every device."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+from typing import Any
+
+from compensator.commands import Answer
+from compensator.service.composition import load, read_once
+from drivers.errors import DriverError
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command; the exit code is 1 where a channel gave no good reading.
+
+    Raises
+    ------
+    CompensatorError
+        If the configuration cannot be used.
+    """
+    loaded, _, _, fleet = load(arguments.config)
+    units = {name: dict(device.units) for name, device in fleet.devices.items()}
+    answers = asyncio.run(read_once(fleet))
+    rows: list[dict[str, Any]] = []
+    for channel in loaded.config.channel:
+        answer, unit = answers[channel.device], units[channel.device][channel.input]
+        row = {"channel": channel.name, "device": channel.device, "input": channel.input, "value": None, "unit": unit}
+        if isinstance(answer, DriverError):
+            row |= {"quality": answer.code, "detail": str(answer)}
+        else:
+            reading = answer[channel.input]
+            row |= {"quality": str(reading.quality), "detail": reading.detail}
+            if reading.quality == "good":
+                row["value"] = reading.value
+        rows.append(row)
+    good = all(row["quality"] == "good" for row in rows)
+    return Answer({"channels": rows}, "\n".join(map(_line, rows)), 0 if good else 1)
+
+
+def _line(row: dict[str, Any]) -> str:
+    value = f"{row['value']:12.4f} {row['unit']:<5}" if row["value"] is not None else " " * 18
+    return f"{row['channel']:<20} {row['device']:<16} {row['input']:>3}  {value} {row['quality']} {row['detail']}"

@@ -1,0 +1,51 @@
+"""`compensator simulate`: a model over measured data."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import logging
+from typing import Any
+
+import numpy as np
+
+from compensator.commands import Answer
+from compensator.model.model_file import load_model
+from compensator.simulation import csv_rows, scores, simulate
+from compensator.tables import load_data, require, roles_of
+
+log = logging.getLogger("compensator")
+
+COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_tdtf_um", "y_std_um")
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command.
+
+    Raises
+    ------
+    CompensatorError
+        If the data or the model cannot be read.
+    """
+    model = load_model(arguments.model)
+    data = load_data(arguments.data, model.period_s, roles_of(arguments.column))
+    for remark in data.remarks:
+        log.warning("%s", remark)
+    for record in data.records:
+        require(arguments.data, record, ("t_q_degc", "at_degc"))
+    parts = [simulate(model, record) for record in data.records]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    with arguments.out.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows(csv_rows(columns, COLUMNS))
+    result: dict[str, Any] = {
+        "samples": int(columns["t_s"].size),
+        "records": len(parts),
+        "out": str(arguments.out),
+    }
+    text = f"{result['samples']} samples in {len(parts)} record(s) → {arguments.out}"
+    if "y_um" in columns:
+        score = scores(columns["y_um"], columns["y_pred_um"])
+        result |= {"fit_pct": score.fit_pct, "rms_um": score.rms_um, "peak_to_peak_um": score.peak_to_peak_um}
+        text += f"\nfit {score.fit_pct:.2f} %, residual {score.rms_um:.3f} µm rms"
+        text += f", {score.peak_to_peak_um:.2f} µm peak to peak"
+    return Answer(result, text)
