@@ -118,6 +118,7 @@ async def read_once(fleet: drivers.Fleet) -> dict[str, dict[int, Reading] | Driv
 async def run_service(
     path: str, *, clock: Clock | None = None, samples: int | None = None,
     on_ready: Callable[[Daemon], None] | None = None, on_sample: Callable[[Outcome], None] | None = None,
+    on_poll: Callable[[], None] | None = None, on_publish: Callable[[str, bytes], None] | None = None,
 ) -> Daemon:  # fmt: skip
     """Run the service of a configuration until it is stopped.
 
@@ -133,6 +134,10 @@ async def run_service(
         Called with the daemon once everything is open.
     on_sample : callable, optional
         Called after each sample.
+    on_poll : callable, optional
+        Called after each poll.
+    on_publish : callable, optional
+        Called with name and JSON of each message after it was published.
     """
     loaded, model, model_bytes, fleet = load(path)
     config = loaded.config
@@ -144,13 +149,18 @@ async def run_service(
     def command(name: str, payload: bytes) -> Reply:
         return daemon.command(name, payload)
 
+    def publish(name: str, data: bytes) -> None:
+        publisher.publish(name, data)
+        if on_publish is not None:
+            on_publish(name, data)
+
     publisher = Publisher(config.zenoh, command)
     clock = clock or SystemClock()
     store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
     resumed = resume(loaded, model)
     daemon = Daemon(
         config=config, compensation=resumed.compensation, devices=fleet.devices, recorder=recorder,
-        publish=publisher.publish, clock=clock,
+        publish=publish, clock=clock,
         first_sequence=first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s),
         adoption=Adoption(config, folder, store), notes=resumed.notes,
     )  # fmt: skip
@@ -158,7 +168,7 @@ async def run_service(
         with publisher:
             if on_ready is not None:
                 on_ready(daemon)
-            await daemon.run(samples=samples, on_sample=on_sample)
+            await daemon.run(samples=samples, on_sample=on_sample, on_poll=on_poll)
     finally:
         await fleet.close()
     return daemon

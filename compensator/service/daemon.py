@@ -110,7 +110,10 @@ class Daemon:
 
     # ------------------------------------------------------------------ running
 
-    async def run(self, *, samples: int | None = None, on_sample: Callable[[Outcome], None] | None = None) -> None:
+    async def run(
+        self, *, samples: int | None = None, on_sample: Callable[[Outcome], None] | None = None,
+        on_poll: Callable[[], None] | None = None,
+    ) -> None:  # fmt: skip
         """Run until `stop` or for a number of samples.
 
         Parameters
@@ -119,6 +122,8 @@ class Daemon:
             Stop after so many.
         on_sample : callable, optional
             Called with the outcome after each sample was published.
+        on_poll : callable, optional
+            Called after each poll, when its sample, if one ended there, is on disk and published.
         """
         self._commands.open()
         period_s = self._compensation.model.period_s
@@ -140,6 +145,8 @@ class Daemon:
                     done += 1
                 if outcome is not None and on_sample is not None:
                     on_sample(outcome)
+                if on_poll is not None:
+                    on_poll()
         finally:
             await self._close()
 
