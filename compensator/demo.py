@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import csv
-import hashlib
 import json
 import shutil
 import socket
@@ -39,6 +38,7 @@ from compensator.messages import Offset, number
 from compensator.report.page import Block, Figure, Line, Page, Table, write_page
 from compensator.service.compensation import Outcome
 from compensator.service.composition import run_service
+from compensator.service.model_store import sha256_of
 from compensator.service.publisher import ask, session_config
 from compensator.simulation import Scores, scores
 from sim_hardware.physics import Duty, PublishedQuill, QuillMachine, World, draw_effect, usual_sensors
@@ -236,7 +236,7 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> dict[str, Any]:
     # An adequate model is left as it was: there is nothing to take over.
     adopt = (
         folder / "diagnosis" / "model.toml"
-        if found["model_sha256"] != _sha256(folder / "calibration" / "model.toml")
+        if found["model_sha256"] != sha256_of((folder / "calibration" / "model.toml").read_bytes())
         else None
     )
     days = {
@@ -260,10 +260,6 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> dict[str, Any]:
         "adopted_after_h": adopted_h,
         "second_day_rms_um": {name: float(np.std(values)) for name, values in errors.items()},
     }  # fmt: skip
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _loop_table(loop: Mapping[str, Any]) -> Table:

@@ -27,7 +27,7 @@ from compensator.diagnose.outcome import (
     table_of,
     warnings_of,
 )  # fmt: skip
-from compensator.diagnose.refit import Refit, Tried, deformation, refit
+from compensator.diagnose.refit import Refit, Tried, refit
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.simulation import scores
 
@@ -41,8 +41,7 @@ FAR_OFF = 0.1
 def is_far_off(model: ThermalModel, evidence: Evidence) -> bool:
     """Tell whether the calibration itself says that the model misses much of the deformation."""
     folds = model.provenance.get("folds_rms_um")
-    spread = float(np.nanstd(np.concatenate([run.y_um for run in evidence.runs])))
-    return isinstance(folds, float) and folds > FAR_OFF * spread
+    return isinstance(folds, float) and folds > FAR_OFF * evidence.spread_um
 
 
 def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told) -> Diagnosis:
@@ -57,13 +56,13 @@ def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told) -> Diagno
     told : callable
         Is told how many blocks of how many are done.
     """
-    y = np.concatenate([run.y_um for run in evidence.runs])
+    y, open_ = evidence.y_um, evidence.deformation_um
     whole = refit(evidence)
     before, after = _held_out(evidence, told)
     effects = _effects(evidence, whole)
     helps = bool(effects) and rms_of(after) <= rms_of(before)
-    left = np.where(evidence.used, deformation(evidence) - whole.predicted, np.nan)
-    bare = np.where(evidence.used, deformation(evidence) - whole.by_paths, np.nan)
+    left = np.where(evidence.used, open_ - whole.predicted, np.nan)
+    bare = np.where(evidence.used, open_ - whole.by_paths, np.nan)
     clean = rms_of(after) < NOISE_TIMES * evidence.noise_um
     return Diagnosis(
         verdict="unexplained" if not effects else "explained" if clean else "partly_explained", effects=effects,
@@ -79,11 +78,12 @@ def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told) -> Diagno
 def _held_out(evidence: Evidence, told: Told) -> tuple[Vector, Vector]:
     """Return the residual of the base and of the refit on every block, each without that block."""
     before, after = (np.full(evidence.used.size, np.nan) for _ in range(2))
+    open_ = evidence.deformation_um
     for done, block in enumerate(evidence.blocks(FOLDS), start=1):
         told(done, FOLDS + 1)
         seen = refit(evidence.hidden(block))
-        before[block] = (deformation(evidence) - seen.by_paths)[block]
-        after[block] = (deformation(evidence) - seen.predicted)[block]
+        before[block] = (open_ - seen.by_paths)[block]
+        after[block] = (open_ - seen.predicted)[block]
     return before, after
 
 

@@ -80,8 +80,7 @@ def _doubtful(searched: Diagnosis, evidence: Evidence) -> bool:
     """Tell whether what the search says is of no use although much is left."""
     if rms_of(searched.held_out_after) > rms_of(searched.held_out_before):
         return True
-    spread = float(np.nanstd(np.concatenate([run.y_um for run in evidence.runs])))
-    return searched.verdict == "unexplained" and rms_of(searched.held_out_before) > FAR_OFF * spread
+    return searched.verdict == "unexplained" and rms_of(searched.held_out_before) > FAR_OFF * evidence.spread_um
 
 
 def _by_search(model: ThermalModel, evidence: Evidence, told: Told) -> Diagnosis:
@@ -93,7 +92,7 @@ def _by_search(model: ThermalModel, evidence: Evidence, told: Told) -> Diagnosis
     # What rounds off an effect is of no use where the effect itself cannot be deployed.
     deployed = [e for e in everything if e.deployable] if any(e.deployable for e in effects) and helps else []
     extended = dataclasses.replace(model, effects=(*model.effects, *map(table_of, deployed)), sha256="")
-    y = np.concatenate([run.y_um for run in evidence.runs])
+    y = evidence.y_um
     return Diagnosis(
         verdict=_verdict(evidence, found), effects=effects,
         before=scores(y, y - before), after=scores(y, y - after), held_out=HELD_OUT,

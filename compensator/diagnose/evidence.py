@@ -86,6 +86,22 @@ class Evidence:
         """Number of samples used."""
         return int(self.used.sum())
 
+    @property
+    def y_um(self) -> Vector:
+        """Measured deformation on every sample of all runs, shape (n,), µm; NaN where it is missing."""
+        return _measured(self.runs)
+
+    @property
+    def spread_um(self) -> float:
+        """Standard deviation of the measured deformation, µm."""
+        return float(np.nanstd(self.y_um))
+
+    @property
+    def deformation_um(self) -> Vector:
+        """Measured deformation less the effects that the model has already, shape (n,), µm; 0 where it is not used."""
+        paths = np.concatenate([wave.y_dtf_um + wave.y_tdtf_um for wave in self.waves])
+        return np.asarray(np.where(self.used, self.residual + paths, 0.0))
+
     def without_nuisances(self, columns: Matrix) -> Matrix:
         """Project the nuisances out of columns, which are zero where samples are not used."""
         return np.asarray(columns - self.basis @ (self.basis.T @ columns))
@@ -204,10 +220,14 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     folds = model.provenance.get("folds_rms_um", 0.0)
     own = float(np.sqrt(max(float(folds) ** 2 - noise_um**2, 0.0))) if isinstance(folds, float) else 0.0
     # A calibration that misses by more than this has not merely an error of its own, it lacks something.
-    own = min(own, OWN_SHARE * float(np.nanstd(np.concatenate([run.y_um for run in runs]))))
+    own = min(own, OWN_SHARE * float(np.nanstd(_measured(runs))))
     return gathered(
         runs, waves, residual, used, _setting(model, runs, waves), noise_um=noise_um, own_error_um=own
     )  # fmt: skip
+
+
+def _measured(runs: Sequence[Run]) -> Vector:
+    return np.concatenate([run.y_um for run in runs])
 
 
 def gathered(

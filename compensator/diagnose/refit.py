@@ -92,12 +92,6 @@ class Refit:
     rivals: tuple[tuple[Tried, ...], ...]
 
 
-def deformation(evidence: Evidence) -> Vector:
-    """Return the measured deformation less the effects that the model has already, µm; 0 where it is not used."""
-    paths = np.concatenate([wave.y_dtf_um + wave.y_tdtf_um for wave in evidence.waves])
-    return np.asarray(np.where(evidence.used, evidence.residual + paths, 0.0))
-
-
 def refit(evidence: Evidence) -> Refit:
     """Fit the base anew and add channels while the error on held-out blocks falls.
 
@@ -155,7 +149,7 @@ class _Fitting:
         scale[scale == 0.0] = 1.0
         self.scale, self.table = scale, whole / scale
         self.base = runs.shape[1] + ROW * len(self.paths)
-        self.y = deformation(evidence)
+        self.y = evidence.deformation_um
         self.blocks = [self._grams(mask) for mask in self._masks()]
         self.all = self._grams([evidence.used])
 

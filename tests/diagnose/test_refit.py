@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from compensator.commands.identify import read_runs
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.refit import deformation, refit
+from compensator.diagnose.refit import refit
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
 from tests.bench.spindle import FILE, SPLITS, one
@@ -125,7 +125,7 @@ def test_held_out_samples_do_not_take_part(runs):
     })  # fmt: skip
     again = refit(evidence_of(calibrated(runs), disturbed).hidden(block))
     assert again.rms_um == pytest.approx(before.rms_um, rel=1e-6)
-    assert not deformation(seen)[block].any()
+    assert not seen.deformation_um[block].any()
 
 
 @pytest.mark.skipif(not FILE.exists(), reason="the measured spindle's data is not here")
