@@ -7,6 +7,7 @@ import argparse
 from compensator.commands import Answer
 from compensator.errors import UsageError
 from compensator.reasons import WORDS, explain
+from compensator.receiver.reasons import WORDS as RECEIVER_WORDS
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -17,7 +18,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     UsageError
         If there is no such code.
     """
-    words = explain(arguments.code)
+    words = explain(arguments.code) or RECEIVER_WORDS.get(arguments.code)
     if words is None:
-        raise UsageError(f"{arguments.code}: unknown, expected one of: {', '.join(WORDS)}")
+        known = ", ".join(dict.fromkeys([*WORDS, *RECEIVER_WORDS]))
+        raise UsageError(f"{arguments.code}: unknown, expected one of: {known}")
     return Answer({"code": arguments.code, "means": words[0], "do": words[1]}, f"{words[0]}\n{words[1]}")

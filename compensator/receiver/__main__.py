@@ -1,0 +1,46 @@
+"""`python -m compensator.receiver --config receiver.toml`: shows what a control would apply; writes to none."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+
+from .errors import ReceiverError
+from .settings import load_settings
+from .subscriber import Receiver
+
+
+def main() -> int:
+    """Print a line whenever state, reasons or number change, until SIGINT or SIGTERM."""
+    parser = argparse.ArgumentParser(
+        prog="compensator.receiver", description="Shows what a control would apply; writes to none.",
+        epilog="example: python -m compensator.receiver --config receiver.toml",
+    )  # fmt: skip
+    parser.add_argument("--config", required=True, metavar="FILE", help="TOML with a table [receiver]")
+    arguments = parser.parse_args()
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    try:
+        settings, _ = load_settings(arguments.config)
+        receiver = Receiver(settings)
+    except ReceiverError as error:
+        sys.stderr.write(f"compensator.receiver: {error}\n")
+        return error.exit_code
+    said: object = None
+    with receiver:
+        while not ended.wait(0.1):
+            applied = receiver.poll()
+            # A changed number in a detail (an age, a way to go) is no news.
+            news = (applied.seq, applied.state, tuple(reason.code for reason in applied.reasons))
+            if news != said:
+                said = news
+                sys.stdout.write(applied.text + "\n")
+                sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

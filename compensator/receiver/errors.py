@@ -1,0 +1,9 @@
+"""The receiver's one error: it cannot be started like this. Whatever arrives is data, and never raises."""
+
+from __future__ import annotations
+
+
+class ReceiverError(Exception):
+    """The receiver cannot be started: one line with file, key, value and what was expected."""
+
+    exit_code = 2

@@ -1,0 +1,330 @@
+"""What a receiver does with offsets: pure behaviour, no thread, clock or socket.
+
+The applied offset is moved by one function only, `Follower.advance`, and never by more than
+`offset_rate_max_um_per_min` allows for the time since the call before (and never for more than `step_max_s` of it).
+So nothing can jump: not a start, a message, a new service, a reconnection, or a program that was stopped for an hour.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from .errors import ReceiverError
+from .message import OffsetMessage, Rejected, parse_offset
+from .reasons import Reason
+
+#: Part of `valid_for_s` for which the published rate is followed: it is the growth until the next sample, and
+#: services allow two to three samples.
+RATE_PART = 0.5
+#: Closer than this the offset counts as arrived, µm.
+ARRIVED_UM = 0.01
+
+FollowerState = Literal["starting", "following", "holding", "fading"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What the applied offset may do.
+
+    Parameters
+    ----------
+    offset_max_um : float
+        Largest offset, µm. A message beyond it is dropped.
+    offset_rate_max_um_per_min : float
+        Largest rate, µm/min.
+    valid_max_s : float
+        Longest time that one message may be used, whatever it says of itself, s.
+    step_max_s : float
+        Longest time between two calls of `advance` that counts for moving, s.
+    clock_tolerance_s : float
+        How far in the future a message may lie by the wall clock, s.
+    """
+
+    offset_max_um: float
+    offset_rate_max_um_per_min: float
+    valid_max_s: float = 600.0
+    step_max_s: float = 1.0
+    clock_tolerance_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in ("offset_max_um", "offset_rate_max_um_per_min", "valid_max_s", "step_max_s", "clock_tolerance_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ReceiverError(f"{name} = {value}: expected a number above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Applied:
+    """What is to be applied now, and why.
+
+    Parameters
+    ----------
+    offset_um : float
+        To be added to the commanded Y, µm.
+    state : str
+        `starting`: nothing usable yet, what was there stands; `following`; `holding`; `fading`: to zero, on demand.
+    reasons : tuple of Reason
+        Why it does not follow, or follows with a remark; in words by `Reason.text`.
+    arrived : bool
+        Whether the offset is where it should be; false while it holds.
+    age_s : float or None
+        Age of the newest message of this machine, s.
+    seq : int or None
+        Its number.
+    service_state : str or None
+        Its state.
+    """
+
+    offset_um: float
+    state: FollowerState
+    reasons: tuple[Reason, ...]
+    arrived: bool
+    age_s: float | None
+    seq: int | None
+    service_state: str | None
+
+    @property
+    def text(self) -> str:
+        """Return it as one line for people."""
+        why = "; ".join(reason.text for reason in self.reasons)
+        return f"{self.offset_um:+.2f} µm, {self.state}" + (f": {why}" if why else "")
+
+
+@dataclass(slots=True)
+class _Held:
+    """The newest message, and when it was measured on the monotonic clock."""
+
+    message: OffsetMessage
+    measured_s: float
+    valid_s: float
+
+
+@dataclass(slots=True)
+class Follower:
+    """Follows one machine's offset.
+
+    Parameters
+    ----------
+    machine : str
+        Whose offset; messages of others are dropped.
+    limits : Limits
+        What it may do.
+    applied_um : float
+        What is applied at the control already, µm; it moves on from there.
+    last_sequence : int
+        Highest number that was used before a restart; −1 where none is known.
+
+    Raises
+    ------
+    ReceiverError
+        Where what is applied already is not a number within the limits: a person has to put that right first.
+
+    Examples
+    --------
+    >>> follower = Follower("vmc-07", Limits(offset_max_um=100.0, offset_rate_max_um_per_min=6.0), applied_um=2.0)
+    >>> follower.advance(0.0).state
+    'starting'
+    >>> follower.receive(0.0, b'{"schema": 1, "machine": "vmc-07", "seq": 5, "time_utc_ns": 1, "valid_for_s": 150.0, '
+    ...     b'"y_offset_um": -12.0, "y_offset_rate_um_per_min": 0.0, "y_offset_std_um": 0.4, "state": "ok", '
+    ...     b'"reasons": [], "model_sha256": ""}')
+    True
+    >>> print(follower.advance(1.0).text)  # 6 µm/min: 0.1 µm in a second
+    +1.90 µm, following: The offset is still under way at the permitted rate. (to -12.00 µm)
+    """
+
+    machine: str
+    limits: Limits
+    applied_um: float = 0.0
+    last_sequence: int = -1
+    alive: bool | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
+    _held: _Held | None = None
+    _rejected: Reason | None = None
+    _mode: Literal["follow", "hold", "fade"] = "follow"
+    _fade_rate_um_per_min: float = 0.0
+    _before_s: float | None = None
+
+    def __post_init__(self) -> None:
+        self.rebase(self.applied_um)
+
+    # ------------------------------------------------------------------ what others want
+
+    def follow(self) -> None:
+        """Follow the machine, again after `hold` or `fade`."""
+        self._mode = "follow"
+
+    def hold(self) -> None:
+        """Freeze the offset where it is."""
+        self._mode = "hold"
+
+    def fade(self, rate_um_per_min: float) -> None:
+        """Take the offset away, at this rate and never faster than the limit; nothing else ever does so.
+
+        Raises
+        ------
+        ReceiverError
+            Where the rate is not above 0.
+        """
+        if not (math.isfinite(rate_um_per_min) and rate_um_per_min > 0.0):
+            raise ReceiverError(f"fade rate = {rate_um_per_min} µm/min: expected a number above 0")
+        self._mode, self._fade_rate_um_per_min = "fade", rate_um_per_min
+
+    def rebase(self, applied_um: float) -> None:
+        """Go on from what the control holds, where that is not what was applied last.
+
+        Raises
+        ------
+        ReceiverError
+            Where that is not a number within the limits.
+        """
+        if not (math.isfinite(applied_um) and abs(applied_um) <= self.limits.offset_max_um):
+            raise ReceiverError(
+                f"applied offset = {applied_um} µm: expected at most offset_max_um = {self.limits.offset_max_um:g}; "
+                f"put the control right first"
+            )
+        self.applied_um = float(applied_um)
+
+    # ------------------------------------------------------------------ what arrives
+
+    def receive(self, now_s: float, payload: bytes, *, age_s: float | None = None, asked: bool = False) -> bool:
+        """Take a message, or drop it with a reason.
+
+        Parameters
+        ----------
+        now_s : float
+            Monotonic clock, s.
+        payload : bytes
+            As it arrived.
+        age_s : float, optional
+            Wall clock minus the message's time, s, where that is to be judged; else it counts as measured just now.
+            From here on only the monotonic clock counts, so a wall clock that is set later changes nothing.
+        asked : bool
+            Whether it is the answer to a query: an answer may be overtaken by a newer message, and that is no replay.
+
+        Returns
+        -------
+        bool
+            Whether it is now the newest message.
+        """
+        try:
+            message = parse_offset(payload)
+            accepted = self._check(message, age_s, asked)
+        except Rejected as rejected:
+            self._rejected = rejected.reason
+            self.dropped[rejected.reason.code] = self.dropped.get(rejected.reason.code, 0) + 1
+            return False
+        if not accepted:
+            return False
+        valid_s = min(message.valid_for_s, self.limits.valid_max_s)
+        self._held = _Held(message, now_s - max(age_s or 0.0, 0.0), valid_s)
+        self.last_sequence = message.seq
+        self._rejected = None
+        return True
+
+    def _check(self, message: OffsetMessage, age_s: float | None, asked: bool) -> bool:
+        if message.machine != self.machine:
+            raise Rejected(Reason("other_machine", f"{message.machine[:64]}, expected {self.machine}"))
+        # The same message twice is what a query at the start brings about. After a restart the newest one may be
+        # asked for again; its age is judged like any other's.
+        again = message.seq == self.last_sequence
+        if again and (self._held is not None or not asked):
+            if self._held is not None and message == self._held.message:
+                return False
+            raise Rejected(Reason("replayed", f"number {message.seq} was used before"))
+        if message.seq < self.last_sequence:
+            if asked:
+                return False
+            raise Rejected(Reason("replayed", f"number {message.seq} after {self.last_sequence}"))
+        if age_s is not None:
+            self._check_age(message, age_s)
+        if message.y_offset_um is not None and abs(message.y_offset_um) > self.limits.offset_max_um:
+            detail = f"{message.y_offset_um:.2f} µm, expected at most {self.limits.offset_max_um:g}"
+            raise Rejected(Reason("out_of_range", detail))
+        return True
+
+    def _check_age(self, message: OffsetMessage, age_s: float) -> None:
+        if not age_s >= -self.limits.clock_tolerance_s:
+            raise Rejected(Reason("clock_disagrees", f"{-age_s:.1f} s ahead of the wall clock here"))
+        if age_s > min(message.valid_for_s, self.limits.valid_max_s):
+            raise Rejected(Reason("late", f"{age_s:.1f} s old by the wall clock, valid for {message.valid_for_s:g} s"))
+
+    # ------------------------------------------------------------------ what is applied
+
+    def advance(self, now_s: float, payload: bytes | None = None) -> Applied:
+        """Move on in time and say what is to be applied; the only way in which the offset ever moves.
+
+        Parameters
+        ----------
+        now_s : float
+            Monotonic clock, s. One that goes back counts as standing still.
+        payload : bytes, optional
+            A message that arrived just now.
+        """
+        if payload is not None:
+            self.receive(now_s, payload)
+        elapsed_s = 0.0 if self._before_s is None else now_s - self._before_s
+        self._before_s = now_s
+        step_s = min(max(elapsed_s, 0.0), self.limits.step_max_s)
+        state, target_um, reasons = self._wanted(now_s)
+        arrived = False
+        if target_um is not None:
+            rate = self.limits.offset_rate_max_um_per_min
+            if state == "fading":
+                rate = min(rate, self._fade_rate_um_per_min)
+            self._move(target_um, rate * step_s / 60.0)
+            arrived = abs(target_um - self.applied_um) <= ARRIVED_UM
+            if state == "fading":
+                reasons.append(Reason("faded") if self.applied_um == 0.0 else Reason("fading"))
+            elif not arrived:
+                reasons.append(Reason("catching_up", f"to {target_um:+.2f} µm"))
+        held = self._held
+        return Applied(
+            offset_um=self.applied_um, state=state, reasons=tuple(reasons), arrived=arrived,
+            age_s=None if held is None else max(now_s - held.measured_s, 0.0),
+            seq=None if held is None else held.message.seq,
+            service_state=None if held is None else held.message.state,
+        )  # fmt: skip
+
+    def _move(self, target_um: float, step_um: float) -> None:
+        way = target_um - self.applied_um
+        if abs(way) <= step_um:
+            self.applied_um = target_um
+        else:
+            moved = self.applied_um + math.copysign(step_um, way)
+            self.applied_um = max(-self.limits.offset_max_um, min(self.limits.offset_max_um, moved))
+
+    def _wanted(self, now_s: float) -> tuple[FollowerState, float | None, list[Reason]]:
+        """Return the state, where the offset should be (None: where it is), and the reasons so far."""
+        reasons = [] if self._rejected is None else [self._rejected]
+        if self.alive is False:
+            reasons.append(Reason("service_gone"))
+        if self._mode == "fade":
+            return "fading", 0.0, reasons
+        if self._mode == "hold":
+            return "holding", None, [Reason("operator_hold"), *reasons]
+        held = self._held
+        if held is None:
+            return "starting", None, [Reason("no_message"), *reasons]
+        message, age_s = held.message, now_s - held.measured_s
+        codes = ", ".join(message.reasons)
+        if age_s > held.valid_s:
+            return "holding", None, [Reason("stale", f"{age_s:.0f} s old, valid for {held.valid_s:g} s"), *reasons]
+        if not message.usable or message.y_offset_um is None:
+            return "holding", None, [Reason(f"service_{message.state}", codes), *reasons]
+        if message.state == "degraded":
+            reasons.append(Reason("service_degraded", codes))
+        followed_s = max(0.0, min(age_s, RATE_PART * held.valid_s))
+        target_um = message.y_offset_um + message.y_offset_rate_um_per_min * followed_s / 60.0
+        largest = self.limits.offset_max_um
+        if abs(target_um) > largest:
+            target_um = math.copysign(largest, target_um)
+            reasons.append(Reason("offset_limited", f"{largest:g} µm"))
+        return "following", target_um, reasons
+
+    # ------------------------------------------------------------------ over a restart
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return what must outlive a restart."""
+        return {"machine": self.machine, "last_sequence": self.last_sequence}

@@ -1,0 +1,157 @@
+"""One published offset, checked to the last key: what is not wholly right is dropped with a reason."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from .reasons import Reason
+
+#: Version of the messages that this receiver understands.
+SCHEMA = 1
+#: Longest payload, bytes; an offset has about 300.
+PAYLOAD_MAX_BYTES = 65_536
+_STATES = ("starting", "ok", "degraded", "hold", "fault")
+_INT_MAX = 2**63 - 1
+
+
+class Rejected(Exception):
+    """A message that must not be used.
+
+    Parameters
+    ----------
+    reason : Reason
+        Why.
+    """
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__(reason.text)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OffsetMessage:
+    """A checked offset.
+
+    Parameters
+    ----------
+    machine : str
+        Whose.
+    seq : int
+        Never repeats for a machine.
+    time_utc_ns : int
+        When it was measured, ns since 1970 UTC.
+    valid_for_s : float
+        How long it may be used, s.
+    y_offset_um : float or None
+        To be added to the commanded Y, µm; a number whenever the state is `ok` or `degraded`.
+    y_offset_rate_um_per_min : float
+        How it goes on until the next one, µm/min; 0 where none is known.
+    state : str
+        `starting`, `ok`, `degraded`, `hold` or `fault`.
+    reasons : tuple of str
+        The service's codes.
+    """
+
+    machine: str
+    seq: int
+    time_utc_ns: int
+    valid_for_s: float
+    y_offset_um: float | None
+    y_offset_rate_um_per_min: float
+    state: str
+    reasons: tuple[str, ...]
+
+    @property
+    def usable(self) -> bool:
+        """Whether a receiver may follow it."""
+        return self.state in ("ok", "degraded")
+
+
+def parse_offset(payload: bytes) -> OffsetMessage:
+    """Decode and check a payload; keys that are not known are left alone.
+
+    Raises
+    ------
+    Rejected
+        `malformed` or `other_schema`.
+    """
+    table = _decode(payload)
+    if _integer(table, "schema") != SCHEMA:
+        raise Rejected(Reason("other_schema", f"schema {table['schema']}, expected {SCHEMA}"))
+    state = table.get("state")
+    if state not in _STATES:
+        raise _malformed("state", state, f"one of {', '.join(_STATES)}")
+    machine = table.get("machine")
+    if not isinstance(machine, str) or not machine:
+        raise _malformed("machine", machine, "a name")
+    reasons = table.get("reasons")
+    if not isinstance(reasons, list) or not all(isinstance(code, str) for code in reasons):
+        raise _malformed("reasons", reasons, "a list of codes")
+    valid_for_s = _number(table, "valid_for_s")
+    if valid_for_s is None or valid_for_s <= 0.0:
+        raise _malformed("valid_for_s", valid_for_s, "seconds above 0")
+    offset_um, rate = _number(table, "y_offset_um"), _number(table, "y_offset_rate_um_per_min")
+    if offset_um is None and state in ("ok", "degraded"):
+        raise _malformed("y_offset_um", None, f"a number in state {state}")
+    std_um = _number(table, "y_offset_std_um")
+    if std_um is not None and std_um < 0.0:
+        raise _malformed("y_offset_std_um", std_um, "0 or more")
+    return OffsetMessage(
+        machine=machine, seq=_integer(table, "seq"), time_utc_ns=_integer(table, "time_utc_ns"),
+        valid_for_s=valid_for_s, y_offset_um=offset_um, y_offset_rate_um_per_min=rate or 0.0, state=state,
+        reasons=tuple(reasons),
+    )  # fmt: skip
+
+
+def _decode(payload: bytes) -> dict[str, Any]:
+    if len(payload) > PAYLOAD_MAX_BYTES:
+        raise Rejected(Reason("malformed", f"{len(payload)} bytes, expected at most {PAYLOAD_MAX_BYTES}"))
+    try:
+        table = json.loads(payload.decode("utf-8"), parse_constant=_no_constant, object_pairs_hook=_pairs)
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise Rejected(Reason("malformed", f"not JSON: {error}")) from error
+    if not isinstance(table, dict):
+        raise Rejected(Reason("malformed", "not a JSON object"))
+    return table
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Two values under one key: nobody can say which one is meant."""
+    table = dict(pairs)
+    if len(table) != len(pairs):
+        raise ValueError("a key stands twice")
+    return table
+
+
+def _malformed(key: str, value: object, expected: str) -> Rejected:
+    return Rejected(Reason("malformed", f"{key} = {str(value)[:40]}, expected {expected}"))
+
+
+def _integer(table: dict[str, Any], key: str) -> int:
+    value = table.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _INT_MAX:
+        raise _malformed(key, value, "a whole number")
+    return value
+
+
+def _number(table: dict[str, Any], key: str) -> float | None:
+    """Return a finite number or None for null; a key that is missing is an error, as is anything else."""
+    value = table.get(key, "nothing")
+    if value is None:
+        return None
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise _malformed(key, value, "a number or null")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise _malformed(key, value, "a finite number")
+    return number

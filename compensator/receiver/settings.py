@@ -1,0 +1,179 @@
+"""Settings of a receiver: the table `[receiver]` of a TOML file. An unknown key is an error; no limit has a default."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from .errors import ReceiverError
+from .follower import Limits
+
+T = TypeVar("T")
+_PREFIX = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """`[receiver]`.
+
+    Parameters
+    ----------
+    machine, prefix : str
+        As in the service's `machine.name` and `zenoh.prefix`.
+    offset_max_um : float
+        Largest offset, µm.
+    offset_rate_max_um_per_min : float
+        Largest rate, µm/min; not below the service's, or the offset lags behind.
+    connect : tuple of str
+        Where router or service are found, such as `tcp/127.0.0.1:7447`. Either this or `zenoh_config`.
+    zenoh_config : str
+        A Zenoh configuration (JSON5) of mode `client`, with certificates for instance; relative to the file.
+    check_clock : bool
+        Compare every message's time with the wall clock here, for hosts that keep their clocks together. Answers to
+        queries, and what arrives after a standstill, are compared in any case: their age shows in nothing else.
+    clock_tolerance_s : float
+        How far a message may lie in the future, s.
+    valid_max_s : float
+        Longest time that one message may be used, s.
+    state_file : str
+        Keeps the last number over a restart, so that older messages stay dropped; relative to the file. Empty: none.
+    """
+
+    machine: str
+    prefix: str
+    offset_max_um: float
+    offset_rate_max_um_per_min: float
+    connect: tuple[str, ...] = ()
+    zenoh_config: str = ""
+    check_clock: bool = False
+    clock_tolerance_s: float = 5.0
+    valid_max_s: float = 600.0
+    state_file: str = ""
+
+    def limits(self, *, step_max_s: float = 1.0) -> Limits:
+        """Return the follower's limits.
+
+        Parameters
+        ----------
+        step_max_s : float
+            Longest time between two calls that counts for moving, s.
+        """
+        return Limits(
+            offset_max_um=self.offset_max_um, offset_rate_max_um_per_min=self.offset_rate_max_um_per_min,
+            valid_max_s=self.valid_max_s, step_max_s=step_max_s, clock_tolerance_s=self.clock_tolerance_s,
+        )  # fmt: skip
+
+
+def load_settings(path: str | Path) -> tuple[Settings, dict[str, Any]]:
+    """Read a TOML file with the table `[receiver]`.
+
+    Returns
+    -------
+    (Settings, dict)
+        The settings with paths made absolute, and the file's other tables.
+
+    Raises
+    ------
+    ReceiverError
+        One line that names file, key, value and what was expected.
+    """
+    path = Path(path)
+    try:
+        tables = tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise ReceiverError(f"{path}: {error.strerror or error}; expected a settings file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ReceiverError(f"{path}: not a TOML file: {error}") from error
+    table = tables.pop("receiver", None)
+    if not isinstance(table, dict):
+        raise ReceiverError(f"{path}: receiver: missing, expected a table [receiver]")
+    return settings_from(table, source=str(path), folder=path.parent), tables
+
+
+def settings_from(table: Mapping[str, Any], *, source: str, folder: Path | None = None) -> Settings:
+    """Check the keys of `[receiver]`.
+
+    Parameters
+    ----------
+    table : mapping
+        Keys and values.
+    source : str
+        File, for messages.
+    folder : pathlib.Path, optional
+        What paths are relative to; the working folder where none is given.
+
+    Raises
+    ------
+    ReceiverError
+        As `load_settings`.
+    """
+    settings = read_table(Settings, table, source=source, name="receiver")
+    _check(settings, source)
+    folder = Path() if folder is None else folder
+    absolute = {
+        key: str((folder / getattr(settings, key)).resolve()) if getattr(settings, key) else ""
+        for key in ("zenoh_config", "state_file")
+    }
+    values = {field.name: getattr(settings, field.name) for field in fields(settings)}
+    return Settings(**{**values, **absolute})
+
+
+def _check(settings: Settings, source: str) -> None:
+    if not settings.machine:
+        raise ReceiverError(f"{source}: receiver.machine = '': expected the service's machine.name")
+    if not _PREFIX.fullmatch(settings.prefix):
+        raise ReceiverError(f"{source}: receiver.prefix = {settings.prefix!r}: expected names parted by /")
+    if bool(settings.connect) == bool(settings.zenoh_config):
+        raise ReceiverError(
+            f"{source}: receiver.connect = {list(settings.connect)}: expected addresses such as "
+            f"'tcp/127.0.0.1:7447' here, or a file in receiver.zenoh_config, and not both"
+        )
+    try:
+        settings.limits()
+    except ReceiverError as error:
+        raise ReceiverError(f"{source}: receiver.{error}") from error
+
+
+def read_table(kind: type[T], table: Mapping[str, Any], *, source: str, name: str) -> T:
+    """Make a settings class of a table: every key known, every value of its type, nothing missing.
+
+    Raises
+    ------
+    ReceiverError
+        One line that names file, table, key, value and what was expected.
+    """
+    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    for key in table:
+        if key not in known:
+            raise ReceiverError(f"{source}: {name}.{key}: unknown key, expected one of: {', '.join(known)}")
+    values = {}
+    for key, field in known.items():
+        if key in table:
+            values[key] = _value(table[key], str(field.type), f"{source}: {name}.{key}")
+        elif field.default is MISSING:
+            raise ReceiverError(f"{source}: {name}.{key}: missing, expected {_EXPECTED[str(field.type)]}")
+    return kind(**values)
+
+
+_EXPECTED = {
+    "str": "a text", "bool": "true or false", "int": "a whole number", "float": "a number",
+    "tuple[str, ...]": "a list of texts",
+}  # fmt: skip
+
+
+def _value(value: Any, kind: str, where: str) -> Any:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if kind == "tuple[str, ...]" and isinstance(value, list) and all(isinstance(item, str) for item in value):
+        return tuple(value)
+    if kind == "float" and number and math.isfinite(value):
+        return float(value)
+    if (kind == "int" and number and isinstance(value, int)) or (kind == "bool" and isinstance(value, bool)):
+        return value
+    if kind == "str" and isinstance(value, str):
+        return value
+    raise ReceiverError(f"{where} = {value!r}: expected {_EXPECTED[kind]}")

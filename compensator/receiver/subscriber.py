@@ -1,0 +1,255 @@
+"""The thin layer of Zenoh around `Follower`.
+
+Everything is taken out of Zenoh's buffers in `poll`, on the caller's thread: no callback runs beside it, a slow caller
+blocks nobody, and no thread hangs the program's exit. Only the first connection is made by a thread of its own,
+because an address that does not answer would keep the caller's loop waiting.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import zenoh
+
+from .errors import ReceiverError
+from .follower import Applied, Follower
+from .reasons import Reason
+from .settings import Settings
+
+#: One try to reach the router, ms, and the pause before the next, s.
+CONNECT_TIMEOUT_MS = 1000
+CONNECT_PAUSE_S = 0.5
+#: How long an answer to "what is the latest?" is waited for, ms.
+ANSWER_TIMEOUT_S = 5.0
+_BUFFER = 32
+_CONNECTING = Reason("not_connected")
+
+
+def monotonic_s() -> float:
+    """Return a clock that nobody sets and that goes on while the computer sleeps, s."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+def client_config(settings: Settings) -> Any:
+    """Make the Zenoh configuration: a client that listens and scouts for nothing.
+
+    Raises
+    ------
+    ReceiverError
+        Where the file cannot be used.
+    """
+    if settings.zenoh_config:
+        try:
+            config = zenoh.Config.from_file(settings.zenoh_config)
+        except zenoh.ZError as error:
+            raise ReceiverError(f"{settings.zenoh_config}: {error}; expected a Zenoh configuration") from error
+        # Between two peers a router passes nothing on, and nobody would say so.
+        if json.loads(config.get_json("mode") or "null") != "client":
+            raise ReceiverError(f"{settings.zenoh_config}: mode = {config.get_json('mode')}: expected 'client'")
+    else:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps(list(settings.connect)))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("scouting/gossip/enabled", "false")
+        retry = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
+        config.insert_json5("connect/retry", json.dumps(retry))
+    config.insert_json5("connect/timeout_ms", str(CONNECT_TIMEOUT_MS))
+    return config
+
+
+class Receiver:
+    """Receives the offset of one machine. Use it as a context manager, and call `poll` in your loop.
+
+    Parameters
+    ----------
+    settings : Settings
+        Whose offset, from where, and what it may do.
+    applied_um : float
+        What is applied at the control already, µm.
+    step_max_s : float
+        Longest time between two calls of `poll` that counts, s: the offset moves for no more than that, and what
+        arrives after a longer one is used only if the wall clock says that it is fresh.
+    clock, utc_ns : callable, optional
+        Monotonic clock, s, and wall clock, ns.
+
+    Attributes
+    ----------
+    follower : Follower
+        Take `follow`, `hold`, `fade` and `rebase` from here.
+
+    Raises
+    ------
+    ReceiverError
+        Where the settings, the Zenoh configuration or the state file cannot be used.
+    """
+
+    def __init__(
+        self, settings: Settings, *, applied_um: float = 0.0, step_max_s: float = 1.0,
+        clock: Callable[[], float] = monotonic_s, utc_ns: Callable[[], int] = time.time_ns,
+    ) -> None:  # fmt: skip
+        self._settings = settings
+        self._config = client_config(settings)
+        self._clock, self._utc_ns = clock, utc_ns
+        self._state_file = Path(settings.state_file) if settings.state_file else None
+        self._remark: Reason | None = None
+        self.follower = Follower(
+            settings.machine, settings.limits(step_max_s=step_max_s), applied_um, self._last_sequence()
+        )
+        self._polled_s: float | None = None
+        self._session: Any = None
+        self._opened: list[Any] = []
+        self._ended = threading.Event()
+        self._opener = threading.Thread(target=self._open, name="thermal-receiver-connect", daemon=True)
+        self._offsets: Any = None
+        self._tokens: Any = None
+        self._answers: list[Any] = []
+
+    def __enter__(self) -> Receiver:
+        self._opener.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave Zenoh; may be called twice. What is applied at the control stands."""
+        self._ended.set()
+        if self._opener.is_alive():
+            self._opener.join(CONNECT_TIMEOUT_MS / 1000.0 + 2.0)
+        session, self._session = self._session, None
+        if session is None and self._opened:
+            session = self._opened.pop()
+        if session is not None:
+            session.close()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the first connection was made."""
+        return self._session is not None
+
+    # ------------------------------------------------------------------ the loop's part
+
+    def poll(self) -> Applied:
+        """Take what arrived, move on in time, and say what is to be applied; never waits."""
+        now_s = self._clock()
+        # After a standstill of this program nobody knows how long a message has been waiting.
+        stood = self._polled_s is not None and now_s - self._polled_s > self.follower.limits.step_max_s
+        self._polled_s = now_s
+        if self._session is None and self._opened:
+            self._declare(self._opened.pop())
+        if self._session is not None:
+            self._take_tokens()
+            self._take_answers(now_s)
+            while (sample := self._offsets.try_recv()) is not None:
+                self._take(now_s, sample, judge=stood or self._settings.check_clock, asked=False)
+        applied = self.follower.advance(now_s)
+        remarks = tuple(r for r in (self._remark, None if self.connected else _CONNECTING) if r is not None)
+        if not remarks:
+            return applied
+        return Applied(
+            offset_um=applied.offset_um, state=applied.state, reasons=applied.reasons + remarks,
+            arrived=applied.arrived, age_s=applied.age_s, seq=applied.seq, service_state=applied.service_state,
+        )  # fmt: skip
+
+    def _take(self, now_s: float, sample: Any, *, judge: bool, asked: bool) -> None:
+        payload = sample.payload.to_bytes() if sample.kind == zenoh.SampleKind.PUT else b""
+        age_s = (self._utc_ns() - _time_of(payload)) / 1e9 if judge else None
+        if self.follower.receive(now_s, payload, age_s=age_s, asked=asked):
+            self._save()
+
+    def _take_answers(self, now_s: float) -> None:
+        for answers in list(self._answers):
+            try:
+                while (reply := answers.try_recv()) is not None:
+                    if reply.ok is not None:
+                        self._take(now_s, reply.ok, judge=True, asked=True)
+            except zenoh.ZError:  # all answers are in
+                self._answers.remove(answers)
+
+    def _take_tokens(self) -> None:
+        while (token := self._tokens.try_recv()) is not None:
+            self.follower.alive = token.kind == zenoh.SampleKind.PUT
+            if self.follower.alive:  # a service, or the way to it, is new: it may have published meanwhile
+                self._ask()
+
+    # ------------------------------------------------------------------ connecting
+
+    def _key(self, name: str) -> str:
+        return f"{self._settings.prefix}/thermal/{name}"
+
+    def _open(self) -> None:
+        while not self._ended.is_set():
+            try:
+                session = zenoh.open(self._config)
+            except zenoh.ZError:
+                self._ended.wait(CONNECT_PAUSE_S)
+                continue
+            self._opened.append(session)
+            return
+
+    def _declare(self, session: Any) -> None:
+        ring = zenoh.handlers.RingChannel
+        self._session = session
+        self._offsets = session.declare_subscriber(self._key("y/offset"), ring(_BUFFER))
+        self._tokens = session.liveliness().declare_subscriber(self._key("alive"), ring(_BUFFER), history=True)
+        self._ask()
+
+    def _ask(self) -> None:
+        if len(self._answers) < _BUFFER:
+            # A ring would take the answers with it when the last one is in.
+            handler: Any = zenoh.handlers.FifoChannel(_BUFFER)
+            self._answers.append(self._session.get(self._key("y/offset"), handler, timeout=ANSWER_TIMEOUT_S))
+
+    # ------------------------------------------------------------------ over a restart
+
+    def _last_sequence(self) -> int:
+        if self._state_file is None or not self._state_file.exists():
+            return -1
+        try:
+            kept = json.loads(self._state_file.read_text(encoding="utf-8"))
+            machine, last = kept["machine"], kept["last_sequence"]
+        except (OSError, ValueError, TypeError, KeyError):
+            machine, last = None, None
+        if not isinstance(last, int) or isinstance(last, bool):
+            self._remark = Reason("state_damaged", str(self._state_file))
+            return -1
+        if machine != self._settings.machine:
+            raise ReceiverError(
+                f"{self._state_file}: machine = {machine!r}: expected {self._settings.machine!r}; "
+                f"each receiver needs a state file of its own"
+            )
+        return last
+
+    def _save(self) -> None:
+        if self._state_file is None:
+            return
+        part = self._state_file.with_name(self._state_file.name + ".part")
+        try:
+            with part.open("w", encoding="utf-8") as file:
+                json.dump(self.follower.snapshot(), file)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(self._state_file)
+        except OSError as error:
+            self._remark = Reason("state_not_saved", f"{self._state_file}: {error.strerror or error}")
+        else:
+            self._remark = None
+
+
+def _time_of(payload: bytes) -> int:
+    """Return the message's own time, ns; 0 (so: too old) where there is none, the check of the message says why."""
+    try:
+        value = json.loads(payload)["time_utc_ns"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return 0
+    return value if isinstance(value, int) else 0

@@ -1,0 +1,22 @@
+"""The smallest program that brings the offset to a control: `follow.py receiver.toml`."""
+
+import sys
+import time
+
+from compensator.receiver import Receiver, load_settings
+
+
+def apply(offset_um: float, why: str) -> None:
+    """Write it to your control here; it is added to the commanded Y, µm."""
+    print(f"{offset_um:+.2f} µm  {why}", flush=True)
+
+
+settings, _ = load_settings(sys.argv[1])
+with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: what your control applies already
+    try:
+        while True:
+            applied = receiver.poll()
+            apply(applied.offset_um, f"{applied.state} {'; '.join(reason.text for reason in applied.reasons)}")
+            time.sleep(0.1)
+    except KeyboardInterrupt:
+        pass  # what is applied stands

@@ -1,0 +1,90 @@
+"""A router process and a scripted service on loopback."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from tests.receiver.offsets import offset
+
+PREFIX = "shop/vmc-07"
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@contextmanager
+def router(port: int) -> Iterator[subprocess.Popen[str]]:
+    script = str(Path(__file__).with_name("router.py"))
+    process = subprocess.Popen(
+        [sys.executable, script, str(port)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+class ScriptedService:
+    """Publishes what a test says, with token and answer, as a service does."""
+
+    def __init__(self, port: int, prefix: str = PREFIX) -> None:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"peer"')
+        config.insert_json5("listen/endpoints", "[]")
+        config.insert_json5("connect/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
+        config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("scouting/gossip/enabled", "false")
+        retry = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+        config.insert_json5("connect/retry", json.dumps(retry))
+        self.key = f"{prefix}/thermal/y/offset"
+        self.latest: bytes | None = None
+        self.session: Any = zenoh.open(config)
+        self._publisher = self.session.declare_publisher(self.key)
+        self._queryable = self.session.declare_queryable(self.key, self._answer)
+        self._token = self.session.liveliness().declare_token(f"{prefix}/thermal/alive")
+
+    def _answer(self, query: Any) -> None:
+        with query:
+            if self.latest is not None:
+                query.reply(self.key, self.latest)
+
+    def put(self, seq: int, y_um: float | None, *, heard: bool = True, **changes: Any) -> None:
+        """Publish, as soon as somebody hears it: a subscription takes a moment to get here."""
+        if heard:
+            until(lambda: self._publisher.matching_status.matching, "a subscriber")
+        self.latest = offset(seq, y_um, **{"time_utc_ns": time.time_ns(), **changes})
+        self._publisher.put(self.latest)
+
+    def close(self) -> None:
+        self._publisher.undeclare()
+        self._queryable.undeclare()
+        self._token.undeclare()
+        self.session.close()
+
+    def __enter__(self) -> ScriptedService:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def until(condition: Callable[[], object], what: str, timeout_s: float = 40.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, f"not within {timeout_s} s: {what}"
+        time.sleep(0.01)
