@@ -24,6 +24,11 @@ ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 #: Unit suffix of a channel name for each unit that a device gives.
 UNIT_SUFFIX = {"degc": "_degc", "um": "_um", "v": "_v", "rpm": "_rpm", "w": "_w"}
 
+_LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):")
+#: Transports on which a certificate says who is there.
+_SECURED = ("tls/", "quic/")
+_TLS_KEYS = ("tls_ca", "tls_certificate", "tls_key")
+
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A table that refuses unknown keys."""
@@ -116,12 +121,41 @@ class Restart(_Table, frozen=True, kw_only=True):
 
 
 class Zenoh(_Table, frozen=True, kw_only=True):
-    """`[zenoh]`: where the offset goes. Nothing is listened on unless it stands here."""
+    """`[zenoh]`: where the offset goes. Nothing is listened on unless it stands here.
+
+    `tls_ca`, `tls_certificate`, `tls_key`: the authority that the router's certificate is of, the machine's own
+    certificate and its key, PEM, relative to the configuration. With them the service connects to a router only, and a
+    command counts as its sender's by what the router's access list lets through. `unproven_commands`: take commands of
+    which nobody proves who sent them; where nothing is said, on loopback without TLS only.
+    """
 
     prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$")]
     mode: Literal["peer", "client", "router"] = "peer"
     listen: list[str] = []
     connect: list[str] = []
+    tls_ca: str | None = None
+    tls_certificate: str | None = None
+    tls_key: str | None = None
+    unproven_commands: bool | None = None
+
+    def secured(self) -> bool:
+        """Tell whether both sides of every link prove who they are."""
+        return self.tls_key is not None
+
+    def on_loopback(self) -> bool:
+        """Tell whether nobody outside this computer is spoken with."""
+        return all(self.is_loopback(endpoint) for endpoint in self.listen + self.connect)
+
+    @staticmethod
+    def is_loopback(endpoint: str) -> bool:
+        """Tell whether an endpoint is on this computer only."""
+        return _LOOPBACK.match(endpoint) is not None
+
+    def takes_unproven(self) -> bool:
+        """Tell whether a command is taken of which nobody proves who sent it."""
+        if self.unproven_commands is not None:
+            return self.unproven_commands
+        return self.on_loopback() and not self.secured()
 
 
 class Recording(_Table, frozen=True, kw_only=True):
@@ -205,6 +239,9 @@ def load_config(path: str | Path) -> LoadedConfig:
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}; expected a configuration file") from error
     config = parse_config(data, source=str(path))
+    files = {key: getattr(config.zenoh, key) for key in _TLS_KEYS}
+    files = {key: str((path.parent / name).resolve()) for key, name in files.items() if name is not None}
+    config = msgspec.structs.replace(config, zenoh=msgspec.structs.replace(config.zenoh, **files))
     return LoadedConfig(config=config, path=path, data=data, sha256=hashlib.sha256(data).hexdigest())
 
 
@@ -261,6 +298,26 @@ def _check(config: Config) -> None:
         _check_channel(channel, devices)
     for key in ("t_q_degc", "at_degc"):
         _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key))
+    _check_zenoh(config.zenoh)
+
+
+def _check_zenoh(zenoh: Zenoh) -> None:
+    given = [key for key in _TLS_KEYS if getattr(zenoh, key) is not None]
+    for endpoint in zenoh.listen + zenoh.connect:
+        if bool(given) != endpoint.startswith(_SECURED) and endpoint in zenoh.connect:
+            expected = "tls/HOST:PORT with tls_ca, tls_certificate and tls_key" if given else "tls_ca, … beside it"
+            raise ConfigError(f"zenoh.connect: {endpoint!r}, expected {expected}")
+        if endpoint.startswith(_SECURED) and endpoint in zenoh.listen:
+            raise ConfigError(f"zenoh.listen: {endpoint!r}, expected a router (`compensator router`): it has the list "
+                              f"of who may do what, the service has none")  # fmt: skip
+    if not given:
+        return
+    for key in _TLS_KEYS:
+        if key not in given:
+            raise ConfigError(f"zenoh.{key}: missing beside {given[0]}")
+    if zenoh.listen or zenoh.mode == "router" or not zenoh.connect:
+        raise ConfigError("zenoh: with tls_key, expected connect alone, no listen and no mode router: whoever "
+                          "connected to the service would speak with its certificate")  # fmt: skip
 
 
 def _check_channel(channel: Channel, devices: set[str]) -> None:

@@ -36,10 +36,11 @@ from compensator.errors import ServiceError
 from compensator.identify.settings import Settings
 from compensator.messages import Offset, number
 from compensator.report.page import Block, Figure, Line, Page, Table, write_page
+from compensator.service.asking import ask
 from compensator.service.compensation import Outcome
 from compensator.service.composition import run_service
 from compensator.service.model_store import sha256_of
-from compensator.service.publisher import ask, session_config
+from compensator.service.session import session_config
 from compensator.simulation import Scores, scores
 from sim_hardware.physics import Duty, PublishedQuill, QuillMachine, World, draw_effect, usual_sensors
 from sim_hardware.physics.effects.base import Effect

@@ -12,9 +12,9 @@ from compensator.config import LoadedConfig
 from compensator.errors import ServiceError
 from compensator.model.model_file import read_model_bytes
 from compensator.service.adoption import check_model
+from compensator.service.asking import Operator, ask, operator_of_file
 from compensator.service.composition import load
 from compensator.service.model_store import ModelStore
-from compensator.service.publisher import ask
 
 NOT_REACHED = "The service was not reached; it uses the model from its next start on."
 
@@ -31,7 +31,10 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     data = read_model_bytes(arguments.model)
     model = check_model(loaded.config, data, source=arguments.model)
     wanted = {"sha256": model.sha256, "model": data.decode(), "force": arguments.force}
-    reply = ask(loaded.config.zenoh, "adopt", json.dumps(wanted).encode(), timeout_s=arguments.timeout)
+    operator = operator_of(arguments)
+    reply = ask(
+        loaded.config.zenoh, "adopt", json.dumps(wanted).encode(), timeout_s=arguments.timeout, operator=operator
+    )
     if reply is None:
         if model.sha256 == running.sha256:
             raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is the service's model already")
@@ -49,7 +52,7 @@ def back(arguments: argparse.Namespace) -> Answer:
     """
     loaded, _, _, _ = load(arguments.config)
     payload = json.dumps({"force": arguments.force}).encode()
-    reply = ask(loaded.config.zenoh, "back", payload, timeout_s=arguments.timeout)
+    reply = ask(loaded.config.zenoh, "back", payload, timeout_s=arguments.timeout, operator=operator_of(arguments))
     if reply is not None:
         return _answered(reply, "", "")
     store = _store(loaded)
@@ -59,6 +62,11 @@ def back(arguments: argparse.Namespace) -> Answer:
     model = check_model(loaded.config, before, source="model before")
     store.back(name=model.name, time_utc_ns=SystemClock().utc_ns())
     return _answered(None, f"back to model {model.name} ({model.sha256[:12]}).", model.sha256)
+
+
+def operator_of(arguments: argparse.Namespace) -> Operator | None:
+    """Return who sends a command, None where nothing is said of it."""
+    return operator_of_file(arguments.zenoh) if arguments.zenoh is not None else None
 
 
 def _store(loaded: LoadedConfig) -> ModelStore:

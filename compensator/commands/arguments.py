@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 _COLUMN = "role of a column of another name"
+_OPERATOR = "Zenoh configuration with the operator's certificate, such as operator.json5; needed over TLS"
 
 
 def demo(parser: argparse.ArgumentParser) -> None:
@@ -97,6 +98,32 @@ def back(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `back`, which `adopt` has too."""
     of_service(parser)
     add = parser.add_argument
+    add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
     words = "take it even where the recordings do not determine its state; the standard deviation says what that costs"
     add("--force", action="store_true", help=words)
     add("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the service's reply, s (60)")
+
+
+def order(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `hold` and `resume`, which `zero` has too."""
+    add = parser.add_argument
+    add("--config", metavar="FILE", help="configuration of the service; where it is not at hand, --prefix and --zenoh")
+    add("--prefix", metavar="PREFIX", help="zenoh.prefix of the machine, such as shop/vmc-07")
+    add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
+    add("--timeout", type=float, default=5.0, metavar="S", help="how long to wait for the service's reply, s (5)")
+
+
+def zero(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `zero`."""
+    order(parser)
+    words = "rest: the machine is at rest; warm: it is not; auto (the default): the service judges"
+    parser.add_argument("--mode", choices=("auto", "rest", "warm"), default="auto", help=words)
+
+
+def router(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `router`."""
+    add = parser.add_argument
+    add("--config", required=True, type=Path, metavar="FILE", help="Zenoh's own configuration, as zenohd takes it")
+    add("--check", action="store_true", help="look at the configuration, open nothing")
+    words = "have Zenoh log to stdout as well; debug says who is refused what"
+    add("--log", choices=("error", "warn", "info", "debug"), help=words)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import logging
 
 from compensator.commands import Answer
 from compensator.service.compensation import Compensation
 from compensator.service.composition import load
+from compensator.service.precautions import precautions
+
+log = logging.getLogger("compensator")
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -19,11 +23,14 @@ def run(arguments: argparse.Namespace) -> Answer:
     """
     loaded, model, _, fleet = load(arguments.config)
     Compensation(loaded.config, model)
+    warnings = precautions(loaded)
+    for warning in warnings:
+        log.warning("%s: warning: %s", arguments.config, warning)
     machine = loaded.config.machine.name
     text = (
         f"{arguments.config}: good. Machine {machine}, model {model.name} ({model.kind}), "
         f"{len(fleet.devices)} device(s), {len(loaded.config.channel)} channel(s). Nothing was opened."
     )
     result = {"ok": True, "machine": machine, "model": model.name, "model_sha256": model.sha256,
-              "devices": list(fleet.devices)}  # fmt: skip
+              "devices": list(fleet.devices), "warnings": warnings}  # fmt: skip
     return Answer(result, text)

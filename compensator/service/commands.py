@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from concurrent.futures import Future
 from typing import Any
 
@@ -12,14 +13,18 @@ from compensator.errors import ServiceError
 from compensator.service.adoption import LONGEST_MODEL, Wanted
 from compensator.service.compensation import Compensation
 from compensator.service.journal import Journal
-from compensator.service.publisher import COMMANDS, Reply
+from compensator.service.publisher import COMMANDS, Reply, Sender
 from compensator.service.retrace import obey
-from compensator.service.takeover import Takeover, refusal
+from compensator.service.takeover import Takeover, refusal, sent_by
+
+log = logging.getLogger("compensator")
 
 #: Longest payload of a command that brings no model, bytes.
 LONGEST_COMMAND = 10_000
 #: So many commands wait for the next sample at most.
 WAITING_COMMANDS = 100
+#: So many refused commands are noted between two samples; what floods must not push other events out.
+NOTED_REFUSALS = 10
 
 
 class Commands:
@@ -31,12 +36,16 @@ class Commands:
         Where each command is noted.
     takeover : Takeover
         Takes `adopt` and `back`.
+    unproven : bool
+        Whether commands are taken of which nobody proves who sent them.
     """
 
-    def __init__(self, journal: Journal, takeover: Takeover) -> None:
+    def __init__(self, journal: Journal, takeover: Takeover, *, unproven: bool) -> None:
         self._journal = journal
         self._takeover = takeover
-        self._waiting: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
+        self._unproven = unproven
+        self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
+        self._refused = 0
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def open(self) -> None:
@@ -47,44 +56,62 @@ class Commands:
         """Take none any more."""
         self._loop = None
 
-    def take(self, name: str, payload: bytes) -> Reply:
+    def take(self, name: str, payload: bytes, sender: Sender) -> Reply:
         """Take a command from another thread; see `Daemon.command`."""
-        brings_model = name in ("adopt", "back")
-        if len(payload) > (LONGEST_MODEL if brings_model else LONGEST_COMMAND):
-            return refusal(f"{name}: the payload has {len(payload)} bytes, more than a command may have")
-        try:
-            arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            return refusal(f"{name}: the payload is no JSON object")
-        mode = arguments.get("mode", "auto")
-        if name not in COMMANDS or (name == "zero" and mode not in ("auto", "rest", "warm")):
-            return refusal(
-                f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back"
-            )
         loop = self._loop
-        if loop is None or self._waiting.full():
-            return refusal("the service cannot take a command now")
-        if brings_model:
-            return self._take_model(loop, name, arguments)
-        loop.call_soon_threadsafe(self._enqueue, name, arguments)
+        try:
+            arguments = self._checked(name, payload, sender)
+            if loop is None or self._waiting.full():
+                raise ServiceError("the service cannot take a command now")
+            if name in ("adopt", "back"):
+                wanted = Wanted.of(name, arguments)
+                reply: Future[dict[str, Any]] = Future()
+                loop.call_soon_threadsafe(self._takeover.begin, wanted, reply, sender)
+                return reply
+        except ServiceError as error:
+            if loop is not None:
+                loop.call_soon_threadsafe(self._note_refusal, name, str(error), sender)
+            return refusal(str(error))
+        loop.call_soon_threadsafe(self._enqueue, name, arguments, sender)
         return {"ok": True, "text": f"{name}: acts at the next sample"}
 
     def obey(self, compensation: Compensation) -> None:
         """Let the compensation obey what came since the last sample."""
+        self._refused = 0
         while not self._waiting.empty():
-            name, arguments = self._waiting.get_nowait()
-            self._journal.note("command", name, arguments)
+            name, arguments, sender = self._waiting.get_nowait()
+            log.info("command %s by %s", name, sender)
+            self._journal.note("command", name, arguments | sent_by(sender))
             obey(compensation, name, arguments)
 
-    def _enqueue(self, name: str, arguments: dict[str, Any]) -> None:
-        if not self._waiting.full():
-            self._waiting.put_nowait((name, arguments))
-
-    def _take_model(self, loop: asyncio.AbstractEventLoop, name: str, arguments: dict[str, Any]) -> Reply:
+    def _checked(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
+        """Return the arguments of a command that can be taken."""
+        if len(payload) > (LONGEST_MODEL if name in ("adopt", "back") else LONGEST_COMMAND):
+            raise ServiceError(f"{name}: the payload has {len(payload)} bytes, more than a command may have")
         try:
-            wanted = Wanted.of(name, arguments)
-        except ServiceError as error:
-            return refusal(str(error))
-        reply: Future[dict[str, Any]] = Future()
-        loop.call_soon_threadsafe(self._takeover.begin, wanted, reply)
-        return reply
+            arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            raise ServiceError(f"{name}: the payload is no JSON object") from error
+        mode = arguments.get("mode", "auto")
+        if name not in COMMANDS or (name == "zero" and mode not in ("auto", "rest", "warm")):
+            raise ServiceError(
+                f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back"
+            )
+        if sender.proof == "none" and not self._unproven:
+            raise ServiceError(
+                f"{name}: nobody proves that {sender.name} sends it; expected a router with TLS and the key "
+                f"thermal/command/{name}/<common name of the certificate>, or zenoh.unproven_commands = true"
+            )
+        return arguments
+
+    def _enqueue(self, name: str, arguments: dict[str, Any], sender: Sender) -> None:
+        if self._waiting.full():
+            self._note_refusal(name, "too many commands wait", sender)
+        else:
+            self._waiting.put_nowait((name, arguments, sender))
+
+    def _note_refusal(self, name: str, why: str, sender: Sender) -> None:
+        self._refused += 1
+        if self._refused <= NOTED_REFUSALS:
+            log.warning("command %s by %s refused: %s", name, sender, why)
+            self._journal.note("command_refused", why, {"name": name} | sent_by(sender))

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable
 
 import drivers
+from compensator.certificates import check_files
 from compensator.clock import Clock, SystemClock
 from compensator.config import LoadedConfig, load_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
@@ -18,9 +19,11 @@ from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.finishing import Retention
 from compensator.service.model_store import ModelStore
-from compensator.service.publisher import Publisher, Reply
+from compensator.service.precautions import precautions
+from compensator.service.publisher import Publisher, Reply, Sender
 from compensator.service.recorder import Recorder
 from compensator.service.restart import resume
+from compensator.service.session import tls_files
 from compensator.signature import Signer
 from drivers.errors import DriverConfigError, DriverError
 from drivers.reading import Reading
@@ -65,6 +68,9 @@ def load(path: str) -> tuple[LoadedConfig, ThermalModel, bytes, drivers.Fleet]:
             )
         _check_unit(path, channel.name, units[channel.input])
     _signer(loaded)
+    files = tls_files(config.zenoh)
+    if files is not None:
+        check_files(str(path), files)
     return loaded, model, data, fleet
 
 
@@ -146,8 +152,8 @@ async def run_service(
     attachments = {"config.toml": loaded.data, "model.toml": model_bytes}
     recorder = Recorder(folder, config.machine.name, attachments, retention=keep, signer=_signer(loaded))
 
-    def command(name: str, payload: bytes) -> Reply:
-        return daemon.command(name, payload)
+    def command(name: str, payload: bytes, sender: Sender) -> Reply:
+        return daemon.command(name, payload, sender)
 
     def publish(name: str, data: bytes) -> None:
         publisher.publish(name, data)
@@ -156,6 +162,11 @@ async def run_service(
 
     publisher = Publisher(config.zenoh, command)
     clock = clock or SystemClock()
+    try:
+        for warning in precautions(loaded):
+            log.warning("%s: warning: %s", path, warning)
+    except ConfigError as error:  # recording goes on, whether anybody can be told or not
+        log.error("%s; the router will refuse the service", error)
     store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
     resumed = resume(loaded, model)
     daemon = Daemon(

@@ -21,7 +21,7 @@ from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.grid import Grid
 from compensator.service.journal import Journal
-from compensator.service.publisher import Reply
+from compensator.service.publisher import UNNAMED, Reply, Sender
 from compensator.service.retrace import samples_between
 from compensator.service.sampling import ChannelCollector
 from compensator.service.takeover import Takeover
@@ -98,7 +98,7 @@ class Daemon:
             machine=config.machine.name, recorder=recorder, publish=publish, clock=clock, sequence=first_sequence
         )
         self._takeover = Takeover(adoption, self._journal, clock, lambda: self._compensation)
-        self._commands = Commands(self._journal, self._takeover)
+        self._commands = Commands(self._journal, self._takeover, unproven=config.zenoh.takes_unproven())
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
@@ -317,7 +317,7 @@ class Daemon:
         if seconds:
             self._journal.note("clock", f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
 
-    def command(self, name: str, payload: bytes) -> Reply:
+    def command(self, name: str, payload: bytes, sender: Sender = UNNAMED) -> Reply:
         """Take a command from another thread; it acts at the next sample.
 
         Parameters
@@ -327,10 +327,12 @@ class Daemon:
         payload : bytes
             Empty or a JSON object. `zero` takes `mode`: `auto`, `rest` or `warm`; `adopt` takes `model`, the text of a
             model file, or `sha256`, that of one adopted before, or both; `adopt` and `back` take `force`.
+        sender : Sender
+            Who sent it; stands in the event.
 
         Returns
         -------
         dict or Future of dict
             `ok` and `text`; a promise of them for `adopt` and `back`, whose warm-up takes its time.
         """
-        return self._commands.take(name, payload)
+        return self._commands.take(name, payload, sender)

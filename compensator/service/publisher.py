@@ -10,16 +10,18 @@ import json
 import re
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
-import msgspec
 import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
+from compensator.service.session import in_words, session_config, tell_links
 
-#: Commands that the service takes, each a query on `thermal/command/<name>`.
+#: Commands that the service takes, each a query on `thermal/command/<name>/<who sends it>` or `thermal/command/<name>`.
 COMMANDS = ("zero", "hold", "resume", "adopt", "back")
+#: What a sender's name may be made of; it is a chunk of a key.
+SENDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 _KEYS = {
     "offset": "thermal/y/offset",
@@ -31,33 +33,34 @@ _KEYS = {
 
 #: What a command is answered with, or a promise of it where it takes longer than Zenoh's thread may wait.
 Reply = dict[str, Any] | Future[dict[str, Any]]
-#: name, payload → reply
-CommandHandler = Callable[[str, bytes], Reply]
 
 
-def session_config(settings: Zenoh) -> zenoh.Config:
-    """Make a Zenoh configuration that listens and scouts for nothing that is not configured.
+class Sender(NamedTuple):
+    """Who sent a command.
+
+    Zenoh does not hand the peer's certificate to whoever answers a query. So the name stands in the key, and the
+    router's access list lets each certificate use its own name only.
 
     Parameters
     ----------
-    settings : Zenoh
-        Mode and endpoints.
+    name : str
+        `unnamed` where the key has none.
+    proof : str
+        `certificate`: the service is reached through its router alone, over links on which both sides prove who they
+        are. `none`: the name is what the sender says.
     """
-    config = zenoh.Config()
 
-    def put(key: str, value: object) -> None:
-        config.insert_json5(key, json.dumps(value))
+    name: str = "unnamed"
+    proof: Literal["certificate", "none"] = "none"
 
-    put("mode", settings.mode)
-    put("listen/endpoints", settings.listen)
-    put("connect/endpoints", settings.connect)
-    put("scouting/multicast/enabled", False)
-    put("scouting/gossip/enabled", False)
-    # A router that comes back is found within a second, not within the default's four.
-    put("connect/retry", {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5})
-    # A dead service loses its liveliness token after this, where the network gives no sign.
-    put("transport/link/tx/lease", 4000)
-    return config
+    def __str__(self) -> str:
+        return self.name if self.proof == "certificate" or self.name == "unnamed" else f"{self.name} (not proven)"
+
+
+#: Who sends a command that names nobody.
+UNNAMED = Sender()
+#: name, payload, sender → reply
+CommandHandler = Callable[[str, bytes, Sender], Reply]
 
 
 class Publisher:
@@ -94,7 +97,7 @@ class Publisher:
             self._session = zenoh.open(session_config(self._settings))
         except zenoh.ZError as error:
             endpoints = ", ".join(self._settings.listen + self._settings.connect) or "no endpoints"
-            raise ServiceError(f"zenoh: {error} ({self._settings.mode}, {endpoints})") from error
+            raise ServiceError(f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})") from error
         session = self._session
         for name in _KEYS:
             self._publishers[name] = session.declare_publisher(
@@ -107,9 +110,11 @@ class Publisher:
         for name in ("offset", "status"):
             self._declared.append(session.declare_queryable(self.key(name), self._answer_latest(name)))
         for name in COMMANDS:
-            self._declared.append(session.declare_queryable(self.key(name), self._answer_command(name)))
+            for key in (self.key(name), f"{self.key(name)}/*"):
+                self._declared.append(session.declare_queryable(key, self._answer_command(name)))
         token = f"{self._settings.prefix}/thermal/alive"
         self._declared.append(session.liveliness().declare_token(token))
+        tell_links(session, self._settings.connect)
 
     def publish(self, name: str, data: bytes) -> None:
         """Publish one message; never waits."""
@@ -143,54 +148,33 @@ class Publisher:
         return answer
 
     def _answer_command(self, name: str) -> Callable[[Any], None]:
-        def send(query: Any, reply: dict[str, Any]) -> None:
+        def send(query: Any, key: str, reply: dict[str, Any]) -> None:
             with query:
-                query.reply(self.key(name), json.dumps(reply).encode(), encoding=zenoh.Encoding.APPLICATION_JSON)
+                query.reply(key, json.dumps(reply).encode(), encoding=zenoh.Encoding.APPLICATION_JSON)
 
         def answer(query: Any) -> None:
+            key = str(query.key_expr)
+            sender = self._sender(name, key)
+            if sender is None:
+                query.drop()
+                return
             payload = query.payload.to_bytes() if query.payload is not None else b""
-            reply = self._on_command(name, payload)
+            reply = self._on_command(name, payload, sender)
             if isinstance(reply, Future):
-                reply.add_done_callback(lambda done: send(query, done.result()))
+                reply.add_done_callback(lambda done: send(query, key, done.result()))
             else:
-                send(query, reply)
+                send(query, key, reply)
 
         return answer
 
+    def _sender(self, name: str, key: str) -> Sender | None:
+        """Return who sends a command; None for a question to many keys at once, which is no command.
 
-def ask(settings: Zenoh, command: str, payload: bytes, *, timeout_s: float) -> dict[str, Any] | None:
-    """Send a command to the running service of a configuration, as an operator's program does.
-
-    Parameters
-    ----------
-    settings : Zenoh
-        Settings of the service: it is looked for where it listens, and at the routers that it connects to.
-    command : str
-        One of `COMMANDS`.
-    payload : bytes
-        JSON.
-    timeout_s : float
-        How long to wait for the reply, s.
-
-    Returns
-    -------
-    dict or None
-        `ok` and `text`; None where no service answers.
-    """
-    listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
-    endpoints = [endpoint for endpoint in listened if not endpoint.endswith(":0")] + settings.connect
-    if not endpoints:
-        return None
-    config = session_config(msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints))
-    config.insert_json5("connect/timeout_ms", "0")  # one attempt: a service that runs is there
-    config.insert_json5("connect/exit_on_failure", "true")
-    key = f"{settings.prefix}/thermal/command/{command}"
-    try:
-        with zenoh.open(config) as session:
-            for answer in session.get(key, payload=payload, timeout=timeout_s):
-                if answer.ok is not None:
-                    reply: dict[str, Any] = json.loads(answer.ok.payload.to_bytes())
-                    return reply
-    except (zenoh.ZError, ValueError):
-        return None
-    return None
+        Whoever looks around with `**` must not zero, hold and resume the machine.
+        """
+        if key == self.key(name):
+            return UNNAMED
+        sender = key.removeprefix(f"{self.key(name)}/")
+        if not SENDER.fullmatch(sender):
+            return None
+        return Sender(sender, "certificate" if self._settings.secured() else "none")

@@ -14,6 +14,7 @@ from compensator.errors import CompensatorError
 from compensator.service.adoption import Adoption, Prepared, Wanted
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.journal import Journal
+from compensator.service.publisher import Sender
 
 log = logging.getLogger("compensator")
 
@@ -54,14 +55,17 @@ class Takeover:
         self._adopting: _Adopting | None = None
         self._ended = False
 
-    def begin(self, wanted: Wanted, reply: Future[dict[str, Any]]) -> None:
+    def begin(self, wanted: Wanted, reply: Future[dict[str, Any]], sender: Sender) -> None:
         """Begin to make a model ready; the reply comes once it is, or is refused. In the loop only."""
         if self._adoption is None or self._ended or self._adopting is not None:
             why = "another model is under way" if self._adopting is not None else "this service takes no model now"
+            self._journal.note("command_refused", f"{wanted.action}: {why}", {"name": wanted.action} | sent_by(sender))
             reply.set_result(refusal(f"{wanted.action}: {why}"))
             return
         # The text of the model is not repeated here: it travels in the recording that begins with it.
-        self._journal.note("command", wanted.action, {"sha256": wanted.sha256, "force": wanted.force})
+        log.info("command %s by %s", wanted.action, sender)
+        data = {"sha256": wanted.sha256, "force": wanted.force}
+        self._journal.note("command", wanted.action, data | sent_by(sender))
         self._adopting = _Adopting(wanted, reply)
         self._adopting.task = asyncio.create_task(self._prepare(self._adoption, self._adopting))
         self._adopting.task.add_done_callback(self._tell_refusal)
@@ -140,3 +144,8 @@ class Takeover:
 def refusal(text: str) -> dict[str, Any]:
     """Return the answer to a command that is not taken."""
     return {"ok": False, "text": text}
+
+
+def sent_by(sender: Sender) -> dict[str, Any]:
+    """Return what an event says of who sent a command; it stands above what the payload says of itself."""
+    return {"by": sender.name, "by_proof": sender.proof}

@@ -1,0 +1,154 @@
+"""TLS files looked into before they are used: Zenoh says no more of a bad one than that it cannot connect.
+
+What is inside a certificate is read with the package `cryptography` (extra `tls`); without it only that the
+files are there, and who can read them, is checked.
+"""
+
+from __future__ import annotations
+
+import datetime
+import stat
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from compensator.errors import ConfigError
+
+#: A certificate that ends within so many days is said.
+SOON_DAYS = 30.0
+MISSING = "certificates are not looked into without the package cryptography: pip install quill-compensator[tls]"
+
+
+class TlsFiles(NamedTuple):
+    """The files of one side of a link.
+
+    Parameters
+    ----------
+    ca, certificate, key : pathlib.Path
+        Authority of the other side, own certificate, own private key; PEM.
+    names : tuple of str
+        How the configuration calls the three.
+    """
+
+    ca: Path
+    certificate: Path
+    key: Path
+    names: tuple[str, str, str] = ("zenoh.tls_ca", "zenoh.tls_certificate", "zenoh.tls_key")
+
+
+class Certificate(NamedTuple):
+    """What stands in a certificate.
+
+    Parameters
+    ----------
+    common_name : str
+        Who it is of.
+    begins, ends : datetime.datetime
+        When it is valid, UTC.
+    """
+
+    common_name: str
+    begins: datetime.datetime
+    ends: datetime.datetime
+
+    def wrong_at(self, now: datetime.datetime) -> str | None:
+        """Return in words why it cannot be used at a time, None where it can."""
+        if now > self.ends:
+            return f"certificate of {self.common_name!r} has expired on {self.ends:%Y-%m-%d %H:%M} UTC"
+        if now < self.begins:
+            return f"certificate of {self.common_name!r} is valid from {self.begins:%Y-%m-%d %H:%M} UTC only"
+        return None
+
+
+def check_files(source: str, files: TlsFiles) -> Certificate | None:
+    """Check that the files are there, belong together and that nobody else can read the key.
+
+    Parameters
+    ----------
+    source : str
+        The configuration, for the message.
+    files : TlsFiles
+        What to check.
+
+    Returns
+    -------
+    Certificate or None
+        The own certificate, whether valid now or not; None without the package `cryptography`.
+
+    Raises
+    ------
+    ConfigError
+        One line that names configuration, key, file and what was expected.
+    """
+    for name, path in zip(files.names, files[:3], strict=True):
+        if not path.is_file():
+            raise ConfigError(f"{source}: {name} = {str(path)!r}: no such file, expected a PEM file")
+    mode = stat.S_IMODE(files.key.stat().st_mode)
+    if mode & 0o077:
+        raise ConfigError(
+            f"{source}: {files.names[2]} = {str(files.key)!r}: mode {mode:04o}, expected 0600: others can read the key"
+        )
+    try:
+        from cryptography import x509
+        from cryptography.hazmat.primitives.serialization import load_pem_private_key
+    except ImportError:
+        return None
+    authorities = _read(source, files.names[0], files.ca, x509.load_pem_x509_certificates)
+    own = _read(source, files.names[1], files.certificate, x509.load_pem_x509_certificates)
+    key = _read(source, files.names[2], files.key, lambda data: load_pem_private_key(data, None))
+    if own[0].public_key() != key.public_key():
+        raise ConfigError(f"{source}: {files.names[2]} = {str(files.key)!r}: not the key of {files.certificate}")
+    if len(own) == 1 and not any(_issued(own[0], authority) for authority in authorities):
+        raise ConfigError(f"{source}: {files.names[1]} = {str(files.certificate)!r}: not of the authority {files.ca}")
+    return Certificate(_common_name(own[0]), own[0].not_valid_before_utc, own[0].not_valid_after_utc)
+
+
+def common_name_of(path: Path) -> str:
+    """Return the common name of a certificate.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be read.
+    """
+    try:
+        from cryptography import x509
+    except ImportError as error:
+        raise ConfigError(f"{path}: {MISSING}") from error
+    return _common_name(_read(str(path), "certificate", path, x509.load_pem_x509_certificates)[0])
+
+
+def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[str]:
+    """Return what is to be said of a certificate that can be used."""
+    if certificate is None:
+        return [MISSING]
+    days = (certificate.ends - now).total_seconds() / 86400.0
+    if days >= SOON_DAYS:
+        return []
+    return [f"certificate of {certificate.common_name!r} expires on {certificate.ends:%Y-%m-%d}, in {days:.0f} day(s)"]
+
+
+def _read(source: str, name: str, path: Path, load: Callable[[bytes], Any]) -> Any:
+    try:
+        return load(path.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"{source}: {name} = {str(path)!r}: {error.strerror or error}") from error
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{source}: {name} = {str(path)!r}: no PEM of that kind without a password") from error
+
+
+def _issued(certificate: Any, authority: Any) -> bool:
+    from cryptography.exceptions import InvalidSignature
+
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature):
+        return False
+    return True
+
+
+def _common_name(certificate: Any) -> str:
+    from cryptography.x509.oid import NameOID
+
+    names: Sequence[Any] = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else ""

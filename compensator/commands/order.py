@@ -1,0 +1,57 @@
+"""`compensator zero`, `hold` and `resume`: what an operator tells the running service."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+import msgspec
+
+from compensator.commands import Answer
+from compensator.config import Zenoh, load_config
+from compensator.errors import ServiceError, UsageError
+from compensator.service.asking import ask, operator_of_file
+
+
+def zero(arguments: argparse.Namespace) -> Answer:
+    """Run the command; see `_order`."""
+    return _order("zero", {"mode": arguments.mode}, arguments)
+
+
+def hold(arguments: argparse.Namespace) -> Answer:
+    """Run the command; see `_order`."""
+    return _order("hold", {}, arguments)
+
+
+def resume(arguments: argparse.Namespace) -> Answer:
+    """Run the command; see `_order`."""
+    return _order("resume", {}, arguments)
+
+
+def _order(name: str, payload: dict[str, Any], arguments: argparse.Namespace) -> Answer:
+    """Send a command.
+
+    Raises
+    ------
+    CompensatorError
+        If the service is not reached, does not answer or refuses.
+    """
+    operator = operator_of_file(arguments.zenoh) if arguments.zenoh is not None else None
+    if (arguments.config is None) == (arguments.prefix is None):
+        raise UsageError("expected either --config FILE, or --prefix PREFIX with --zenoh FILE")
+    if arguments.config is not None:
+        settings = load_config(arguments.config).config.zenoh
+    elif operator is None:
+        raise UsageError("--zenoh: missing beside --prefix, expected a Zenoh configuration such as operator.json5")
+    else:
+        try:
+            settings = msgspec.convert({"prefix": arguments.prefix}, Zenoh)
+        except msgspec.ValidationError as error:
+            raise UsageError(f"--prefix {arguments.prefix!r}: expected words between single slashes") from error
+    reply = ask(settings, name, json.dumps(payload).encode(), timeout_s=arguments.timeout, operator=operator)
+    if reply is None:
+        raise ServiceError(f"{settings.prefix}: the service is not reached; does it run, and is its router there?")
+    if not reply.get("ok"):
+        raise ServiceError(f"the service refuses: {reply.get('text', 'no reason given')}")
+    return Answer(reply, str(reply.get("text", "")))

@@ -1,0 +1,122 @@
+"""`compensator router`: a Zenoh router in this process, until SIGTERM or SIGINT."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import datetime
+import logging
+import signal
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from compensator.certificates import check_files, remarks
+from compensator.commands import Answer
+from compensator.errors import ConfigError, ServiceError
+from compensator.service.session import ConfigFile, files_of, get, in_words, put, read_config_file
+
+log = logging.getLogger("compensator")
+
+_SECURED = ("tls/", "quic/")
+
+
+def run(arguments: argparse.Namespace) -> Answer | None:
+    """Run the command.
+
+    Raises
+    ------
+    ConfigError
+        If the file has something unknown, or something that would not do what it looks like.
+    ServiceError
+        If an endpoint cannot be listened on.
+    """
+    path: Path = arguments.config
+    config = checked(path, read_config_file(path))
+    endpoints = get(config, "listen/endpoints")
+    if arguments.check:
+        secured = bool(get(config, "access_control/enabled"))
+        text = f"{path}: good. Listens on {', '.join(endpoints)}, access list {'on' if secured else 'OFF'}."
+        return Answer({"ok": True, "listen": endpoints, "access_control": secured}, text + " Nothing was opened.")
+    if arguments.log is not None:
+        zenoh.init_log_from_env_or(arguments.log)
+    asyncio.run(_serve(path, config, endpoints))
+    log.info("compensator: router stopped")
+    return None
+
+
+def checked(path: Path, file: ConfigFile) -> zenoh.Config:
+    """Refuse what Zenoh would take without a word and not do; look at the TLS files.
+
+    Raises
+    ------
+    ConfigError
+        One line that names file and key.
+    """
+    config = file.config
+    if get(config, "mode") not in (None, "router"):
+        raise ConfigError(f"{path}: mode = {get(config, 'mode')!r}, expected router")
+    put(config, "mode", "router")
+    endpoints = get(config, "listen/endpoints")
+    if not isinstance(endpoints, list) or not endpoints:
+        raise ConfigError(f'{path}: listen/endpoints: missing, expected a list, such as ["tls/0.0.0.0:7447"]')
+    if get(config, "plugins"):
+        raise ConfigError(f"{path}: plugins: this router runs none, expected them in a zenohd only")
+    for name in ("multicast", "gossip"):  # on where nothing is said, which is more than a list of endpoints says
+        if get(config, f"scouting/{name}/enabled") is None:
+            put(config, f"scouting/{name}/enabled", False)
+    _check_access(path, config, endpoints)
+    if any(endpoint.startswith(_SECURED) for endpoint in endpoints):
+        now = datetime.datetime.now(datetime.UTC)
+        certificate = check_files(str(path), files_of(path, file.tls, "listen"))
+        wrong = certificate.wrong_at(now) if certificate is not None else None
+        if wrong is not None:
+            raise ConfigError(f"{path}: {wrong}")
+        for remark in remarks(certificate, now):
+            log.warning("%s: %s", path, remark)
+    return config
+
+
+def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> None:
+    access: dict[str, Any] = get(config, "access_control") or {}
+    enabled = access.get("enabled")
+    if not enabled:
+        if access.get("rules") or access.get("policies"):
+            raise ConfigError(f"{path}: access_control/enabled: expected true beside rules; without it none applies")
+        log.warning("%s: no access list: whoever connects may publish and command everything", path)
+        return
+    if access.get("default_permission") != "deny":
+        raise ConfigError(f"{path}: access_control/default_permission = {access.get('default_permission')!r}, expected "
+                          f"deny: one rule that is missing would open everything")  # fmt: skip
+    named = any(subject.get("cert_common_names") for subject in access.get("subjects") or [])
+    if not named:
+        return
+    if get(config, "transport/link/tls/enable_mtls") is not True:
+        raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true; the list goes by certificates")
+    for endpoint in endpoints:
+        if not endpoint.startswith(_SECURED):
+            raise ConfigError(f"{path}: listen/endpoints: {endpoint!r}, expected tls/HOST:PORT; the access list goes "
+                              f"by certificates")  # fmt: skip
+
+
+async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None:
+    loop, ended = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, ended.set)
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise ServiceError(f"{path}: {in_words(error)}") from error
+    with session:
+        session.info.declare_link_events_listener(_tell, history=True)
+        log.info("compensator: router listens on %s", ", ".join(endpoints))
+        await ended.wait()
+
+
+def _tell(event: Any) -> None:
+    """Say who comes and goes."""
+    link = event.link
+    came = event.kind == zenoh.SampleKind.PUT
+    who = link.auth_identifier or "somebody without a certificate"
+    log.info("router: %s (%s, %s) %s", who, link.dst, link.zid, "is connected" if came else "is gone")

@@ -1,0 +1,142 @@
+"""Sends commands to a running service, as an operator's program does."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import zenoh
+
+from compensator.certificates import check_files, common_name_of
+from compensator.config import Zenoh
+from compensator.errors import ConfigError, ServiceError, UsageError
+from compensator.service.publisher import SENDER
+from compensator.service.session import files_of, get, put, read_config_file, session_config
+
+
+class Operator(NamedTuple):
+    """How an operator reaches services.
+
+    Parameters
+    ----------
+    config : zenoh.Config
+        Configuration of the session.
+    name : str
+        Who it is: the common name of the certificate. Without TLS the user's name on this computer, which is only
+        said. Empty where neither can stand in a key.
+    """
+
+    config: zenoh.Config
+    name: str
+
+
+def operator_of_file(path: Path) -> Operator:
+    """Read an operator's Zenoh configuration.
+
+    Raises
+    ------
+    ConfigError
+        If it, or a file that it names, cannot be used.
+    """
+    config, tls = read_config_file(path)
+    if get(config, "mode") not in (None, "client"):
+        raise ConfigError(f"{path}: mode = {get(config, 'mode')!r}, expected client")
+    if not get(config, "connect/endpoints"):
+        raise ConfigError(f"{path}: connect/endpoints: missing, expected the router, such as tls/HOST:7447")
+    put(config, "mode", "client")
+    put(config, "scouting/multicast/enabled", False)
+    _one_attempt(config)
+    if not tls:
+        return Operator(config, _user())
+    files = files_of(path, tls, "connect")
+    check_files(str(path), files)
+    if get(config, "transport/link/tls/enable_mtls") is not True:
+        raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true, or no certificate is shown")
+    name = common_name_of(files.certificate)
+    if not SENDER.fullmatch(name):
+        raise ConfigError(f"{files.certificate}: common name {name!r}, expected letters, digits, . _ -")
+    return Operator(config, name)
+
+
+def operator_here(settings: Zenoh) -> Operator | None:
+    """Return how the service of a configuration is reached from its own computer; None where it is nowhere to be found.
+
+    Raises
+    ------
+    UsageError
+        If that takes an operator's certificate: the machine's own gives no commands.
+    """
+    if settings.secured():
+        raise UsageError("--zenoh: missing; over TLS commands take an operator's certificate, expected a Zenoh "
+                         "configuration such as operator.json5")  # fmt: skip
+    listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
+    endpoints = [endpoint for endpoint in listened if not endpoint.endswith(":0")] + settings.connect
+    if not endpoints:
+        return None
+    config = session_config(msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints))
+    _one_attempt(config)
+    return Operator(config, _user())
+
+
+def _one_attempt(config: zenoh.Config) -> None:
+    put(config, "connect/timeout_ms", 0)  # a service that runs is there
+    put(config, "connect/exit_on_failure", True)
+
+
+def _user() -> str:
+    try:
+        name = getpass.getuser()
+    except (OSError, KeyError):
+        return ""
+    return name if SENDER.fullmatch(name) else ""
+
+
+def ask(
+    settings: Zenoh, command: str, payload: bytes, *, timeout_s: float, operator: Operator | None = None
+) -> dict[str, Any] | None:
+    """Send a command to the running service.
+
+    Parameters
+    ----------
+    settings : Zenoh
+        Settings of the service: it is looked for where it listens, and at the routers that it connects to.
+    command : str
+        Such as `hold`.
+    payload : bytes
+        JSON.
+    timeout_s : float
+        How long to wait for the reply, s.
+    operator : Operator, optional
+        Who asks; found out from the settings where nothing is given.
+
+    Returns
+    -------
+    dict or None
+        `ok` and `text`; None where no service is there.
+
+    Raises
+    ------
+    ServiceError
+        If the service is alive and does not answer.
+    """
+    operator = operator or operator_here(settings)
+    if operator is None:
+        return None
+    key = f"{settings.prefix}/thermal/command/{command}" + (f"/{operator.name}" if operator.name else "")
+    try:
+        with zenoh.open(operator.config) as session:
+            for answer in session.get(key, payload=payload, timeout=timeout_s):
+                if answer.ok is not None:
+                    reply: dict[str, Any] = json.loads(answer.ok.payload.to_bytes())
+                    return reply
+            alive = list(session.liveliness().get(f"{settings.prefix}/thermal/alive", timeout=timeout_s))
+    except (zenoh.ZError, ValueError):
+        return None
+    if alive:
+        raise ServiceError(f"{key}: the service is alive and gives no answer: does the router's access list permit "
+                           f"{operator.name or 'this'}?")  # fmt: skip
+    return None

@@ -1,0 +1,159 @@
+"""Zenoh sessions: nothing is listened on, scouted or told that is not configured."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import zenoh
+
+from compensator.certificates import TlsFiles
+from compensator.config import Zenoh
+from compensator.errors import ConfigError
+
+log = logging.getLogger("compensator")
+
+
+def put(config: zenoh.Config, key: str, value: object) -> None:
+    """Set one key of a Zenoh configuration."""
+    config.insert_json5(key, json.dumps(value))
+
+
+def get(config: zenoh.Config, key: str) -> Any:
+    """Return one key of a Zenoh configuration, None where it is not there or unset."""
+    try:
+        return json.loads(config.get_json(key))
+    except (zenoh.ZError, KeyError, ValueError):
+        return None
+
+
+def in_words(error: zenoh.ZError) -> str:
+    """Return what Zenoh says without the place in its source."""
+    return re.sub(r"\s+", " ", re.sub(r" at /\S+\.rs:\d+\.", "", str(error))).strip()
+
+
+def session_config(settings: Zenoh) -> zenoh.Config:
+    """Make a Zenoh configuration that listens and scouts for nothing that is not configured.
+
+    Parameters
+    ----------
+    settings : Zenoh
+        Mode, endpoints and TLS files.
+    """
+    config = zenoh.Config()
+    put(config, "mode", settings.mode)
+    put(config, "listen/endpoints", settings.listen)
+    put(config, "connect/endpoints", settings.connect)
+    put(config, "scouting/multicast/enabled", False)
+    put(config, "scouting/gossip/enabled", False)
+    # A router that comes back is found within a second, not within the default's four.
+    put(config, "connect/retry", {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5})
+    # A dead service loses its liveliness token after this, where the network gives no sign.
+    put(config, "transport/link/tx/lease", 4000)
+    if settings.secured():
+        # Zenoh shows its certificate only where `enable_mtls` is set on its side too.
+        put(config, "transport/link/tls/enable_mtls", True)
+        put(config, "transport/link/tls/verify_name_on_connect", True)
+        put(config, "transport/link/tls/root_ca_certificate", settings.tls_ca)
+        put(config, "transport/link/tls/connect_certificate", settings.tls_certificate)
+        put(config, "transport/link/tls/connect_private_key", settings.tls_key)
+        put(config, "transport/link/protocols", ["tls", "quic"])
+    return config
+
+
+def tls_files(settings: Zenoh) -> TlsFiles | None:
+    """Return the TLS files of the service, None where it uses none."""
+    if settings.tls_ca is None or settings.tls_certificate is None or settings.tls_key is None:
+        return None
+    return TlsFiles(Path(settings.tls_ca), Path(settings.tls_certificate), Path(settings.tls_key))
+
+
+class ConfigFile(NamedTuple):
+    """A Zenoh configuration file.
+
+    Parameters
+    ----------
+    config : zenoh.Config
+        Its content; paths of TLS files are absolute.
+    tls : dict of str to str
+        Its TLS files by key.
+    """
+
+    config: zenoh.Config
+    tls: dict[str, str]
+
+
+_TLS = "transport/link/tls"
+_FILES = (
+    "root_ca_certificate",
+    "listen_certificate",
+    "listen_private_key",
+    "connect_certificate",
+    "connect_private_key",
+)
+
+
+def read_config_file(path: Path) -> ConfigFile:
+    """Read a Zenoh configuration file (JSON5, JSON or YAML, as zenohd takes it).
+
+    Paths in it are relative to the file, not to where the command is called.
+
+    Raises
+    ------
+    ConfigError
+        One line that names file and what is wrong.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file, expected a Zenoh configuration")
+    try:
+        config = zenoh.Config.from_file(str(path))
+    except zenoh.ZError as error:
+        raise ConfigError(f"{path}: {in_words(error)}") from error
+    tls = {}
+    for name in _FILES:
+        value = get(config, f"{_TLS}/{name}")
+        if value is not None:
+            tls[name] = str((path.parent / value).resolve())
+            put(config, f"{_TLS}/{name}", tls[name])
+    return ConfigFile(config, tls)
+
+
+def files_of(source: Path, tls: dict[str, str], side: str) -> TlsFiles:
+    """Return the TLS files of one side, `connect` or `listen`, of a configuration file.
+
+    Raises
+    ------
+    ConfigError
+        If one is missing.
+    """
+    names = ("root_ca_certificate", f"{side}_certificate", f"{side}_private_key")
+    for name in names:
+        if name not in tls:
+            raise ConfigError(f"{source}: {_TLS}/{name}: missing, expected a PEM file")
+    ca, certificate, key = names
+    return TlsFiles(Path(tls[ca]), Path(tls[certificate]), Path(tls[key]),
+                    (f"{_TLS}/{ca}", f"{_TLS}/{certificate}", f"{_TLS}/{key}"))  # fmt: skip
+
+
+def tell_links(session: Any, endpoints: Sequence[str]) -> None:
+    """Say in the log when a link comes and goes, and once where none is there yet.
+
+    Without this a certificate that the router refuses looks like a service that runs.
+    """
+
+    def tell(event: Any) -> None:
+        came = event.kind == zenoh.SampleKind.PUT
+        kind = str(event.transport.whatami).rpartition(".")[2].lower()
+        log.log(logging.INFO if came else logging.WARNING, "zenoh: %s %s %s", kind, event.transport.zid,
+                "is connected" if came else "is gone; it is tried again")  # fmt: skip
+
+    if endpoints and not session.info.transports():
+        log.warning(
+            "zenoh: no connection to %s yet: is the router there, and does it take this certificate? It is tried again",
+            ", ".join(endpoints),
+        )
+    session.info.declare_transport_events_listener(tell, history=True)

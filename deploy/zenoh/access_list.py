@@ -1,0 +1,171 @@
+#!/usr/bin/env python3
+"""Makes the router's configuration, access list included, of a list of who is there.
+
+Zenoh's rules go by the common name of a certificate, in both directions; what no rule allows is denied. A hand-written
+list that forgets one direction is silent, and one that allows too much is silent as well, so it is made here.
+
+example: access_list.py shop.toml > /etc/compensator/zenoh/router.json5
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
+PREFIX = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")
+KEYS = {
+    "router": {"listen", "ca", "certificate", "key"},
+    "machine": {"name", "prefix"},
+    "receiver": {"name", "machines"},
+    "operator": {"name", "machines"},
+}
+#: What a receiver may ask for; anything else below a prefix comes by itself or is a command.
+ANSWERED = ("thermal/y/offset", "thermal/status")
+
+HEADER = """\
+// Configuration of the Zenoh router: compensator router --config router.json5, or zenohd --config router.json5.
+// Made by access_list.py of shop.toml: change that and make this anew.
+"""
+
+
+def rule(name: str, flow: str, messages: list[str], keys: list[str]) -> dict[str, Any]:
+    """Return a rule that allows messages in one direction: ingress comes from the client, egress goes to it."""
+    return {"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}
+
+
+def machine_rules(machine: dict[str, Any]) -> list[dict[str, Any]]:
+    """Let a service publish, answer and be alive below its own prefix, and hear whatever others may ask."""
+    name, own = machine["name"], [f"{machine['prefix']}/thermal/**"]
+    return [
+        rule(f"{name} publishes", "ingress", ["put", "reply", "declare_queryable", "liveliness_token"], own),
+        rule(f"{name} hears", "egress", ["declare_subscriber", "query"], ["**"]),
+    ]
+
+
+def reading_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
+    """Let a receiver subscribe, ask for the latest and for who is alive, and say nothing."""
+    below = [prefix if prefix == "**" else f"{prefix}/**" for prefix in prefixes]
+    asked = [f"{prefix}/{key}" for prefix in prefixes for key in ANSWERED]
+    subscribes = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
+    return [
+        rule(f"{name} subscribes", "ingress", subscribes, below),
+        rule(f"{name} asks", "ingress", ["query"], asked),
+        rule(f"{name} reads", "egress", ["put", "reply", "liveliness_token"], below),
+    ]
+
+
+def operator_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
+    """Let an operator read, and send commands in no name but the own.
+
+    Commands without a name get through as well: the service answers in words that it takes none, unless
+    `zenoh.unproven_commands` is set there.
+    """
+    own = [f"{prefix}/thermal/command/*{end}" for prefix in prefixes for end in (f"/{name}", "")]
+    return [*reading_rules(name, prefixes), rule(f"{name} commands", "ingress", ["query"], own)]
+
+
+def access_control(shop: dict[str, Any]) -> dict[str, Any]:
+    """Return Zenoh's access list."""
+    machines = {machine["name"]: machine for machine in shop["machine"]}
+    rules: dict[str, list[dict[str, Any]]] = {name: machine_rules(machine) for name, machine in machines.items()}
+    for role, make in (("receiver", reading_rules), ("operator", operator_rules)):
+        for client in shop.get(role, []):
+            # Zenoh lets a subscription or a question through that one rule includes as a whole.
+            prefixes = [machines[name]["prefix"] for name in client["machines"]] if "machines" in client else ["**"]
+            rules[client["name"]] = make(client["name"], prefixes)
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [one for of_client in rules.values() for one in of_client],
+        "subjects": [{"id": name, "cert_common_names": [name]} for name in rules],
+        "policies": [{"rules": [one["id"] for one in its], "subjects": [name]} for name, its in rules.items()],
+    }
+
+
+def router(shop: dict[str, Any]) -> dict[str, Any]:
+    """Return the whole configuration."""
+    own = shop["router"]
+    return {
+        "mode": "router",
+        "listen": {"endpoints": own["listen"]},
+        "connect": {"endpoints": []},
+        # Who belongs here is configured; nobody is looked for, and nobody is told of anybody.
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "adminspace": {"enabled": False},
+        "transport": {
+            # A second link under the name of a client that is there is refused.
+            "unicast": {"max_links": 1},
+            "link": {
+                "protocols": sorted({endpoint.split("/", 1)[0] for endpoint in own["listen"]}),
+                "tls": {
+                    "root_ca_certificate": own["ca"],
+                    "listen_certificate": own["certificate"],
+                    "listen_private_key": own["key"],
+                    "enable_mtls": True,
+                    "close_link_on_expiration": True,
+                },
+            },
+        },
+        "access_control": access_control(shop),
+    }
+
+
+def checked(shop: dict[str, Any], source: Path) -> dict[str, Any]:
+    """Refuse what would give somebody other rights than were meant."""
+
+    def refuse(text: str) -> None:
+        sys.exit(f"{source}: {text}")
+
+    for key in shop:
+        if key not in KEYS:
+            refuse(f"{key}: unknown, expected one of: {', '.join(KEYS)}")
+    if not isinstance(shop.get("router"), dict) or not shop.get("machine"):
+        refuse("expected a table [router] and at least one [[machine]]")
+    names: list[str] = []
+    for kind, keys in KEYS.items():
+        for table in [shop["router"]] if kind == "router" else shop.get(kind, []):
+            for key in {*table} ^ keys:
+                if key in table or key != "machines":
+                    refuse(f"{kind}: {key}: {'unknown' if key in table else 'missing'}, keys are {', '.join(keys)}")
+            if kind == "router":
+                continue
+            if not NAME.fullmatch(table["name"]) or table["name"] in names:
+                refuse(f"{kind}: name {table['name']!r}, expected letters, digits, . _ - and no name twice in any role")
+            names.append(table["name"])
+            if kind == "machine" and not PREFIX.fullmatch(table["prefix"]):
+                refuse(f"machine {table['name']!r}: prefix {table['prefix']!r}, expected words between single slashes")
+            for machine in table.get("machines", []):
+                if machine not in [known["name"] for known in shop["machine"]]:
+                    refuse(f"{kind} {table['name']!r}: machine {machine!r} does not stand here")
+    prefixes = [machine["prefix"] for machine in shop["machine"]]
+    for one in prefixes:
+        if sum(other == one or other.startswith(f"{one}/thermal/") for other in prefixes) > 1:
+            refuse(f"machine: prefix {one!r} stands twice, or another lies below it")
+    for endpoint in shop["router"]["listen"]:
+        if not endpoint.startswith(("tls/", "quic/")):
+            refuse(f"router: listen {endpoint!r}, expected tls/HOST:PORT: elsewhere nobody proves who he is")
+    return shop
+
+
+def main() -> int:
+    """Write the configuration to stdout."""
+    text, _, example = (__doc__ or "").rpartition("\n\n")
+    parser = argparse.ArgumentParser(description=text, epilog=example)
+    parser.add_argument("shop", type=Path, metavar="FILE", help="who is there, TOML")
+    path = parser.parse_args().shop
+    try:
+        shop = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        sys.exit(f"{path}: {error}")
+    sys.stdout.write(HEADER + json.dumps(router(checked(shop, path)), indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
