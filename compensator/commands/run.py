@@ -63,7 +63,11 @@ class Voice:
             self._state = event.data["state"]
             fields["REASONS"] = " ".join(event.data["reasons"])
         fields["STATE"] = self._state
-        log.log(level(event), "%s: %s", event.kind, event.text, extra={"fields": fields})
+        text = event.text
+        if "by" in event.data:
+            fields["BY"] = event.data["by"]
+            text += f" (by {event.data['by']}, proof: {event.data['by_proof']})"
+        log.log(level(event), "%s: %s", event.kind, text, extra={"fields": fields})
 
 
 def level(event: Event) -> int:

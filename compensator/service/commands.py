@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from concurrent.futures import Future
 from typing import Any
 
@@ -16,8 +15,6 @@ from compensator.service.journal import Journal
 from compensator.service.publisher import COMMANDS, Reply, Sender
 from compensator.service.retrace import obey
 from compensator.service.takeover import Takeover, refusal, sent_by
-
-log = logging.getLogger("compensator")
 
 #: Longest payload of a command that brings no model, bytes.
 LONGEST_COMMAND = 10_000
@@ -80,7 +77,6 @@ class Commands:
         self._refused = 0
         while not self._waiting.empty():
             name, arguments, sender = self._waiting.get_nowait()
-            log.info("command %s by %s", name, sender)
             self._journal.note("command", name, arguments | sent_by(sender))
             obey(compensation, name, arguments)
 
@@ -113,5 +109,4 @@ class Commands:
     def _note_refusal(self, name: str, why: str, sender: Sender) -> None:
         self._refused += 1
         if self._refused <= NOTED_REFUSALS:
-            log.warning("command %s by %s refused: %s", name, sender, why)
-            self._journal.note("command_refused", why, {"name": name} | sent_by(sender))
+            self._journal.note("command_refused", why, {"name": name, "ok": False} | sent_by(sender))

@@ -53,9 +53,6 @@ class Sender(NamedTuple):
     name: str = "unnamed"
     proof: Literal["certificate", "none"] = "none"
 
-    def __str__(self) -> str:
-        return self.name if self.proof == "certificate" or self.name == "unnamed" else f"{self.name} (not proven)"
-
 
 #: Who sends a command that names nobody.
 UNNAMED = Sender()

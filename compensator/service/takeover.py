@@ -59,11 +59,11 @@ class Takeover:
         """Begin to make a model ready; the reply comes once it is, or is refused. In the loop only."""
         if self._adoption is None or self._ended or self._adopting is not None:
             why = "another model is under way" if self._adopting is not None else "this service takes no model now"
-            self._journal.note("command_refused", f"{wanted.action}: {why}", {"name": wanted.action} | sent_by(sender))
-            reply.set_result(refusal(f"{wanted.action}: {why}"))
+            why = f"{wanted.action}: {why}"
+            self._journal.note("command_refused", why, {"name": wanted.action, "ok": False} | sent_by(sender))
+            reply.set_result(refusal(why))
             return
         # The text of the model is not repeated here: it travels in the recording that begins with it.
-        log.info("command %s by %s", wanted.action, sender)
         data = {"sha256": wanted.sha256, "force": wanted.force}
         self._journal.note("command", wanted.action, data | sent_by(sender))
         self._adopting = _Adopting(wanted, reply)

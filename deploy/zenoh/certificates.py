@@ -185,7 +185,7 @@ def main() -> int:
     for path in sorted(folder.glob("*.pem")):
         certificate = x509.load_pem_x509_certificate(path.read_bytes())
         until = f"{certificate.not_valid_after_utc:%Y-%m-%d}"
-        print(f"{path.name:<28} {common_name(certificate):<28} until {until}{'  new' if path.stem in made else ''}")  # noqa: T201
+        print(f"{path.name:<28} {common_name(certificate):<28} until {until}{'  new' if path.stem in made else ''}")
     return 0
 
 
