@@ -5,7 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from compensator.report.figure import Figure, Line, svg, thinned
+from compensator.report.drawing import svg
+from compensator.report.figure import Figure, Line, thinned
 from compensator.report.page import Page, Table, write_page
 
 

@@ -8,7 +8,8 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from compensator.report.figure import COLOURS, LINES, svg, thinned
+from compensator.report.drawing import COLOURS, LINES, svg
+from compensator.report.figure import thinned
 from compensator.report.page import (
     Details,
     Figure,

@@ -1,0 +1,205 @@
+"""Draws the pictures of a page with matplotlib: as SVG in CSS variables, or in the colours of paper."""
+
+from __future__ import annotations
+
+import html
+import io
+import re
+import textwrap
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import matplotlib.dates as mdates
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Canvas
+from matplotlib.figure import SubFigure
+
+from compensator.report.figure import Figure, Line, described, thinned
+
+
+@dataclass(frozen=True, slots=True)
+class Palette:
+    """Colours of a picture.
+
+    Parameters
+    ----------
+    ink, grid : str
+        Of letters and axes, and of the grid and shaded spans.
+    lines : tuple of str
+        Of what is drawn.
+    """
+
+    ink: str
+    grid: str
+    lines: tuple[str, ...]
+
+
+#: Placeholder colours that are drawn → CSS variables that stand in the page.
+INK, GRID = "#010101", "#020202"
+LINES = ("#030303", "#040404", "#050505", "#060606", "#070707")
+COLOURS = {INK: "--ink", GRID: "--grid"} | {colour: f"--line-{i}" for i, colour in enumerate(LINES)}
+ON_PAGE = Palette(INK, GRID, LINES)
+#: The same as the page's own where it is printed.
+ON_PAPER = Palette("#000000", "#d0d0d0", ("#d55e00", "#0072b2", "#009e73", "#a3487f", "#8a7400"))
+_DASHES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)))
+#: Seconds of a day, matplotlib's unit of time.
+_DAY_S = 86400.0
+#: Narrowest piece of a strip, as a share of the picture: an event of one minute in a year is seen.
+_NARROWEST = 1.0 / 500.0
+#: What a letter and what the sample of a legend's entry take, and what stands left of the axes, inches.
+_LETTER_IN, _SAMPLE_IN, _LEFT_IN = 0.09, 0.65, 0.8
+
+
+def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
+    """Draw a figure.
+
+    Parameters
+    ----------
+    figure : Figure
+        What to draw.
+    prefix : str
+        Makes its identifiers different from those of other pictures on the page.
+    width : float
+        In inches: less where several stand side by side, so that the text stays readable.
+    """
+    with mpl.rc_context(style(ON_PAGE) | {"svg.fonttype": "none", "svg.hashsalt": figure.title}):
+        canvas = Canvas(figsize=(width, figure.height), layout="constrained")
+        draw(canvas, figure, width, ON_PAGE)
+        buffer = io.StringIO()
+        canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    for colour, variable in COLOURS.items():
+        text = text.replace(colour, f"var({variable})")
+    text = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{prefix}-", text)
+    label = html.escape(f"{figure.title}. {figure.note}".strip())
+    opening, _, rest = text.partition(">")
+    opening = opening.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+    return f"{opening}><desc>{html.escape(described(figure))}</desc>{rest}"
+
+
+def style(palette: Palette) -> dict[Any, Any]:
+    """Return matplotlib's settings for pictures in some colours."""
+    ink = palette.ink
+    return {
+        "font.family": "sans-serif", "font.size": 10, "text.color": ink, "axes.labelcolor": ink, "axes.edgecolor": ink,
+        "xtick.color": ink, "ytick.color": ink, "grid.color": palette.grid, "figure.facecolor": "none",
+        "axes.facecolor": "none", "legend.framealpha": 0.0,
+    }  # fmt: skip
+
+
+def draw(canvas: Canvas | SubFigure, figure: Figure, width: float, palette: Palette) -> None:
+    """Draw a figure onto a canvas.
+
+    Parameters
+    ----------
+    canvas : matplotlib.figure.Figure or SubFigure
+        Where, laid out by "constrained".
+    figure : Figure
+        What.
+    width : float
+        Of the canvas, inches: so much room there is for the legend.
+    palette : Palette
+        Its colours.
+    """
+    axes = canvas.subplots()
+    _draw(axes, figure, palette)
+    if figure.strips:
+        _strips(axes, figure, palette)
+    _legend(axes, width)
+
+
+def _draw(axes: Axes, figure: Figure, palette: Palette) -> None:
+    named: set[str] = set()
+    lines, unit = palette.lines, _DAY_S if figure.clock else 1.0
+    for span in figure.spans:
+        label = "" if span.name in named else _plain(span.name)
+        axes.axvspan(span.first / unit, span.last / unit, color=palette.grid, alpha=0.35, linewidth=0, label=label)
+        named.add(span.name)
+    if figure.unit_circle:
+        angle = np.linspace(0.0, 2.0 * np.pi, 200)
+        axes.plot(np.cos(angle), np.sin(angle), color=palette.ink, linewidth=0.8)
+        axes.set_aspect("equal", adjustable="datalim")
+    for i, line in enumerate(figure.lines):
+        _curve(axes, line, i, figure, lines)
+    drawn = len(figure.lines)
+    for marks in figure.marks:
+        hollow: dict[str, Any] = {"markerfacecolor": "none"} if marks.marker == "o" else {}
+        colour = lines[drawn % len(lines)]
+        axes.plot(marks.x / unit, marks.y, marks.marker, color=colour, label=_plain(marks.name), **hollow)
+        drawn += 1
+    for stems in figure.stems:
+        colour = lines[drawn % len(lines)]
+        axes.vlines(stems.x, 0.0, stems.y, color=colour, label=_plain(stems.name), linewidth=2.0)
+        drawn += 1
+    if figure.stems:
+        axes.axhline(0.0, color=palette.ink, linewidth=0.8)
+    for limit in figure.limits:
+        axes.axhline(limit, color=palette.ink, linewidth=0.8, linestyle="--")
+    # A logarithmic axis without a positive value cannot be drawn.
+    if figure.x_log and np.isfinite(axes.dataLim.minposx):
+        axes.set_xscale("log")
+    if figure.y_log and np.isfinite(axes.dataLim.minposy):
+        axes.set_yscale("log")
+    _axes(axes, figure, unit)
+
+
+def _axes(axes: Axes, figure: Figure, unit: float) -> None:
+    if figure.x_limits is not None:
+        axes.set_xlim(figure.x_limits[0] / unit, figure.x_limits[1] / unit)
+    if figure.clock:
+        locator = mdates.AutoDateLocator(tz="UTC", minticks=3, maxticks=9)  # type: ignore[no-untyped-call]
+        axes.xaxis.set_major_locator(locator)
+        formatter = mdates.ConciseDateFormatter(locator, tz="UTC")  # type: ignore[no-untyped-call]
+        axes.xaxis.set_major_formatter(formatter)
+    axes.set_xlabel(_plain(figure.x_label))
+    axes.set_ylabel(_plain(figure.y_label))
+    axes.grid(visible=True)
+
+
+def _strips(axes: Axes, figure: Figure, palette: Palette) -> None:
+    """Draw rows of time, the first on top; a piece too narrow to be seen is drawn as wide as one that is."""
+    unit = _DAY_S if figure.clock else 1.0
+    first, last = figure.x_limits or (
+        min((a for s in figure.strips for a, _ in s.spans), default=0.0),
+        max((b for s in figure.strips for _, b in s.spans), default=1.0),
+    )
+    least = (last - first) * _NARROWEST
+    for row, strip in enumerate(figure.strips):
+        pieces = [(a / unit, max(b - a, least) / unit) for a, b in strip.spans]
+        axes.broken_barh(pieces, (row - 0.35, 0.7), color=palette.lines[strip.line % len(palette.lines)], linewidth=0)
+    axes.set_yticks(range(len(figure.strips)), [_plain(strip.name) for strip in figure.strips])
+    axes.set_ylim(len(figure.strips) - 0.5, -0.5)
+
+
+def _curve(axes: Axes, line: Line, i: int, figure: Figure, lines: tuple[str, ...]) -> None:
+    colour = lines[i % len(lines)]
+    # The sixth curve has the first one's colour, but another dash.
+    dash = _DASHES[(i + i // len(lines)) % len(_DASHES)]
+    x = line.x / _DAY_S if figure.clock else line.x
+    keep = thinned(line.x, line.y, x_log=figure.x_log)
+    axes.plot(x[keep], line.y[keep], linestyle=dash, color=colour, label=_plain(line.name), linewidth=1.5)
+    if line.band is not None:
+        edges = [thinned(line.x, edge, x_log=figure.x_log) for edge in line.band]
+        keep = np.unique(np.concatenate([keep, *edges]))
+        low, high = line.band
+        axes.fill_between(x[keep], low[keep], high[keep], color=colour, alpha=0.2, linewidth=0)
+
+
+def _legend(axes: Axes, width: float) -> None:
+    """Put the names above the axes, in as many columns as there is room for."""
+    handles, names = axes.get_legend_handles_labels()
+    if not names:
+        return
+    room = width - _LEFT_IN
+    names = [textwrap.fill(name, int((room - _SAMPLE_IN) / _LETTER_IN)) for name in names]
+    longest = max(len(part) for name in names for part in name.splitlines())
+    columns = min(3, max(1, int(room / (longest * _LETTER_IN + _SAMPLE_IN))))
+    axes.legend(handles, names, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2)
+
+
+def _plain(words: str) -> str:
+    """Keep matplotlib from reading what stands between two dollar signs as a formula."""
+    return words.replace("$", r"\$")
