@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import re
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +13,6 @@ from compensator.audit.findings import Difference, Finding, Kind, utc
 from compensator.audit.recording_audit import RecordingAudit, audit_recording
 from compensator.chain import NOTHING
 from compensator.signature import Verifier
-
-#: Less than so many bytes are audited in this process; starting others takes as long.
-ALONE = 8_000_000
 
 _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
 
@@ -84,7 +79,7 @@ class Audit:
 
 def audit(
     paths: Sequence[Path], *, public_key: Path | None = None, told: Callable[[int, int], None] | None = None,
-    workers: int | None = None,
+    executor: Executor | None = None,
 ) -> Audit:  # fmt: skip
     """Audit recordings.
 
@@ -96,8 +91,8 @@ def audit(
         Key that they must be signed with.
     told : callable, optional
         Called with the number of bytes worked off, and of all.
-    workers : int, optional
-        Number of processes; as many as there are processors where it is worth it.
+    executor : Executor, optional
+        Who audits the files; this process, one after the other, where there is none.
 
     Raises
     ------
@@ -110,8 +105,6 @@ def audit(
     paths = list(dict.fromkeys(paths))
     sizes = {path: path.stat().st_size if path.exists() else 0 for path in paths}
     whole = sum(sizes.values())
-    if workers is None:
-        workers = min(os.cpu_count() or 1, len(paths)) if whole > ALONE else 1
     done = 0
 
     def add(size: int) -> None:
@@ -120,28 +113,21 @@ def audit(
         if told is not None:
             told(done, whole)
 
-    if workers > 1:
-        audits = _side_by_side(paths, public_key, workers, lambda path: add(sizes[path]))
+    if executor is not None:
+        audits = _side_by_side(executor, paths, public_key, lambda path: add(sizes[path]))
     else:
         audits = [audit_recording(path, verifier, told=add) for path in paths]
     return judge(audits, signed=verifier is not None)
 
 
 def _side_by_side(
-    paths: Sequence[Path], public_key: Path | None, workers: int, done: Callable[[Path], None]
+    executor: Executor, paths: Sequence[Path], public_key: Path | None, done: Callable[[Path], None]
 ) -> list[RecordingAudit]:  # fmt: skip
-    """Audit files in processes: each carries the state that it begins with, so none waits for another."""
-    # A fresh interpreter for each: whatever threads the caller has, none of them is copied.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = {pool.submit(_audit_one, path, public_key): path for path in paths}
-        try:
-            for job in as_completed(jobs):
-                job.result()
-                done(jobs[job])
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    """Audit files side by side: each carries the state that it begins with, so none waits for another."""
+    jobs = {executor.submit(_audit_one, path, public_key): path for path in paths}
+    for job in as_completed(jobs):
+        job.result()
+        done(jobs[job])
     return [job.result() for job in jobs]
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 _COLUMN = "role of a column of another name"
 _OPERATOR = "Zenoh configuration with the operator's certificate, such as operator.json5; needed over TLS"
+_SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (default: all cores of this machine)"
 
 
 def demo(parser: argparse.ArgumentParser) -> None:
@@ -77,6 +78,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="DIR", help="diagnosis.json, model.toml and report.html come there")
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
+    add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
 
 def replay(parser: argparse.ArgumentParser) -> None:
@@ -86,6 +88,7 @@ def replay(parser: argparse.ArgumentParser) -> None:
     add("--public-key", type=Path, metavar="FILE", help="Ed25519 key, PEM, that they must be signed with")
     add("--model", metavar="OTHER", help="no audit: what this model would have done; a model file, or quill")
     add("--out", type=Path, metavar="CSV", help="with --model: both offsets, sample by sample")
+    add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
 
 def adopt(parser: argparse.ArgumentParser) -> None:

@@ -12,13 +12,17 @@ from pathlib import Path
 from compensator import __version__
 from compensator.commands import Answer
 from compensator.commands.identify import progress, read_runs
+from compensator.commands.workers import workers
 from compensator.diagnose.diagnosis import diagnose
-from compensator.diagnose.outcome import Diagnosis
+from compensator.diagnose.outcome import FOLDS, Diagnosis
 from compensator.diagnose.summary import figures, text
 from compensator.model.model_file import load_model
 from compensator.model.model_writer import write_model
 from compensator.report.diagnosis import write_report
 from compensator.tables import roles_of
+
+#: So few values are searched in this process; starting others takes as long.
+ALONE = 30_000
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -29,16 +33,20 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the data or the model cannot be read, or there is too little.
     """
-    return diagnose_files(arguments.data, arguments.model, arguments.out, columns=arguments.column)
+    given = arguments
+    return diagnose_files(given.data, given.model, given.out, columns=given.column, scheduler=given.scheduler)
 
 
-def diagnose_files(data: Sequence[Path], model: str | Path, out: Path, *, columns: Sequence[str] = ()) -> Answer:
+def diagnose_files(
+    data: Sequence[Path], model: str | Path, out: Path, *, columns: Sequence[str] = (), scheduler: str | None = None
+) -> Answer:
     """Diagnose files and write `diagnosis.json`, `model.toml` and `report.html` into a folder."""
     base = load_model(model)
     remarks: list[str] = []
     runs = read_runs(data, roles_of(columns), remarks, period_s=base.period_s)
-    with progress("searching") as told:
-        diagnosis = diagnose(base, runs, told=told)
+    values = sum(run.t_s.size * (len(run.channels) + 2) for run in runs)
+    with progress("searching") as told, workers(FOLDS if values > ALONE else 1, scheduler) as executor:
+        diagnosis = diagnose(base, runs, told=told, mapped=executor.map if executor else map)
     return write(diagnosis, base.sha256, data, out, remarks)
 
 

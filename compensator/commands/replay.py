@@ -11,11 +11,14 @@ from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
 from compensator.commands import Answer
 from compensator.commands.progress import progress
+from compensator.commands.workers import workers
 from compensator.errors import UsageError
 from compensator.model.model_file import load_model
 
 #: Exit code where an audit found a difference.
 FOUND = 3
+#: Less than so many bytes are audited in this process; starting others takes as long.
+ALONE = 8_000_000
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -33,8 +36,13 @@ def run(arguments: argparse.Namespace) -> Answer:
         return _compare(paths, arguments.model, arguments.out)
     if arguments.out is not None:
         raise UsageError("--out: is for --model, which is not given")
-    with progress("auditing") as told:
-        found = audit(paths, public_key=arguments.public_key, told=told)
+    public_key = arguments.public_key
+    if arguments.scheduler is not None:
+        # The workers look for the same files, from other folders.
+        paths, public_key = [path.resolve() for path in paths], public_key and public_key.resolve()
+    worth = len(paths) if sum(path.stat().st_size for path in paths if path.exists()) > ALONE else 1
+    with progress("auditing") as told, workers(worth, arguments.scheduler) as executor:
+        found = audit(paths, public_key=public_key, told=told, executor=executor)
     return Answer(found.as_json(), summary(found), 0 if found.clean else FOUND)
 
 

@@ -21,6 +21,7 @@ from compensator.diagnose.outcome import (
     RIVAL_TIMES,
     Diagnosis,
     Effect,
+    Mapped,
     Rival,
     how_to_tell_apart,
     rms_of,
@@ -44,7 +45,7 @@ def is_far_off(model: ThermalModel, evidence: Evidence) -> bool:
     return isinstance(folds, float) and folds > FAR_OFF * evidence.spread_um
 
 
-def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told) -> Diagnosis:
+def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told, mapped: Mapped) -> Diagnosis:
     """Fit the base anew with the channels that it lacks, and say what that is worth on held-out blocks.
 
     Parameters
@@ -55,10 +56,12 @@ def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told) -> Diagno
         Its residual and signals.
     told : callable
         Is told how many blocks of how many are done.
+    mapped : callable
+        Does the fits without a block: `map`, or that of an executor.
     """
     y, open_ = evidence.y_um, evidence.deformation_um
     whole = refit(evidence)
-    before, after = _held_out(evidence, told)
+    before, after = _held_out(evidence, told, mapped)
     effects = _effects(evidence, whole)
     helps = bool(effects) and rms_of(after) <= rms_of(before)
     left = np.where(evidence.used, open_ - whole.predicted, np.nan)
@@ -75,13 +78,15 @@ def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told) -> Diagno
     )  # fmt: skip
 
 
-def _held_out(evidence: Evidence, told: Told) -> tuple[Vector, Vector]:
+def _held_out(evidence: Evidence, told: Told, mapped: Mapped) -> tuple[Vector, Vector]:
     """Return the residual of the base and of the refit on every block, each without that block."""
     before, after = (np.full(evidence.used.size, np.nan) for _ in range(2))
     open_ = evidence.deformation_um
-    for done, block in enumerate(evidence.blocks(FOLDS), start=1):
+    told(1, FOLDS + 1)
+    blocks = list(evidence.blocks(FOLDS))
+    fits = mapped(refit, [evidence.hidden(block) for block in blocks])
+    for done, (block, seen) in enumerate(zip(blocks, fits, strict=True), start=2):
         told(done, FOLDS + 1)
-        seen = refit(evidence.hidden(block))
         before[block] = (open_ - seen.by_paths)[block]
         after[block] = (open_ - seen.predicted)[block]
     return before, after

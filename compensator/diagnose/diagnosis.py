@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import repeat
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +24,7 @@ from compensator.diagnose.outcome import (
     RIVAL_TIMES,
     Diagnosis,
     Effect,
+    Mapped,
     Rival,
     Verdict,
     how_to_tell_apart,
@@ -46,7 +49,9 @@ def _silent(done: int, total: int) -> None:
     """Tell nobody."""
 
 
-def diagnose(model: ThermalModel, runs: Sequence[Run], *, told: Told = _silent) -> Diagnosis:
+def diagnose(
+    model: ThermalModel, runs: Sequence[Run], *, told: Told = _silent, mapped: Mapped = map
+) -> Diagnosis:  # fmt: skip
     """Find what a model lacks.
 
     Parameters
@@ -57,6 +62,8 @@ def diagnose(model: ThermalModel, runs: Sequence[Run], *, told: Told = _silent) 
         Measured data with y and every channel that was logged.
     told : callable
         Is told how many searches of how many are done.
+    mapped : callable
+        Does the searches for the held-out blocks: `map`, or that of an executor.
 
     Raises
     ------
@@ -66,12 +73,12 @@ def diagnose(model: ThermalModel, runs: Sequence[Run], *, told: Told = _silent) 
     evidence = evidence_of(model, runs)
     told(0, FOLDS + 1)
     if is_far_off(model, evidence):
-        return diagnose_anew(model, evidence, told)
-    searched = _by_search(model, evidence, told)
+        return diagnose_anew(model, evidence, told, mapped)
+    searched = _by_search(model, evidence, told, mapped)
     if not _doubtful(searched, evidence):
         return searched
     # What was found in the residual holds nowhere else, or nothing was: perhaps the paths themselves are bent.
-    anew = diagnose_anew(model, evidence, told)
+    anew = diagnose_anew(model, evidence, told, mapped)
     better = rms_of(anew.held_out_after) < ANEW_LEAVES * rms_of(searched.held_out_before)
     return anew if anew.effects and better else searched
 
@@ -83,9 +90,9 @@ def _doubtful(searched: Diagnosis, evidence: Evidence) -> bool:
     return searched.verdict == "unexplained" and rms_of(searched.held_out_before) > FAR_OFF * evidence.spread_um
 
 
-def _by_search(model: ThermalModel, evidence: Evidence, told: Told) -> Diagnosis:
+def _by_search(model: ThermalModel, evidence: Evidence, told: Told, mapped: Mapped) -> Diagnosis:
     found = Search(evidence).run()
-    before, after = _held_out(evidence, found, told)
+    before, after = _held_out(evidence, found, told, mapped)
     helps = rms_of(after) <= rms_of(before)
     everything = _effects(evidence, found)
     effects = tuple(effect for effect in everything if not effect.part.companion)
@@ -107,7 +114,7 @@ def _by_search(model: ThermalModel, evidence: Evidence, told: Told) -> Diagnosis
 # ---------------------------------------------------------------------------- held out
 
 
-def _held_out(evidence: Evidence, found: Found, told: Told) -> tuple[Vector, Vector]:
+def _held_out(evidence: Evidence, found: Found, told: Told, mapped: Mapped) -> tuple[Vector, Vector]:
     """Return the residual before and after on every block, each by a search that did not see it.
 
     Whether a run's initial state is taken as unknown or as rest is what serves the first model better.
@@ -116,16 +123,24 @@ def _held_out(evidence: Evidence, found: Found, told: Told) -> tuple[Vector, Vec
     hidden = [isinstance(part.hypothesis, Unobserved) for part in found.joint.parts]
     before = {rest: np.full(raw.size, np.nan) for rest in (True, False)}
     after = {rest: np.full(raw.size, np.nan) for rest in (True, False)}
-    for done, block in enumerate(evidence.blocks(FOLDS), start=1):
+    told(1, FOLDS + 1)
+    blocks = list(evidence.blocks(FOLDS))
+    views = [evidence.hidden(block) for block in blocks]
+    # Nobody knows what a hidden source does in a block that was not seen.
+    unknown = bool(hidden) and all(hidden)
+    found_without = repeat(nothing) if unknown else mapped(partial(_found_in, hidden=any(hidden)), views)
+    for done, (block, seen, effects) in enumerate(zip(blocks, views, found_without, strict=False), start=2):
         told(done, FOLDS + 1)
-        seen = evidence.hidden(block)
-        # Nobody knows what a hidden source does in a block that was not seen.
-        effects = nothing if hidden and all(hidden) else summed(seen, Search(seen).run(hidden=any(hidden)).joint)
         for rest in (True, False):
             before[rest][block] = seen.left(raw, nothing, at_rest=rest)[block]
             after[rest][block] = seen.left(raw, effects, at_rest=rest)[block]
     best = min((True, False), key=lambda rest: rms_of(before[rest]))
     return before[best], after[best]
+
+
+def _found_in(seen: Evidence, *, hidden: bool) -> Vector:
+    """Search in a part of the data; return what is found there on every sample of all, µm."""
+    return summed(seen, Search(seen).run(hidden=hidden).joint)
 
 
 # ---------------------------------------------------------------------------- what was found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,6 +19,8 @@ Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 
 #: Blocks that are held out in turn, and how that is told.
 FOLDS = 3
+#: What does a function for each of some values, like `map`: here, or side by side.
+Mapped = Callable[..., Iterable[Any]]
 HELD_OUT = (
     f"each of {FOLDS} blocks of time predicted after choosing and fitting on the others; zero and initial state from "
     "the others, too"

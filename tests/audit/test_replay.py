@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from compensator.audit.series import Audit, audit, summary
+from compensator.commands.workers import workers
 from compensator.config import LoadedConfig, parse_config
 from compensator.messages import Event, Offset
 from compensator.model.model_file import parse_model
@@ -326,6 +327,8 @@ def test_several_processes_find_the_same(tmp_path: Path) -> None:
     Service(tmp_path, start_ns=evening).run(30).stop()
     paths = recordings(tmp_path, MACHINE)
     told: list[tuple[int, int]] = []
-    side_by_side = audit(paths[::-1], workers=2, told=lambda done, whole: told.append((done, whole)))
+    with workers(2, None) as executor:
+        assert executor is not None
+        side_by_side = audit(paths[::-1], executor=executor, told=lambda done, whole: told.append((done, whole)))
     assert side_by_side == audit(paths)
     assert told[-1][0] == told[-1][1] == sum(path.stat().st_size for path in paths)

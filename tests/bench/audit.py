@@ -20,6 +20,7 @@ import msgspec
 from mcap.reader import make_reader
 
 from compensator.audit.series import audit
+from compensator.commands.workers import workers
 from compensator.container import PAYLOAD, Container
 from compensator.messages import MESSAGES
 from compensator.recording import recordings
@@ -68,13 +69,14 @@ def over_all(read: Callable[[Path], int], paths: Sequence[Path], workers: int) -
 def measure(folder: Path) -> None:
     paths = recordings(folder, MACHINE)
     size = sum(path.stat().st_size for path in paths)
-    workers = os.cpu_count() or 1
-    print(f"\na year audited: {len(paths)} files, {size / 1e6:.0f} MB, {workers} processes")
+    count = os.cpu_count() or 1
+    print(f"\na year audited: {len(paths)} files, {size / 1e6:.0f} MB, {count} processes")
     for _ in range(3):
-        library, messages = over_all(read_with_library, paths, workers)
-        own, _ = over_all(read_by_ourselves, paths, workers)
+        library, messages = over_all(read_with_library, paths, count)
+        own, _ = over_all(read_by_ourselves, paths, count)
         began = time.perf_counter()
-        found = audit(paths)
+        with workers(len(paths), None) as executor:
+            found = audit(paths, executor=executor)
         seconds = time.perf_counter() - began
         print(
             f"{found.samples} samples, {messages} messages, clean: {found.clean}; audit {seconds:.1f} s; reading and "

@@ -26,6 +26,24 @@ def followed(form: str, at: float, wanted: float, half: float) -> float:
     return wanted if abs(wanted - at) > half else at
 
 
+def _trace(form: str, share: Vector, half: float) -> Vector:
+    """Return where it stands after each step: `followed` over a record, without a call for each sample."""
+    at, out = 0.0, []
+    if form == "stick":
+        for wanted in share.tolist():
+            if not -half <= wanted - at <= half:
+                at = wanted
+            out.append(at)
+        return np.array(out)
+    for wanted in share.tolist():
+        if at < wanted - half:
+            at = wanted - half
+        elif at > wanted + half:
+            at = wanted + half
+        out.append(at)
+    return np.array(out)
+
+
 @register("hysteresis")
 class HysteresisEffect:
     """The streaming side."""
@@ -74,12 +92,7 @@ class HysteresisHypothesis(Hypothesis):
     def fixed(self, waves: Waves, values: Sequence[float]) -> Vector | None:
         """Return how far it stands behind."""
         share = waves.y_dtf_um + waves.y_tdtf_um if self.acts_on == "all" else waves.share(self.acts_on)
-        at, out = 0.0, []
-        half, law = float(values[0]), self.law
-        for wanted in share.tolist():
-            at = followed(law, at, wanted, half)
-            out.append(at)
-        return np.array(out) - share
+        return _trace(self.law, share, float(values[0])) - share
 
     def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
         """Return the table that the engine runs."""
