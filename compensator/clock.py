@@ -22,7 +22,7 @@ class Clock(Protocol):
     async def sleep(self, seconds: float) -> None:
         """Wait."""
 
-    async def settle(self, tasks: Collection[asyncio.Task[Any]], timeout_s: float) -> None:
+    async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
         """Wait until the tasks are done, or for a while; the tasks go on."""
 
 
@@ -41,7 +41,7 @@ class SystemClock:
         """Wait."""
         await asyncio.sleep(max(seconds, 0.0))
 
-    async def settle(self, tasks: Collection[asyncio.Task[Any]], timeout_s: float) -> None:
+    async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
         """Wait until the tasks are done, or for a while."""
         if tasks:
             await asyncio.wait(tasks, timeout=timeout_s)
@@ -86,7 +86,7 @@ class VirtualClock:
             await self._on_advance(self._elapsed_ns / NS)
         await asyncio.sleep(0)
 
-    async def settle(self, tasks: Collection[asyncio.Task[Any]], timeout_s: float) -> None:
+    async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
         """Wait until the tasks are done, however long that takes in real time."""
         if tasks:
             await asyncio.wait(tasks)

@@ -290,6 +290,13 @@ MESSAGES: Mapping[str, type[msgspec.Struct]] = {
     "seal": Seal,
 }
 
+
+def degraded(offset: Offset, reason: str) -> Offset:
+    """Return an offset with one reason more; a state of `ok` becomes `degraded`."""
+    state: State = "degraded" if offset.state == "ok" else offset.state
+    return msgspec.structs.replace(offset, state=state, reasons=[*offset.reasons, reason])
+
+
 _ENCODER = msgspec.json.Encoder()
 
 

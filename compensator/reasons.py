@@ -54,8 +54,12 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "operator_hold": ("An operator has frozen the offset.", "Send the command resume."),
     "recording_failed": (
-        "The sample could not be written to disk; compensation goes on.",
+        "The sample could not be written to disk and waits for it; compensation goes on.",
         "Check free space, permissions and the disk.",
+    ),
+    "recording_late": (
+        "The disk is so slow that the offset went out before its sample was written; that follows.",
+        "Check the disk: its health, other programs that write to it, a network share.",
     ),
     "internal_error": ("The service met an error of its own and holds the offset.", "Report the event with its text."),
     "good": ("The value can be used.", "Nothing."),

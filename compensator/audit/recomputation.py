@@ -12,14 +12,15 @@ from compensator.audit.verification import Record
 from compensator.config import Config, parse_config
 from compensator.container import PAYLOAD, Attachment, Contents
 from compensator.errors import CompensatorError, DataError
-from compensator.messages import Event, Offset, Sample, encode
+from compensator.messages import Event, Offset, Sample, degraded, encode
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation
+from compensator.service.recording_thread import FAILED, LATE
 from compensator.service.retrace import obey
 
-#: Beginnings of what the service says when the disk does not take the recording, and when it does again.
-DISK_FAILED, DISK_BACK = "the disk does not take the recording", "the disk takes the recording again"
+#: Reasons that the disk gives: only the offset itself can say that it was published before it was on disk.
+_DISK_REASONS = (FAILED, LATE)
 
 _SAMPLE = msgspec.json.Decoder(Sample)
 _EVENT = msgspec.json.Decoder(Event)
@@ -102,7 +103,8 @@ class Recomputation:
         self.restarted = False
         #: Names of recordings that events say were removed by the limit of what is kept.
         self.removed: list[str] = []
-        self._disk_failed = False
+        #: Numbers of samples whose offset was published before it was on disk.
+        self.early: set[int] = set()
         #: A sample of which the estimate or the offset is missing: a torn end, or a difference.
         self._incomplete: Difference | None = None
 
@@ -157,10 +159,9 @@ class Recomputation:
         if event.kind == "start":
             self.restarted = self.restarted or not self.samples
         elif event.kind == "recording":
-            if event.text.startswith(DISK_FAILED):
-                self._disk_failed = True
-            elif event.text.startswith(DISK_BACK):
-                self._disk_failed = False
+            early = event.data.get("published_early")
+            if type(early) is int:
+                self.early.add(early)
             removed = event.data.get("removed")
             if isinstance(removed, list):
                 self.removed += [name for name in removed[:1000] if isinstance(name, str)]
@@ -183,13 +184,7 @@ class Recomputation:
         else:
             self.first_seq, self.first_ns = sample.seq, sample.time_utc_ns
         self.last_seq, self.last_ns = sample.seq, sample.time_utc_ns
-        expected = outcome.offset
-        # The file began because the disk had not taken the sample before; the event that says so may be lost with it.
-        if self._disk_failed or (not self.samples and b'"recording_failed"' in offset):
-            expected = msgspec.structs.replace(
-                expected, state="degraded" if expected.state == "ok" else expected.state,
-                reasons=[*expected.reasons, "recording_failed"],
-            )  # fmt: skip
+        expected = self._as_published(outcome.offset, offset)
         self.samples += 1
         pairs = (
             ("sample", data, outcome.sample),
@@ -211,6 +206,14 @@ class Recomputation:
                 self._count(Difference(file=self._file, topic="event", seq=sample.seq, time_utc_ns=sample.time_utc_ns,
                                        fields=(Field(name=kind, recorded=said, recomputed=text),)))  # fmt: skip
 
+    def _as_published(self, expected: Offset, recorded: bytes) -> Offset:
+        """Return an offset with the reason of the disk where it was published with one."""
+        for reason in _DISK_REASONS:
+            if f'"{reason}"'.encode() in recorded:
+                self.early.add(expected.seq)
+                return degraded(expected, reason)
+        return expected
+
     def _held(self, offset: bytes, events: list[Event], records: list[Record]) -> None:
         """Compare an offset that was published although its sample could not be worked on."""
         last = records[-1]
@@ -219,7 +222,8 @@ class Recomputation:
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             raise DataError(f"{self._file}: /offset record {last.sequence}: {error}") from error
         self._act(events, said.seq)
-        expected = encode(self.compensation.held(said.machine, said.seq, said.time_utc_ns))
+        held = self.compensation.held(said.machine, said.seq, said.time_utc_ns)
+        expected = encode(self._as_published(held, offset))
         if expected != offset:
             self._differs("offset", said.seq, said.time_utc_ns, offset, expected)
 

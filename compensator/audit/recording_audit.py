@@ -74,6 +74,8 @@ class RecordingAudit:
         SHA-256 of the model.
     removed : tuple of str
         Recordings that its events say were removed by the limit of what is kept.
+    early : int
+        Offsets that were published before they were on disk.
     size : int
         Bytes.
     """
@@ -108,6 +110,7 @@ class RecordingAudit:
     not_worked_out: str = ""
     model: str = ""
     removed: tuple[str, ...] = ()
+    early: int = 0
     size: int = 0
 
 
@@ -296,7 +299,7 @@ class _Audit:
             state_after=hashlib.sha256(work.compensation.state()).hexdigest() if work else "",
             not_worked_out=self._why_not, model=work.compensation.model.sha256 if work else "",
             removed=tuple(work.removed) if work else (),
-            size=self._size,
+            early=len(work.early) if work else 0, size=self._size,
         )  # fmt: skip
 
 

@@ -63,7 +63,8 @@ class Audit:
         """Return it as it stands in the result of `--json`."""
         files = [
             {"file": f.file, "machine": f.machine, "end": f.end, "samples": f.samples, "records": f.records,
-             "skipped_samples": f.skipped, "differing_samples": f.differing, "findings": f.findings_count,
+             "skipped_samples": f.skipped, "differing_samples": f.differing,
+             "published_early": f.early, "findings": f.findings_count,
              "chained": bool(f.last), "last_value": f.last or None, "signed_seals": f.signed,
              "model_sha256": f.model or None}
             for f in self.files
@@ -200,6 +201,10 @@ class _Judge:
             self.remarks.append(f"{file.file}: has no end, {what}: still being written, or ended hard{known}")
         if file.skipped:
             self.remarks.append(f"{file.file}: {file.skipped} sample(s) between others were not recorded")
+        if file.early:
+            self.remarks.append(
+                f"{file.file}: {file.early} offset(s) were published before they were on disk, which was slow or failed"
+            )
         self._seals(file)
 
     def _seals(self, file: RecordingAudit) -> None:

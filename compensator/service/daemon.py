@@ -32,6 +32,8 @@ log = logging.getLogger("compensator")
 
 #: Part of the poll interval that a sample waits for devices at most.
 WAIT_PART = 0.5
+#: So long an offset waits for the disk: a part of the poll interval, so that no poll comes late, and at most so many s.
+DISK_PART, DISK_S = 0.4, 2.0
 
 
 @dataclass(slots=True)
@@ -95,8 +97,9 @@ class Daemon:
         fraction = config.sampling.min_good_fraction
         self._collectors = {channel.name: ChannelCollector(fraction) for channel in config.channel}
         self._journal = Journal(
-            machine=config.machine.name, recorder=recorder, publish=publish, clock=clock, sequence=first_sequence
-        )
+            machine=config.machine.name, recorder=recorder, publish=publish, clock=clock, sequence=first_sequence,
+            limit_s=min(DISK_PART * config.sampling.poll_interval_s, DISK_S),
+        )  # fmt: skip
         self._takeover = Takeover(adoption, self._journal, clock, lambda: self._compensation)
         self._commands = Commands(self._journal, self._takeover, unproven=config.zenoh.takes_unproven())
         self._stop = False
@@ -158,20 +161,20 @@ class Daemon:
         """
         try:
             await self._poll(interval_s)
-            return self._sample(label_ns) if label_ns is not None else None
+            return await self._sample(label_ns) if label_ns is not None else None
         except Exception as error:
             log.exception("internal error")
             self._journal.note("error", f"internal error: {type(error).__name__}: {error}")
             self._compensation.fail()
             if label_ns is not None:
-                self._hold(label_ns)
+                await self._hold(label_ns)
             return None
 
-    def _hold(self, label_ns: int) -> None:
+    async def _hold(self, label_ns: int) -> None:
         """Publish that the last offset stands, without the sample that could not be worked on."""
-        offset = encode(self._compensation.held(self._config.machine.name, self._journal.sequence, label_ns))
-        self._journal.record([("offset", offset)], label_ns, self._compensation.state())
-        self._publish("offset", offset)
+        held = self._compensation.held(self._config.machine.name, self._journal.sequence, label_ns)
+        offset = await self._journal.record(label_ns, self._compensation.state(), offset=held)
+        self._publish("offset", encode(offset or held))
         self._journal.sequence += 1
 
     def stop(self) -> None:
@@ -182,7 +185,7 @@ class Daemon:
         self.stop()
         self._commands.close()
         await self._takeover.end()
-        self._journal.close(self._compensation.state())
+        await self._journal.close(self._compensation.state())
         for state in self._devices.values():
             if state.task is not None:
                 state.task.cancel()
@@ -232,7 +235,7 @@ class Daemon:
 
     # ------------------------------------------------------------------ one sample
 
-    def _sample(self, label_ns: int) -> Outcome:
+    async def _sample(self, label_ns: int) -> Outcome:
         began = time.perf_counter()
         self._pass_pause(label_ns)
         self._compensation = self._takeover.swap()
@@ -250,20 +253,16 @@ class Daemon:
         self._broken_off = False
         for kind, text in outcome.notes:
             self._journal.note(kind, text)
-        offset = self._journal.marked(outcome.offset)
+        self._tell_state(self._journal.expected(outcome.offset))
+        sample, estimate = encode(outcome.sample), encode(outcome.estimate)
+        offset = await self._journal.record(label_ns, state, sample=sample, estimate=estimate, offset=outcome.offset)
+        assert offset is not None
         self._tell_state(offset)
-        records = [
-            ("sample", encode(outcome.sample)),
-            ("estimate", encode(outcome.estimate)),
-            ("offset", encode(offset)),
-        ]
-        if not self._journal.record(records, label_ns, state):
-            offset = self._journal.marked(offset)
         outcome = Outcome(outcome.sample, outcome.estimate, offset, outcome.notes)
         self._publish("offset", encode(offset))
         self.latency.add(time.perf_counter() - began)
-        self._publish("sample", records[0][1])
-        self._publish("estimate", records[1][1])
+        self._publish("sample", sample)
+        self._publish("estimate", estimate)
         self._publish("status", encode(self._status(outcome)))
         self._journal.sequence += 1
         self._takeover.follow(outcome)

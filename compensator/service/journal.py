@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
 from collections.abc import Callable
 from typing import Any
 
-import msgspec
-
 from compensator.clock import Clock
-from compensator.messages import SCHEMA, Event, Offset, encode
+from compensator.messages import SCHEMA, Event, Offset, degraded, encode
+from compensator.service.recording_thread import FAILED, WAITING_EVENTS, Group, RecordingThread
 
-#: So many events wait for the disk at most, so that a disk that is gone for long costs no memory; the newest are kept.
-WAITING_EVENTS = 1000
+log = logging.getLogger("compensator")
+
+#: How it is said that the disk refuses the recording, takes it too late, and takes it again.
+DISK_FAILED = "the disk does not take the recording"
+DISK_LATE = "the disk takes the recording too late"
+DISK_BACK = "the disk takes the recording again"
+#: How often it is said that the service waits for the disk at its end, s.
+CLOSING_S = 10.0
 
 
 class Journal:
@@ -29,17 +36,25 @@ class Journal:
         For the time of events.
     sequence : int
         Number of the first sample.
+    limit_s : float
+        So long an offset waits for the disk, s.
     """
 
     def __init__(
-        self, *, machine: str, recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, sequence: int
-    ) -> None:
+        self, *, machine: str, recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, sequence: int,
+        limit_s: float,
+    ) -> None:  # fmt: skip
         self._machine = machine
         self._recorder = recorder
         self._publish = publish
         self._clock = clock
+        self._limit_s = limit_s
+        self._thread = RecordingThread(recorder)
         self._events: list[Event] = []
-        self._failed = False
+        #: What the next sample brings along: whether it opens a file, and another model.
+        self._new_file, self._model = False, None  # type: tuple[bool, bytes | None]
+        #: With which reason the last offset was published, and the last error of the disk.
+        self._reason, self._error = "", None  # type: tuple[str, BaseException | None]
         #: Number of the sample under way; events carry it.
         self.sequence = sequence
 
@@ -54,58 +69,81 @@ class Journal:
             schema=SCHEMA, machine=self._machine, seq=self.sequence, time_utc_ns=self._clock.utc_ns(), kind=kind,
             text=text, data=data or {},
         )  # fmt: skip
+        # Bounded, so that a loop that cannot record costs no memory.
         self._events = [*self._events[1 - WAITING_EVENTS :], event]
         self._publish("event", encode(event))
 
-    def record(self, records: list[tuple[str, bytes]], time_utc_ns: int, state: bytes) -> bool:
-        """Bring records and waiting events to disk; tell whether it worked.
+    async def record(
+        self, time_utc_ns: int, state: bytes, *, sample: bytes = b"", estimate: bytes = b"",
+        offset: Offset | None = None,
+    ) -> Offset | None:  # fmt: skip
+        """Bring a sample and the waiting events to disk, and return the offset as it is to be published.
+
+        Where the disk does not take it within `limit_s`, or not at all, the offset says so; the sample waits and is
+        written in its order.
 
         Parameters
         ----------
-        records : list of (str, bytes)
-            Topic and JSON.
         time_utc_ns : int
-            Time of the records, ns since 1970 UTC.
+            Time of the sample, ns since 1970 UTC.
         state : bytes
-            State of the compensation before the sample among the records.
+            State of the compensation before it.
+        sample, estimate : bytes
+            JSON; empty where there is none.
+        offset : Offset, optional
+            What the compensation decided.
         """
-        events = [("event", encode(event)) for event in self._events]
-        try:
-            self._recorder.write([*events, *records], time_utc_ns, state=state)
-        except OSError as error:
-            if not self._failed:
-                self._failed = True
-                self.note("recording", f"the disk does not take the recording: {error}")
-            return False
-        if self._failed:
-            self._failed = False
-            self.note("recording", "the disk takes the recording again")
-        self._events = self._events[len(events) :]
+        group = Group(
+            time_utc_ns=time_utc_ns, state=state, events=self._events, sample=sample, estimate=estimate, offset=offset,
+            new_file=self._new_file, model=self._model,
+        )  # fmt: skip
+        self._events, self._new_file, self._model = [], False, None
+        attempt = asyncio.wrap_future(self._thread.put(group))
+        attempt.add_done_callback(lambda done: done.cancelled() or done.exception())  # seen, also when it ends later
+        await self._clock.settle([attempt], self._limit_s)
+        reason, in_flight = self._thread.published(group)
+        self._tell_disk(reason, in_flight, attempt.exception() if attempt.done() else None)
         for text, data in self._recorder.remarks():
             self.note("recording", text, data)
-        return True
+        return degraded(offset, reason) if offset is not None and reason else offset
 
-    def marked(self, offset: Offset) -> Offset:
-        """Return the offset with what the receiver must know of the disk."""
-        if not self._failed or "recording_failed" in offset.reasons:
-            return offset
-        state = "degraded" if offset.state == "ok" else offset.state
-        return msgspec.structs.replace(offset, state=state, reasons=[*offset.reasons, "recording_failed"])
+    def expected(self, offset: Offset) -> Offset:
+        """Return the offset as it is published if the disk does as it did with the sample before."""
+        return degraded(offset, self._reason) if self._reason else offset
+
+    def _tell_disk(self, reason: str, in_flight: bool, error: BaseException | None) -> None:
+        """Note once when the disk does not take the recording, and once when it does again."""
+        data = {"published_early": self.sequence, "reason": reason} if in_flight else {}
+        if reason and (reason != self._reason or in_flight):
+            if error is not None and not isinstance(error, OSError):
+                log.error("internal error", exc_info=error)
+                self.note("recording", f"{DISK_FAILED}: internal error: {type(error).__name__}: {error}", data)
+            elif reason == FAILED:
+                self.note("recording", f"{DISK_FAILED}: {error or self._error}", data)
+            else:
+                self.note("recording", f"{DISK_LATE}: not within {self._limit_s:g} s", data)
+        elif self._reason and not reason:
+            lost, self._thread.lost = self._thread.lost, 0
+            text = f"{DISK_BACK}; " + (f"{lost} sample(s) were not recorded" if lost else "nothing was lost")
+            self.note("recording", text, {"lost": lost})
+        self._reason, self._error = reason, error or self._error
 
     def start_new_file(self, model: bytes | None = None) -> None:
-        """Finish the file, so that the next sample opens another; with another model where one is given."""
-        if model is not None:
-            self._recorder.attachments = {**self._recorder.attachments, "model.toml": model}
-        try:
-            self._recorder.start_new()
-        except OSError as error:
-            self.note("recording", f"the recording could not be finished: {error}")
+        """Let the next sample open a file of its own; with another model where one is given."""
+        self._new_file = True
+        self._model = model if model is not None else self._model
 
-    def close(self, state: bytes) -> None:
-        """Say that the service ends, and finish the recording."""
+    async def close(self, state: bytes) -> None:
+        """Say that the service ends, and finish the recording, however long the disk takes."""
         self.note("stop", "the service ends")
-        self.record([], self._clock.utc_ns(), state)
-        try:
-            self._recorder.close()
-        except OSError as error:
+        await self.record(self._clock.utc_ns(), state)
+        closing = asyncio.wrap_future(self._thread.close())
+        while not (await asyncio.wait([closing], timeout=CLOSING_S))[0]:
+            log.warning("the recording is being finished: the disk has not taken it for %g s", CLOSING_S)
+        if self._thread.waiting:
+            log.error("%d sample(s) are not on disk, which did not take them", self._thread.waiting)
+        error = closing.exception()
+        if isinstance(error, OSError):
             self.note("recording", f"the recording could not be finished: {error}")
+        elif error is not None:
+            raise error

@@ -63,11 +63,15 @@ class Recorder:
         self._finisher = Finisher(folder, machine, retention or Retention(), signer)
         self._live: _Live | None = None
         self._day = ""
+        #: A file that was given up with more in it than was synced, and how long it may be.
+        self._uncut: tuple[Path, int] | None = None
         #: Why the next file begins, and the last value of the file before it where that is known.
         self._reason, self._last = "start", b""
         self.path: Path | None = None
 
-    def write(self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"") -> None:
+    def write(
+        self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"", sync: bool = True
+    ) -> None:
         """Write records and bring them to disk, all of them before it returns.
 
         Parameters
@@ -79,10 +83,14 @@ class Recorder:
         state : bytes
             State of the compensation before these records; travels as `state.json` in a file that opens with them.
 
+        sync : bool
+            Without it they come to disk together with the next ones.
+
         Raises
         ------
         OSError
-            If the disk does not take them. The file is given up and the next call starts a new one.
+            If the disk does not take them. What was written since the last sync is cut off again, the file is given
+            up, and the next call starts a new one.
         """
         day = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%d")
         try:
@@ -93,8 +101,9 @@ class Recorder:
             self._live.add(records, time_utc_ns)
             if self._signer is not None and time_utc_ns - self._live.sealed_ns >= SEAL_EVERY_NS:
                 self._live.seal("hour", time_utc_ns, self._signer)
-            self._live.sync()
-        except OSError:
+            if sync:
+                self._live.sync()
+        except BaseException:
             self._give_up()
             raise
 
@@ -140,11 +149,19 @@ class Recorder:
         self._reason = "failure"
         # Read from the file when the next one opens: only it knows what it took.
         self._last = b""
-        if live is not None:
-            live.give_up()
+        if live is not None and not live.give_up():
+            self._uncut = live.path, live.synced
 
     def _open(self, time_utc_ns: int, day: str, state: bytes) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
+        if self._uncut is not None:
+            # What it holds beyond that is written again.
+            path, size = self._uncut
+            if path.exists() and path.stat().st_size > size:
+                os.truncate(path, size)
+            if not size:
+                path.unlink(missing_ok=True)
+            self._uncut = None
         previous = recordings(self._folder, self._machine)
         before = self._last
         if previous and not before:
@@ -233,7 +250,7 @@ class _Live:
         self._writer = Writer(self._sink, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
         self._sequence = 0
-        self._synced = 0
+        self.synced = 0
         self._chain = chain.ChainWriter(machine, before)
 
     @property
@@ -280,7 +297,7 @@ class _Live:
             view = view[os.write(self._descriptor, view) :]
         self._sink.data.clear()
         os.fsync(self._descriptor)
-        self._synced = self._sink.size
+        self.synced = self._sink.size
 
     def finish(self) -> None:
         """Write the end and close the file."""
@@ -288,16 +305,20 @@ class _Live:
         self.sync()
         os.close(self._descriptor)
 
-    def give_up(self) -> None:
-        """Cut off what is not whole and close the file."""
-        # Nothing more can be done where this fails, too; what was synced is on disk.
-        with suppress(OSError):
-            os.ftruncate(self._descriptor, self._synced)
+    def give_up(self) -> bool:
+        """Cut off what is not whole and close the file; tell whether the disk took that."""
+        cut = True
+        try:
+            os.ftruncate(self._descriptor, self.synced)
+        except OSError:
+            cut = False
         with suppress(OSError):
             os.close(self._descriptor)
-        if not self._synced:
+        if not self.synced:
             with suppress(OSError):
                 self.path.unlink()
+                cut = True
+        return cut
 
     def _write(self, topic: str, data: bytes) -> None:
         self._writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns, sequence=self._sequence)

@@ -145,7 +145,11 @@ async def test_a_disk_that_fails_and_returns(tmp_path: Path, monkeypatch: pytest
     await bench.run(60)
     found = look(tmp_path / "rec")
     assert found.clean, summary(found)
-    assert found.samples == 60 - 12 - 1 and "recording_failed" in reasons(tmp_path / "rec")
+    # What the disk refused waited, and is on record as it was published.
+    assert found.samples == 60 and sum(file.early for file in found.files) == 13
+    assert "recording_failed" in reasons(tmp_path / "rec")
+    logged = [r.data for path in recordings(tmp_path / "rec", MACHINE) for r in read_messages(path, ("offset",))]
+    assert logged == [data for name, data in bench.published if name == "offset"]
     assert [file.began for file in found.files] == ["start", "failure", "failure"]
     assert not list((tmp_path / "rec").glob("*.part"))
 

@@ -197,8 +197,8 @@ async def test_recordings_without_a_state_and_files_that_are_none(
     machine = Machine(tmp_path)
     write = Recorder.write
 
-    def stateless(self: Recorder, records: Any, time_utc_ns: int, *, state: bytes = b"") -> None:
-        write(self, records, time_utc_ns)
+    def stateless(self: Recorder, records: Any, time_utc_ns: int, *, state: bytes = b"", **rest: Any) -> None:
+        write(self, records, time_utc_ns, **rest)
 
     with monkeypatch.context() as patch:
         patch.setattr(Recorder, "write", stateless)
@@ -271,11 +271,11 @@ async def test_every_file_works_out_from_what_travels_in_it(tmp_path: Path, monk
     full = [False]
     write = Recorder.write
 
-    def failing(self: Recorder, records: Any, time_utc_ns: int, *, state: bytes = b"") -> None:
+    def failing(self: Recorder, records: Any, time_utc_ns: int, **rest: Any) -> None:
         if full[0]:
             self._give_up()
             raise OSError(28, "No space left on device")
-        write(self, records, time_utc_ns, state=state)
+        write(self, records, time_utc_ns, **rest)
 
     def break_off() -> None:
         compensation = machine.daemon._compensation  # type: ignore[union-attr]
@@ -295,6 +295,6 @@ async def test_every_file_works_out_from_what_travels_in_it(tmp_path: Path, monk
     await machine.run(120)
     kinds = {reason for o in machine.outcomes for reason in o.offset.reasons}
     assert {"recording_failed", "internal_error", "operator_hold", "predicting"} <= kinds
-    assert check_files(machine) >= 255
+    assert check_files(machine) >= 265
     assert len(recordings(machine.recordings, MACHINE)) >= 5
     assert np.nanmax(np.abs(np.diff(machine.offsets()))) <= 8.0 + 1e-9
