@@ -120,6 +120,36 @@ class Restart(_Table, frozen=True, kw_only=True):
     bridge_max_min: Positive | None = None
 
 
+class Rest(_Table, frozen=True, kw_only=True):
+    """`[plausibility.rest]`: when nothing heats the machine, and how far T_Q and AT may then be apart.
+
+    `channel`: what tells it, such as `heat_w` or `spindle_rpm`; at or below `at_most` for `after_min` counts as rest.
+    `t_q_at_max_k`: largest change of T_Q − AT since the zero after such a rest.
+    """
+
+    channel: str
+    at_most: float
+    after_min: Positive
+    t_q_at_max_k: Positive
+
+
+class Plausibility(_Table, frozen=True, kw_only=True):
+    """`[plausibility]`: T_Q, AT and measured Y against each other; a check without its limit is off.
+
+    `t_q_below_at_after_min`: T_Q below AT by more than `guards.t_q_below_at_max_k` for so long means exchanged sensors.
+    `false_alarm_days`: mean time between two false alarms of the residual. `residual_std_um`: standard deviation of the
+    residual of the healthy machine, the model's own where none is given; `residual_correlation_min`: for how long its
+    errors hang together. `residual_hold_um`: a suspicious residual beyond this holds the offset.
+    """
+
+    t_q_below_at_after_min: Positive | None = None
+    false_alarm_days: Annotated[float, Meta(ge=1)] | None = None
+    residual_std_um: Positive | None = None
+    residual_correlation_min: Annotated[float, Meta(ge=10, le=1440)] = 60.0
+    residual_hold_um: Positive | None = None
+    rest: Rest | None = None
+
+
 class Zenoh(_Table, frozen=True, kw_only=True):
     """`[zenoh]`: where the offset goes. Nothing is listened on unless it stands here.
 
@@ -188,6 +218,7 @@ class Config(_Table, frozen=True, kw_only=True):
     channel: list[Channel]
     sampling: Sampling = Sampling()
     restart: Restart = Restart()
+    plausibility: Plausibility | None = None
 
 
 class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -296,6 +327,11 @@ def _check(config: Config) -> None:
     devices = {str(device.get("name")) for device in config.device}
     for channel in config.channel:
         _check_channel(channel, devices)
+    rest = config.plausibility.rest if config.plausibility is not None else None
+    if rest is not None and rest.channel not in names:
+        raise ConfigError(
+            f"plausibility.rest.channel = {rest.channel!r}: no such channel, expected one of: {', '.join(names)}"
+        )
     for key in ("t_q_degc", "at_degc"):
         _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key))
     _check_zenoh(config.zenoh)

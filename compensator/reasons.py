@@ -52,6 +52,22 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "What the machine had stored is not known from a record, so the model began with how it was found.",
         "Allow for the standard deviation, or let the machine come to rest and send the command zero.",
     ),
+    "t_q_at_exchanged": (
+        "T_Q has been below AT for longer than any machine is: the two are exchanged, or a couple has come off.",
+        "Check wires, terminals and addresses of both; let the machine rest and send the command zero, or resume.",
+    ),
+    "t_q_at_apart": (
+        "T_Q and AT did not come together at rest as they were at the zero.",
+        "Compare both couples; where they are good, send the command zero at rest.",
+    ),
+    "implausible": (
+        "Measured and predicted Y drift apart; what stands behind the colon fits best: a sensor, or the model.",
+        "Check that sensor, its wire and its seat; for the model, run `compensator diagnose` on the recordings.",
+    ),
+    "residual_too_large": (
+        "Measured and predicted Y are farther apart than plausibility.residual_hold_um.",
+        "Find the sensor that the reasons suspect; then send the command zero at rest.",
+    ),
     "operator_hold": ("An operator has frozen the offset.", "Send the command resume."),
     "recording_failed": (
         "The sample could not be written to disk and waits for it; compensation goes on.",

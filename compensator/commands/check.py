@@ -22,15 +22,15 @@ def run(arguments: argparse.Namespace) -> Answer:
         Naming what is wrong with the configuration.
     """
     loaded, model, _, fleet = load(arguments.config)
-    Compensation(loaded.config, model)
+    checks = Compensation(loaded.config, model).plausibility.describe()
     warnings = precautions(loaded)
     for warning in warnings:
         log.warning("%s: warning: %s", arguments.config, warning)
     machine = loaded.config.machine.name
     text = (
         f"{arguments.config}: good. Machine {machine}, model {model.name} ({model.kind}), "
-        f"{len(fleet.devices)} device(s), {len(loaded.config.channel)} channel(s). Nothing was opened."
+        f"{len(fleet.devices)} device(s), {len(loaded.config.channel)} channel(s). Nothing was opened.\n{checks}"
     )
     result = {"ok": True, "machine": machine, "model": model.name, "model_sha256": model.sha256,
-              "devices": list(fleet.devices), "warnings": warnings}  # fmt: skip
+              "devices": list(fleet.devices), "warnings": warnings, "checks": checks}  # fmt: skip
     return Answer(result, text)

@@ -8,17 +8,18 @@ through the limiter, whatever caused it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import msgspec
 
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
-from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, State, number
+from compensator.messages import SCHEMA, Offset, Sample, State, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.guards import HEATED_W, SensorGuards
 from compensator.service.limits import Limited, OffsetLimiter
+from compensator.service.outcome import VALID_SAMPLES, Outcome, Values, estimate_message, offset_message, values_of
+from compensator.service.plausibility import Evidence, PlausibilityCheck, PlausibilityState
 from compensator.service.state import (
     STATE_SCHEMA,
     CompensationState,
@@ -29,10 +30,10 @@ from compensator.service.state import (
     encode_state,
 )
 
+__all__ = ["Compensation", "Outcome", "slowest_min"]
+
 NAN = float("nan")
 
-#: A published offset may be used for this many samples.
-VALID_SAMPLES = 2.5
 #: Number of samples over which rate and heat are averaged before they decide anything.
 MEAN_SAMPLES = 5
 
@@ -40,38 +41,6 @@ MEAN_SAMPLES = 5
 MOST_BRIDGED = 1500
 #: A state that began unknown counts as known after so many of the slowest time constants (5 % are left then).
 KNOWN_AFTER = 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What one sample led to.
-
-    Parameters
-    ----------
-    sample : Sample
-        The sample with the guards' verdicts.
-    estimate : EstimateMessage
-        What the model makes of it.
-    offset : Offset
-        What is to be published.
-    notes : tuple of (str, str)
-        Events: kind and text.
-    """
-
-    sample: Sample
-    estimate: EstimateMessage
-    offset: Offset
-    notes: tuple[tuple[str, str], ...]
-
-
-@dataclass(slots=True)
-class _Values:
-    """Usable values of one sample; NaN where a channel is not usable."""
-
-    t_q: float
-    at: float
-    y: float
-    others: dict[str, float]
 
 
 class Compensation:
@@ -95,6 +64,7 @@ class Compensation:
         if missing:
             raise ServiceError(f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured")
         self._guards = SensorGuards(config.channel, config.guards, self._period_min)
+        self.plausibility = PlausibilityCheck(config, model)
         self._limiter = OffsetLimiter(config.limits, self._period_min)
         self._zero = ZeroState(wanted=config.zero.at_start)
         self._memory = Memory()
@@ -130,9 +100,16 @@ class Compensation:
         self._memory.operator_hold = True
 
     def resume(self) -> None:
-        """Follow the model again, at the permitted rate."""
+        """Follow the model again, at the permitted rate.
+
+        After exchanged sensors the state is that of a machine which never was: it begins unknown.
+        """
         self._memory.operator_hold = False
         self._memory.internal_error = False
+        if self.plausibility.exchanged:
+            self.plausibility.seen()
+            if self._engine.has_reference:
+                self._pass_cold(min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED))
 
     def fail(self) -> None:
         """Hold the offset because the service met an error of its own."""
@@ -213,6 +190,7 @@ class Compensation:
             schema=STATE_SCHEMA, model_sha256=self.model.sha256, alternative=self._config.model.alternative,
             engine=self._engine.snapshot(), guards=self._guards.snapshot(), offset_um=self._limiter.offset_um,
             zero=self._zero, memory=self._memory,
+            plausibility=self.plausibility.state if self.plausibility.is_on else None,
         ))  # fmt: skip
 
     def restore(self, state: bytes) -> None:
@@ -243,6 +221,8 @@ class Compensation:
         self._engine, self._zero, self._memory = engine, whole.zero, whole.memory
         self._guards.restore(whole.guards)
         self._limiter.offset_um = whole.offset_um
+        # A state of before there was this check has no part for it: it begins anew.
+        self.plausibility.state = whole.plausibility or PlausibilityState()
 
     def pause(self, samples: int) -> None:
         """Pass over samples that nobody took, such as those while the service did not run.
@@ -261,6 +241,7 @@ class Compensation:
             return
         minutes = samples * self._period_min
         self._guards.pass_time(minutes)
+        self.plausibility.pass_time(samples)
         self._memory.missing_min += minutes
         if not self._engine.has_reference:
             return
@@ -339,7 +320,7 @@ class Compensation:
         """
         heat = self._memory.estimate.heat_w if self._memory.estimate else NAN
         sample = msgspec.structs.replace(raw, channels=self._guards.judge(raw.channels, heat))
-        values = _values(sample.channels)
+        values = values_of(sample.channels)
         notes: list[tuple[str, str]] = []
         self._set_zero(values, notes)
         self._memory.seq, self._memory.time_utc_ns = raw.seq, raw.time_utc_ns
@@ -353,15 +334,38 @@ class Compensation:
         if math.isnan(self._zero.y_ref) and estimate is not None:
             # The probe was missing at the zero: its reference makes the residual start at zero.
             self._zero.y_ref = values.y - y_pred
+        if self.plausibility.is_on:
+            notes += self.plausibility.take(self._evidence(raw, values, estimate, y_pred))
         state, reasons, limited = self._decide(values, estimate, y_pred)
+        # Somebody is suspected: the offset may be wrong by what measured and predicted Y differ by.
+        std = math.hypot(estimate.y_std_um, self.plausibility.error_um) if estimate else NAN
         return Outcome(
             sample=sample,
-            estimate=self._estimate_message(sample, values, estimate, y_pred),
-            offset=self._offset_message(sample, estimate, state, reasons, limited),
+            estimate=estimate_message(sample, values, estimate, self._engine.reference, self._zero, y_pred),
+            offset=offset_message(sample, self.model, std, state, reasons, limited),
             notes=tuple(notes),
         )
 
-    def _set_zero(self, values: _Values, notes: list[tuple[str, str]]) -> None:
+    def _evidence(self, raw: Sample, values: Values, estimate: Estimate | None, y_pred: float) -> Evidence:
+        """Return what the checks between the sensors look at."""
+        t_q, at = (
+            number(channel.mean) if channel is not None and channel.device_quality == "good" else NAN
+            for channel in (raw.channels.get(name) for name in ("t_q_degc", "at_degc"))
+        )
+        reference = self._engine.reference
+        rest = self._config.plausibility.rest if self._config.plausibility is not None else None
+        # A prediction without both temperatures, or from an unknown state, is no witness against a sensor.
+        usable = not math.isnan(values.t_q + values.at) and self._memory.cold_min <= 0.0
+        return Evidence(
+            below_k=at - t_q,
+            apart_k=(values.t_q - reference.t_q_degc) - (values.at - reference.at_degc),
+            rest=values.others.get(rest.channel, NAN) if rest is not None else NAN,
+            residual_um=values.y - self._zero.y_ref - y_pred if usable else NAN,
+            std_um=estimate.y_std_um if estimate else NAN,
+            predicted_um=y_pred,
+        )
+
+    def _set_zero(self, values: Values, notes: list[tuple[str, str]]) -> None:
         zero = self._zero
         if not zero.wanted or math.isnan(values.t_q) or math.isnan(values.at):
             return
@@ -374,6 +378,7 @@ class Compensation:
             self._memory.estimate, self._memory.rates, self._memory.heats = None, [], []
             zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
+        self.plausibility.zeroed(at_rest=not warm)
         notes.append((
             "zero",
             f"zero on a {'warm machine' if warm else 'machine at rest'}: "
@@ -390,7 +395,7 @@ class Compensation:
     # ------------------------------------------------------------------ decision
 
     def _decide(
-        self, values: _Values, estimate: Estimate | None, y_pred: float
+        self, values: Values, estimate: Estimate | None, y_pred: float
     ) -> tuple[State, list[str], Limited | None]:
         reasons = [
             code for code, value in (("t_q_missing", values.t_q), ("at_missing", values.at)) if math.isnan(value)
@@ -407,7 +412,10 @@ class Compensation:
         if self._memory.cold_min > 0.0:
             self._memory.cold_min -= self._period_min
             reasons.append("cold_start")
+        reasons += self.plausibility.reasons
         blocking = self._blocking(values, expired)
+        if self.plausibility.exchanged:
+            return "fault", [*reasons, *blocking, "t_q_at_exchanged"], self._limiter.hold()
         if blocking:
             return "hold", reasons + blocking, self._limiter.hold()
         if lost:
@@ -419,7 +427,7 @@ class Compensation:
         reasons += limited.reasons
         return ("degraded" if reasons else "ok"), reasons, limited
 
-    def _blocking(self, values: _Values, expired: bool) -> list[str]:
+    def _blocking(self, values: Values, expired: bool) -> list[str]:
         """Return why the offset must stay where it is."""
         # A single estimate of the heat overshoots when a source is switched; its mean over some samples does not.
         heat = _mean(self._memory.heats)
@@ -431,49 +439,11 @@ class Compensation:
         ]  # fmt: skip
         flags = (
             ("prediction_expired", expired),
+            ("residual_too_large", self.plausibility.too_large),
             ("operator_hold", self._memory.operator_hold),
             ("internal_error", self._memory.internal_error),
         )
         return outside + [code for code, present in flags if present]
-
-    # ------------------------------------------------------------------ messages
-
-    def _estimate_message(
-        self, sample: Sample, values: _Values, estimate: Estimate | None, y_pred: float
-    ) -> EstimateMessage:
-        y = values.y - self._zero.y_ref
-        reference = self._engine.reference
-        return EstimateMessage(
-            schema=SCHEMA, machine=sample.machine, seq=sample.seq, time_utc_ns=sample.time_utc_ns,
-            t_q_ref_degc=reference.t_q_degc, at_ref_degc=reference.at_degc, y_ref_um=self._zero.y_ref,
-            heat_w=estimate.heat_w if estimate else NAN,
-            heat_std_w=estimate.heat_std_w if estimate else NAN,
-            y_dtf_um=estimate.y_dtf_um if estimate else NAN,
-            y_tdtf_um=estimate.y_tdtf_um if estimate else NAN,
-            y_effects_um=list(estimate.y_effects_um) if estimate else [],
-            y_base_um=self._zero.y_base,
-            y_pred_um=y_pred,
-            y_std_um=estimate.y_std_um if estimate else NAN,
-            y_rate_um_per_min=estimate.y_rate_um_per_min if estimate else NAN,
-            y_um=y, residual_um=y - y_pred,
-        )  # fmt: skip
-
-    def _offset_message(
-        self,
-        sample: Sample,
-        estimate: Estimate | None,
-        state: State,
-        reasons: list[str],
-        limited: Limited | None,
-    ) -> Offset:
-        return Offset(
-            schema=SCHEMA, machine=sample.machine, seq=sample.seq, time_utc_ns=sample.time_utc_ns,
-            valid_for_s=VALID_SAMPLES * self.model.period_s,
-            y_offset_um=limited.offset_um if limited else NAN,
-            y_offset_rate_um_per_min=limited.rate_um_per_min if limited else NAN,
-            y_offset_std_um=estimate.y_std_um if estimate else NAN,
-            state=state, reasons=reasons, model_sha256=self.model.sha256,
-        )  # fmt: skip
 
 
 def slowest_min(model: ThermalModel) -> float:
@@ -488,13 +458,3 @@ def slowest_min(model: ThermalModel) -> float:
 
 def _mean(values: list[float]) -> float:
     return math.fsum(values) / len(values) if values else NAN
-
-
-def _values(channels: dict[str, ChannelSample]) -> _Values:
-    usable = {name: number(channel.mean) if channel.quality == "good" else NAN for name, channel in channels.items()}
-    return _Values(
-        t_q=usable.pop("t_q_degc", NAN),
-        at=usable.pop("at_degc", NAN),
-        y=usable.pop("y_um", NAN),
-        others=usable,
-    )

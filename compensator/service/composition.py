@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import drivers
 from compensator.certificates import check_files
@@ -169,11 +170,12 @@ async def run_service(
         log.error("%s; the router will refuse the service", error)
     store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
     resumed = resume(loaded, model)
+    checks: tuple[str, str, dict[str, Any]] = ("plausibility", resumed.compensation.plausibility.describe(), {})
     daemon = Daemon(
         config=config, compensation=resumed.compensation, devices=fleet.devices, recorder=recorder,
         publish=publish, clock=clock,
         first_sequence=first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s),
-        adoption=Adoption(config, folder, store), notes=resumed.notes,
+        adoption=Adoption(config, folder, store), notes=(*resumed.notes, checks),
     )  # fmt: skip
     try:
         with publisher:

@@ -15,6 +15,7 @@ import msgspec
 
 from compensator.errors import DataError
 from compensator.model.engine import EngineState, Estimate
+from compensator.service.plausibility import PlausibilityState
 
 NAN = float("nan")
 
@@ -101,6 +102,8 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
         References of Y.
     memory : Memory
         What is remembered from sample to sample.
+    plausibility : PlausibilityState, optional
+        What the checks between the sensors remember; left out where none is on, as it was before there were any.
     """
 
     schema: int
@@ -111,11 +114,15 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     offset_um: float
     zero: ZeroState
     memory: Memory
+    plausibility: PlausibilityState | None = None
 
 
 def encode_state(state: CompensationState) -> bytes:
     """Return a state as JSON."""
-    return json.dumps(_worded(msgspec.to_builtins(state)), separators=(",", ":")).encode()
+    table = msgspec.to_builtins(state)
+    if state.plausibility is None:
+        del table["plausibility"]
+    return json.dumps(_worded(table), separators=(",", ":")).encode()
 
 
 def _worded(value: Any) -> Any:

@@ -1,0 +1,386 @@
+"""Plausibility between T_Q, AT and the measured Y: exchanged, drifted apart, or no longer what the model says.
+
+Three checks, each on only where the configuration states its limit:
+
+- *exchanged*: T_Q below AT by more than `guards.t_q_below_at_max_k` for longer than `t_q_below_at_after_min`. A machine
+  without heat has both alike, so exchanged wires show once heat has come. The offset has the wrong sign by then:
+  `fault`, latched until somebody has looked (`resume`, or a zero at rest).
+- *at rest*: where a channel tells that nothing heats the machine, T_Q and AT must come back to the difference that they
+  had at the zero. The reason stands until a rest says otherwise.
+- *residual*: measured − predicted, against its own stated standard deviation, by a two-sided CUSUM on its innovations.
+  The errors of a model hang together over `residual_correlation_min`, so what counts is what the last block does not
+  tell: e = z − φ z'. Threshold from the stated time between two false alarms, by Siegmund's formula. Which sensor fits
+  the residual best is said by `suspects`. The offset goes on, with a standard deviation that takes the residual in.
+
+Works on the sample alone and knows no clock; the state travels with that of the compensation.
+
+Source: Page (1954) for the CUSUM; Siegmund, Sequential Analysis (1985), for its mean time between false alarms;
+Basseville and Nikiforov (1993), chapter 8, for whitening first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from compensator.config import Config, Plausibility
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.suspects import LOG_ODDS, Block, Fit, Suspects
+
+NAN = float("nan")
+
+#: Samples in a block of the residual: single minutes after a heat step say nothing of a sensor.
+BLOCK_SAMPLES = 10
+#: Part of a block that must have been usable.
+_USABLE = 0.5
+#: Blocks that suspects are told from: 12 h of one-minute samples.
+WINDOW = 72
+#: Shift, in standard deviations of the residual, that the CUSUM is made for.
+_SHIFT = 5.0
+#: One innovation counts for no more than this many of its standard deviations: wild minutes raise nothing alone.
+_CLIP = 3.0
+#: The reason goes once so many blocks in a row have been within so many standard deviations.
+CALM_BLOCKS = 6
+_CALM = 2.0
+#: Mean excess of a Gaussian random walk over a boundary, in its standard deviations (Siegmund).
+_EXCESS = 1.166
+_DAY_MIN = 1440.0
+
+
+@dataclass(slots=True)
+class PlausibilityState:
+    """What the checks remember.
+
+    Parameters
+    ----------
+    below_min : float
+        For how long T_Q has been below AT, min.
+    exchanged : bool
+        Whether that has been for too long.
+    rest_min : float
+        For how long nothing has heated the machine, min.
+    apart : bool
+        Whether T_Q and AT were apart at the last rest.
+    taken, used : int
+        Samples in the block under way, and those that could be used.
+    sums : tuple of three floats
+        Residual, its variance and the prediction, summed over them.
+    blocks : list of Block
+        The last ones, the newest last.
+    z : float
+        Residual of the last usable block in standard deviations; NaN before the first.
+    skipped : int
+        Blocks since then that could not be used.
+    high, low : float
+        The two CUSUMs.
+    suspects : list of str
+        Who is suspected; empty while nothing is.
+    accused : int
+        Blocks since the first one was.
+    calm : int
+        Quiet blocks in a row since.
+    """
+
+    below_min: float = 0.0
+    exchanged: bool = False
+    rest_min: float = 0.0
+    apart: bool = False
+    taken: int = 0
+    used: int = 0
+    sums: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    blocks: list[Block] = field(default_factory=list)
+    z: float = NAN
+    skipped: int = 0
+    high: float = 0.0
+    low: float = 0.0
+    suspects: list[str] = field(default_factory=list)
+    accused: int = 0
+    calm: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """One sample, as the checks see it; NaN where something cannot be used.
+
+    Parameters
+    ----------
+    below_k : float
+        AT − T_Q as measured, K, whatever the guards say of it.
+    apart_k : float
+        T_Q − AT as a change since the zero, K.
+    rest : float
+        Value of the channel that tells the rest.
+    residual_um, std_um, predicted_um : float
+        Measured − predicted, the prediction's stated standard deviation, and the prediction, µm.
+    """
+
+    below_k: float
+    apart_k: float
+    rest: float
+    residual_um: float
+    std_um: float
+    predicted_um: float
+
+
+class PlausibilityCheck:
+    """The checks of one machine.
+
+    Parameters
+    ----------
+    config : Config
+        Limits; without `[plausibility]` nothing is checked.
+    model : ThermalModel
+        The running model.
+    """
+
+    def __init__(self, config: Config, model: ThermalModel) -> None:
+        self._limits = config.plausibility or Plausibility()
+        self._below_max_k = config.guards.t_q_below_at_max_k
+        self._period_min = model.period_s / 60.0
+        self._model_std_um = model.y_std_um
+        measured = any(channel.name == "y_um" for channel in config.channel)
+        self.residual_std_um = self._limits.residual_std_um or model.y_std_um
+        self._watched = measured and self._limits.false_alarm_days is not None and self.residual_std_um > 0.0
+        self._has_y = measured
+        block_min = BLOCK_SAMPLES * self._period_min
+        # No exp(): its last bit depends on the platform, and an audit must come to the same state.
+        self._keep = 1.0 / (1.0 + block_min / self._limits.residual_correlation_min)
+        #: Standard deviation of an innovation, the part of it that counts for nothing, and the threshold.
+        self._e_std = math.sqrt(1.0 - self._keep * self._keep)
+        self._allowance = 0.5 * _SHIFT * (1.0 - self._keep)
+        days = self._limits.false_alarm_days
+        self.threshold = (
+            cusum_threshold(self._allowance, self._e_std, days * _DAY_MIN / block_min) if days else math.inf
+        )
+        self._suspects = Suspects(model, BLOCK_SAMPLES, WINDOW, self._keep)
+        self.state = PlausibilityState()
+        self._notes: list[tuple[str, str]] = []
+
+    # ------------------------------------------------------------------ what is on
+
+    @property
+    def is_on(self) -> bool:
+        """Whether anything is checked."""
+        return self._watched or self._limits.t_q_below_at_after_min is not None or self._limits.rest is not None
+
+    def describe(self) -> str:
+        """Return in words what is checked and what is not."""
+        parts = []
+        limits = self._limits
+        parts.append(
+            f"exchanged T_Q and AT after {limits.t_q_below_at_after_min:g} min"
+            if limits.t_q_below_at_after_min is not None
+            else "exchanged T_Q and AT off (no plausibility.t_q_below_at_after_min)"
+        )
+        parts.append(
+            f"T_Q and AT at rest by {limits.rest.channel}" if limits.rest is not None else
+            "T_Q and AT at rest off (no plausibility.rest)"
+        )  # fmt: skip
+        why = (
+            "no plausibility.false_alarm_days" if limits.false_alarm_days is None else
+            "Y is not measured" if not self._has_y else "the model states no error: plausibility.residual_std_um"
+        )  # fmt: skip
+        parts.append(
+            f"residual of {self.residual_std_um:.2g} µm, one false alarm in {limits.false_alarm_days:g} days"
+            if self._watched
+            else f"residual off ({why})"
+        )
+        return "plausibility: " + "; ".join(parts)
+
+    # ------------------------------------------------------------------ one sample
+
+    def take(self, evidence: Evidence) -> list[tuple[str, str]]:
+        """Take one sample in; return what is to be told: kind and text."""
+        self._notes = []
+        self._take_difference(evidence.below_k)
+        self._take_rest(evidence)
+        if self._watched:
+            self._take_residual(evidence)
+        return self._notes
+
+    @property
+    def reasons(self) -> list[str]:
+        """What is implausible now; the offset goes on with these."""
+        state = self.state
+        return ["t_q_at_apart"] * state.apart + [f"implausible:{name}" for name in state.suspects]
+
+    @property
+    def exchanged(self) -> bool:
+        """Whether T_Q and AT seem to be exchanged: no offset can be relied on."""
+        return self.state.exchanged
+
+    @property
+    def error_um(self) -> float:
+        """Last residual, µm, while somebody is suspected; else 0: the offset may be wrong by as much."""
+        if not self.state.suspects:
+            return 0.0
+        return next((abs(b.residual_um) for b in reversed(self.state.blocks) if not math.isnan(b.residual_um)), 0.0)
+
+    @property
+    def too_large(self) -> bool:
+        """Whether the residual is beyond what the configuration wants to be followed."""
+        limit = self._limits.residual_hold_um
+        return limit is not None and self.error_um > limit
+
+    # ------------------------------------------------------------------ commands, pauses
+
+    def zeroed(self, *, at_rest: bool) -> None:
+        """Begin anew: measured and predicted Y count from here; at rest, T_Q and AT do, too."""
+        old = self.state
+        self.state = PlausibilityState(below_min=old.below_min, rest_min=old.rest_min)
+        if not at_rest:
+            self.state.exchanged, self.state.apart = old.exchanged, old.apart
+
+    def seen(self) -> None:
+        """Take the latch of exchanged sensors away: somebody has looked."""
+        self.state.exchanged, self.state.below_min = False, 0.0
+
+    def pass_time(self, samples: int) -> None:
+        """Let samples pass that nobody took."""
+        self.state.rest_min = 0.0
+        if self._watched:
+            nothing = Evidence(
+                below_k=NAN, apart_k=NAN, rest=NAN, residual_um=NAN, std_um=NAN, predicted_um=NAN
+            )  # fmt: skip
+            for _ in range(min(samples, WINDOW * BLOCK_SAMPLES)):
+                self._take_residual(nothing)
+
+    # ------------------------------------------------------------------ T_Q and AT
+
+    def _take_difference(self, below_k: float) -> None:
+        limit, state = self._limits.t_q_below_at_after_min, self.state
+        if limit is None or math.isnan(below_k):
+            return
+        state.below_min = state.below_min + self._period_min if below_k > self._below_max_k else 0.0
+        if state.below_min >= limit and not state.exchanged:
+            state.exchanged = True
+            self._tell(
+                f"T_Q has been more than {self._below_max_k:g} K below AT for {state.below_min:g} min, {below_k:.1f} K "
+                f"now: exchanged wires or addresses, or a couple that has come off; suspects: T_Q, AT"
+            )
+
+    def _take_rest(self, evidence: Evidence) -> None:
+        rest, state = self._limits.rest, self.state
+        if rest is None or math.isnan(evidence.rest):
+            return
+        state.rest_min = state.rest_min + self._period_min if evidence.rest <= rest.at_most else 0.0
+        if state.rest_min < rest.after_min or math.isnan(evidence.apart_k):
+            return
+        apart = abs(evidence.apart_k) > rest.t_q_at_max_k
+        if apart and not state.apart:
+            self._tell(
+                f"after {state.rest_min:g} min of rest T_Q and AT differ by {evidence.apart_k:+.2f} K more than at the "
+                f"zero, expected within {rest.t_q_at_max_k:g} K; suspects: T_Q, AT, or a zero on a warm machine"
+            )
+        elif state.apart and not apart:
+            self._tell("T_Q and AT have come together at rest")
+        state.apart = apart
+
+    # ------------------------------------------------------------------ residual
+
+    def _take_residual(self, evidence: Evidence) -> None:
+        state = self.state
+        state.taken += 1
+        if not math.isnan(evidence.residual_um) and not math.isnan(evidence.std_um):
+            residual, variance, predicted = state.sums
+            extra = evidence.std_um * evidence.std_um - self._model_std_um * self._model_std_um
+            state.sums = (
+                residual + evidence.residual_um,
+                variance + max(extra, 0.0) + self.residual_std_um * self.residual_std_um,
+                predicted + evidence.predicted_um,
+            )
+            state.used += 1
+        if state.taken < BLOCK_SAMPLES:
+            return
+        n, (residual, variance, predicted) = state.used, state.sums
+        if n >= _USABLE * BLOCK_SAMPLES:
+            block = Block(residual / n, math.sqrt(variance / n), predicted / n)
+        else:
+            block = Block(NAN, 1.0, NAN)
+        state.taken, state.used, state.sums = 0, 0, (0.0, 0.0, 0.0)
+        state.blocks = [*state.blocks[-WINDOW + 1 :], block]
+        self._judge(block)
+
+    def _judge(self, block: Block) -> None:
+        state = self.state
+        if math.isnan(block.residual_um):
+            state.skipped += 1
+            return
+        z = block.residual_um / block.std_um
+        # Measured and predicted Y are alike at the zero: that is what comes before the first block.
+        keep = self._keep
+        for _ in range(min(state.skipped, WINDOW)):
+            keep *= self._keep
+        before = 0.0 if math.isnan(state.z) else state.z
+        e = (z - keep * before) / math.sqrt(1.0 - keep * keep) * self._e_std
+        e = max(-_CLIP * self._e_std, min(_CLIP * self._e_std, e))
+        state.high = max(0.0, state.high + e - self._allowance)
+        state.low = max(0.0, state.low - e - self._allowance)
+        state.z, state.skipped = z, 0
+        if state.suspects:
+            state.calm = state.calm + 1 if abs(z) < _CALM else 0
+            if state.calm >= CALM_BLOCKS:
+                state.suspects, state.high, state.low, state.calm, state.accused = [], 0.0, 0.0, 0, 0
+                self._tell("measured and predicted Y agree again")
+                return
+        if state.suspects or max(state.high, state.low) > self.threshold:
+            self._accuse(block)
+
+    def _accuse(self, block: Block) -> None:
+        """Say who fits; every further block may tell it better, until the beginning leaves the window."""
+        self.state.accused += 1
+        if self.state.accused > WINDOW // 2:
+            return
+        ranked, misfit = self._suspects.fits(self.state.blocks)
+        named = [fit for fit in ranked if fit.gain >= ranked[0].gain - LOG_ODDS]
+        suspects = sorted({fit.suspect for fit in named} | ({"model"} if misfit else set()))
+        if suspects == self.state.suspects:
+            return
+        self.state.suspects = suspects
+        self._tell(self._in_words(block, named, misfit))
+
+    def _in_words(self, block: Block, named: list[Fit], misfit: bool) -> str:
+        words = [f"{fit.words} since {self._ago(fit)}" if fit.suspect != "model" else fit.words for fit in named]
+        if misfit:
+            words.append("none of this fits well: something acts that the model does not know")
+        return (
+            f"measured − predicted Y is {block.residual_um:+.2f} µm where ±{block.std_um:.2f} µm is stated: "
+            + ", or ".join(words)
+        )
+
+    def _ago(self, fit: Fit) -> str:
+        return f"{fit.blocks_ago * BLOCK_SAMPLES * self._period_min:g} min"
+
+    def _tell(self, text: str) -> None:
+        self._notes.append(("plausibility", text))
+
+
+def cusum_threshold(allowance: float, std: float, blocks: float) -> float:
+    """Return the threshold of a two-sided CUSUM that crosses it once in so many blocks by chance.
+
+    Siegmund's approximation of the mean time of one side, with increments e − k, e ~ N(0, s²):
+    ``(exp(2 Δ b) − 2 Δ b − 1) / (2 Δ²)``, Δ = k / s, b = h / s + 1.166; both sides together cross twice as often.
+
+    Parameters
+    ----------
+    allowance, std : float
+        k and s.
+    blocks : float
+        Mean time between two false alarms.
+
+    Examples
+    --------
+    >>> round(cusum_threshold(0.5, 1.0, 465.0), 1)  # the textbook's: 4 at k = 1/2 gives 168, 5 gives 465
+    5.0
+    """
+    delta = allowance / std
+
+    def time(h: float) -> float:
+        x = 2.0 * delta * (h / std + _EXCESS)
+        return (math.exp(x) - x - 1.0) / (2.0 * delta * delta)
+
+    low, high = 0.0, 60.0 * std / delta
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if time(middle) < 2.0 * blocks else (low, middle)
+    return round(high, 6)

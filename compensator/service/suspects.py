@@ -1,0 +1,197 @@
+"""Which sensor fits a residual best: T_Q, AT, the measured Y, or the model.
+
+A fault of T_Q or AT reaches the residual through the model alone, so its shape in time is the model's own response to
+a ramp or a step in that input; a fault of the probe is a ramp or a step itself; a wrong gain of the model, and a probe
+that measures something else or on another scale, look like a part of the prediction. Every shape is fitted with its
+size and its beginning, and the likelihoods are compared: what comes within odds of 20 of the best is a suspect.
+
+The errors of the model hang together over time, so residual and shapes are filtered by the same first-order whitening
+before they are compared. Plain loops in a fixed order: an audit must come to the same suspects on another processor.
+
+Source: Basseville and Nikiforov, Detection of Abrupt Changes (1993), chapter 7 (generalised likelihood ratio).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from compensator.model.engine import Engine
+from compensator.model.thermal_model import ThermalModel
+
+#: Suspects whose log likelihood lies within this of the best cannot be told from it: odds of 20.
+LOG_ODDS = 3.0
+#: Mean square of what the best shape leaves, in units of what is expected, beyond which no shape fits.
+MISFIT = 4.0
+#: Samples without a change before a response is taken, so that the observer's gains have settled.
+_SETTLING = 120
+_HOUR_MIN = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Mean of a few samples.
+
+    Parameters
+    ----------
+    residual_um : float
+        Measured − predicted, µm; NaN where too little could be used.
+    std_um : float
+        Its stated standard deviation, µm.
+    predicted_um : float
+        Prediction, µm.
+    """
+
+    residual_um: float
+    std_um: float
+    predicted_um: float
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How well one shape explains a residual.
+
+    Parameters
+    ----------
+    suspect : str
+        `t_q_degc`, `at_degc`, `y_um` or `model`.
+    words : str
+        What would have happened, with its size.
+    blocks_ago : int
+        How many blocks ago it began.
+    gain : float
+        Log likelihood over that of no fault.
+    """
+
+    suspect: str
+    words: str
+    blocks_ago: int
+    gain: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    suspect: str
+    unit: str
+    what: str
+    values: tuple[float, ...]
+
+
+class Suspects:
+    """Compares the shapes of one model.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        The running model.
+    block_samples, window : int
+        Samples in a block, and blocks that are looked at.
+    keep : float
+        Correlation of the residual of two blocks that follow each other.
+    """
+
+    def __init__(self, model: ThermalModel, block_samples: int, window: int, keep: float) -> None:
+        self._model = model
+        self._samples = block_samples
+        self._window = window
+        self._keep = keep
+        self._hours = block_samples * model.period_s / 3600.0
+        self._made: tuple[_Shape, ...] = ()
+
+    def fits(self, blocks: Sequence[Block]) -> tuple[list[Fit], bool]:
+        """Return the best fit of each suspect, the likeliest first, and whether even that one does not fit.
+
+        Parameters
+        ----------
+        blocks : sequence of Block
+            The newest last.
+        """
+        z = [block.residual_um / block.std_um for block in blocks]
+        candidates = [self._beginning_at(begin, blocks, z) for begin in range(len(blocks) - 1)]
+        best: dict[str, Fit] = {}
+        for fit in [fit for each in candidates for fit in each] + [self._as_prediction(blocks, z)]:
+            if fit.suspect not in best or fit.gain > best[fit.suspect].gain:
+                best[fit.suspect] = fit
+        ranked = sorted(best.values(), key=lambda fit: (-fit.gain, fit.suspect))
+        energy, count = _energy(z, self._keep)
+        left = 2.0 * (energy - ranked[0].gain) if ranked else 0.0
+        return ranked, count > 0 and left > MISFIT * count
+
+    def _beginning_at(self, begin: int, blocks: Sequence[Block], z: Sequence[float]) -> list[Fit]:
+        fits = []
+        for shape in self._shapes():
+            v = [0.0] * begin + [
+                value / block.std_um for value, block in zip(shape.values, blocks[begin:], strict=False)
+            ]
+            size, gain = _fitted(z, v, self._keep)
+            words = f"{shape.what} by {size:+.2g} {shape.unit}"
+            fits.append(Fit(shape.suspect, words, len(blocks) - begin, gain))
+        return fits
+
+    def _as_prediction(self, blocks: Sequence[Block], z: Sequence[float]) -> Fit:
+        v = [block.predicted_um / block.std_um for block in blocks]
+        size, gain = _fitted(z, v, self._keep)
+        words = f"measured Y is {1.0 + size:.2f} times the prediction"
+        return Fit("model", words, len(blocks), gain)
+
+    def _shapes(self) -> tuple[_Shape, ...]:
+        if not self._made:
+            made = []
+            for suspect, t_q, at in (("t_q_degc", 1.0, 0.0), ("at_degc", 0.0, 1.0)):
+                name = "T_Q" if t_q else "AT"
+                made.append(_Shape(suspect, "K/h", f"{name} drifts", self._response(t_q, at, ramp=True)))
+                made.append(_Shape(suspect, "K", f"{name} jumped", self._response(t_q, at, ramp=False)))
+            hours = tuple((i + 0.5) * self._hours for i in range(self._window))
+            made.append(_Shape("y_um", "µm/h", "measured Y drifts", hours))
+            made.append(_Shape("y_um", "µm", "measured Y jumped", (1.0,) * self._window))
+            self._made = tuple(made)
+        return self._made
+
+    def _response(self, t_q_k: float, at_k: float, *, ramp: bool) -> tuple[float, ...]:
+        """Return what a fault of an input does to the residual, µm by block: minus its part in the prediction."""
+        engine = Engine(dataclasses.replace(self._model, effects=()))
+        engine.set_reference(0.0, 0.0)
+        for _ in range(_SETTLING):
+            engine.step(0.0, 0.0)
+        values = []
+        per_sample = self._model.period_s / 3600.0
+        for block in range(self._window):
+            total = 0.0
+            for i in range(self._samples):
+                size = (block * self._samples + i + 1) * per_sample if ramp else 1.0
+                total -= engine.step(size * t_q_k, size * at_k).y_um
+            values.append(total / self._samples)
+        return tuple(values)
+
+
+def _fitted(z: Sequence[float], v: Sequence[float], keep: float) -> tuple[float, float]:
+    """Return size and log likelihood gain of a shape, both whitened; missing blocks are left out."""
+    cross = square = 0.0
+    z_before = v_before = math.nan
+    for zi, vi in zip(z, v, strict=True):
+        if math.isnan(zi) or math.isnan(vi):
+            continue
+        first = math.isnan(z_before)
+        ez, ev = (zi, vi) if first else (zi - keep * z_before, vi - keep * v_before)
+        weight = 1.0 if first else 1.0 / (1.0 - keep * keep)
+        cross += weight * ez * ev
+        square += weight * ev * ev
+        z_before, v_before = zi, vi
+    if not square > 0.0:
+        return 0.0, 0.0
+    return cross / square, 0.5 * cross * cross / square
+
+
+def _energy(z: Sequence[float], keep: float) -> tuple[float, int]:
+    """Return half the whitened square of a residual, and the number of blocks."""
+    total, count, before = 0.0, 0, math.nan
+    for zi in z:
+        if math.isnan(zi):
+            continue
+        e = zi if math.isnan(before) else (zi - keep * before) / math.sqrt(1.0 - keep * keep)
+        total += 0.5 * e * e
+        count += 1
+        before = zi
+    return total, count
