@@ -1,0 +1,475 @@
+#!/usr/bin/env python3
+"""Install, upgrade, take back and remove the thermal error compensation on a machine's PC.
+
+Needs Python 3.11 with venv and nothing else. Every command may be given twice; what is done already is left alone.
+
+    install.py install --wheels DIR          the newest quill_compensator-*.whl in DIR, dependencies from DIR, offline
+    install.py install --wheel FILE          dependencies from the package index that pip is set up for
+    install.py machine NAME --config FILE    folder and configuration of a machine, checked, service enabled and started
+    install.py back                          the version before
+    install.py uninstall [--purge]           the program; with --purge configuration, recordings and user, too
+
+Each version lies in a virtual environment of its own, PREFIX/versions/VERSION-HASH; PREFIX/current and PREFIX/previous
+point to two of them. Before anything is switched the new version checks every machine's configuration. A service that
+does not become ready with the new version gets the old one back. Configurations and recordings are never touched, and
+a unit or rule that somebody has changed stays: the new one is put beside it as `.new`.
+
+One file, because it runs before anything else of the program is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import fcntl
+import hashlib
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+DISTRIBUTION = "quill_compensator"
+PREFIX = "/opt/compensator"
+USER = "compensator"
+CONFIGURATIONS, RECORDINGS, LOGS = "/etc/compensator", "/var/lib/compensator", "/var/log/compensator"
+#: File of a version's share/compensator → where the system looks for it.
+SYSTEM_FILES = {
+    "systemd/compensator@.service": "/usr/local/lib/systemd/system/compensator@.service",
+    "systemd/compensator.sysusers.conf": "/usr/local/lib/sysusers.d/compensator.conf",
+    "systemd/compensator.tmpfiles.conf": "/usr/local/lib/tmpfiles.d/compensator.conf",
+    "systemd/70-compensator.rules": "/usr/local/lib/udev/rules.d/70-compensator.rules",
+}
+JOURNAL_LIMITS = {"systemd/journald.conf": "/etc/systemd/journald.conf.d/compensator.conf"}
+COMMAND = "/usr/local/bin/compensator"
+
+
+class InstallError(Exception):
+    """One line: what could not be done, and what was expected."""
+
+
+class Installation:
+    """Everything below a prefix, and the system's files that belong to it.
+
+    Parameters
+    ----------
+    prefix : str
+        Folder of the versions, as the machine will see it.
+    destdir : str
+        Folder that stands for `/`; with it nothing of the running system is touched.
+    """
+
+    def __init__(self, prefix: str, destdir: str) -> None:
+        self._prefix, self._destdir = prefix, destdir
+        self.root = self.path(prefix)
+        self._manifest = self.root / "manifest.json"
+
+    def path(self, name: str) -> Path:
+        """Return where a path of the machine lies now."""
+        return Path(self._destdir + name) if self._destdir else Path(name)
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep a second installer out."""
+        self.root.mkdir(parents=True, exist_ok=True)
+        with (self.root / ".lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise InstallError(f"{self.root}: another installer is at work") from error
+            yield
+
+    # ------------------------------------------------------------------ versions
+
+    def link(self, name: str) -> Path | None:
+        """Return the version that `current` or `previous` points to."""
+        link = self.root / name
+        return link.resolve() if link.is_symlink() and link.exists() else None
+
+    def build(self, wheel: Path, wheels: Path | None, *, dependencies: bool) -> Path:
+        """Make the virtual environment of a wheel; a whole one is left as it is, half of one is made anew."""
+        digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+        version = self.root / "versions" / f"{wheel.name.split('-')[1]}-{digest[:8]}"
+        if (version / ".complete").exists():
+            say(f"{version.name}: is there already")
+            return version
+        say(f"{version.name}: installs into {version}")
+        shutil.rmtree(version, ignore_errors=True)
+        run([sys.executable, "-m", "venv", str(version)])
+        pip = [str(version / "bin/python"), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
+        offline = ["--no-index", "--find-links", str(wheels)] if wheels else []
+        run([*pip, *offline, *([] if dependencies else ["--no-deps"]), str(wheel)])
+        for path in (version, version / "share/compensator"):
+            if not path.is_dir():
+                raise InstallError(f"{wheel}: no {path.relative_to(version)} in it, expected a whole wheel")
+        (version / ".complete").write_text(digest + "\n", encoding="utf-8")
+        os.sync()
+        return version
+
+    def point(self, name: str, version: Path) -> None:
+        """Let `current` or `previous` point to a version, from one moment to the next."""
+        link = self.root / name
+        new = self.root / f".{name}.new"
+        new.unlink(missing_ok=True)
+        new.symlink_to(os.path.relpath(version, self.root))
+        new.replace(link)
+
+    def prune(self) -> None:
+        """Remove versions that neither `current` nor `previous` points to."""
+        keep = {self.link("current"), self.link("previous")}
+        for version in sorted((self.root / "versions").iterdir()):
+            if version.resolve() not in keep:
+                shutil.rmtree(version)
+                say(f"{version.name}: removed")
+
+    # ------------------------------------------------------------------ the system's files
+
+    def put_system_files(self, version: Path, *, journal_limits: bool) -> None:
+        """Bring units, rules and folders' descriptions to their places."""
+        share = version / "share/compensator"
+        known = self._known()
+        here = any(self.path(place).exists() for place in JOURNAL_LIMITS.values())
+        files = SYSTEM_FILES | (JOURNAL_LIMITS if journal_limits or here else {})
+        for name, place in files.items():
+            data = (share / name).read_bytes().replace(PREFIX.encode(), self._prefix.encode())
+            self._put(self.path(place), place, data, known)
+        command = self.path(COMMAND)
+        if not command.exists() or command.is_symlink():
+            command.parent.mkdir(parents=True, exist_ok=True)
+            command.unlink(missing_ok=True)
+            command.symlink_to(f"{self._prefix}/current/bin/compensator")
+
+    def _put(self, path: Path, place: str, data: bytes, known: dict[str, list[str]]) -> None:
+        digest, beside = hashlib.sha256(data).hexdigest(), path.with_name(path.name + ".new")
+        found = hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else None
+        if found == digest:
+            return
+        if found is not None and found not in known.get(place, []):
+            beside.write_bytes(data)
+            say(f"{path}: has been changed here and stays; the new one is {beside.name}")
+            return
+        # Known before it is there: a power cut between the two leaves no file that nobody owns.
+        known[place] = [*known.get(place, []), digest]
+        self._manifest.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name("." + path.name + ".part")
+        part.write_bytes(data)
+        part.replace(path)
+        beside.unlink(missing_ok=True)
+        say(f"{path}: written")
+
+    def _known(self) -> dict[str, list[str]]:
+        return json.loads(self._manifest.read_text(encoding="utf-8")) if self._manifest.exists() else {}
+
+    def remove_system_files(self) -> None:
+        """Remove what was put there; what somebody has changed stays."""
+        known = self._known()
+        for place in (SYSTEM_FILES | JOURNAL_LIMITS).values():
+            path = self.path(place)
+            path.with_name(path.name + ".new").unlink(missing_ok=True)
+            if not path.exists():
+                continue
+            if hashlib.sha256(path.read_bytes()).hexdigest() in known.get(place, []):
+                path.unlink()
+                say(f"{path}: removed")
+            else:
+                say(f"{path}: has been changed here and stays")
+        command = self.path(COMMAND)
+        if command.is_symlink():
+            command.unlink()
+
+    # ------------------------------------------------------------------ machines
+
+    def machines(self) -> list[Path]:
+        """Return the configuration of every machine."""
+        return sorted(self.path(CONFIGURATIONS).glob("*/machine.toml"))
+
+    def check(self, version: Path, config: Path) -> None:
+        """Have a version check a configuration; nothing is opened."""
+        done = subprocess.run(
+            [str(version / "bin/compensator"), "check", "--config", str(config)],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if done.returncode != 0:
+            lines = done.stderr.strip().splitlines() or ["no answer"]
+            raise InstallError(f"{version.name} cannot use {config}: {lines[-1]}")
+        name = config.parent.name
+        table = tomllib.loads(config.read_text(encoding="utf-8"))
+        folder = (Path(CONFIGURATIONS) / name / table["recording"]["folder"]).as_posix()
+        if not os.path.normpath(folder).startswith(f"{RECORDINGS}/{name}/"):
+            raise InstallError(
+                f"{config}: recording.folder = {table['recording']['folder']!r}, expected a folder below "
+                f"{RECORDINGS}/{name}/, the only place that the service may write to"
+            )
+        say(f"{config}: good for {version.name}")
+
+    def activate(self, version: Path, system: System, *, journal_limits: bool = False) -> None:
+        """Switch to a version, restart what runs, and switch back where a service does not become ready.
+
+        Raises
+        ------
+        InstallError
+            If a configuration is not good for it (nothing was switched), or a service did not become ready (the
+            version before is in use again).
+        """
+        for config in self.machines():
+            self.check(version, config)
+        before, earlier = self.link("current"), self.link("previous")
+        self._switch(version, before, system, journal_limits)
+        running = system.running()
+        failed = [unit for unit in running if not system.restarted(unit)]
+        if failed and before not in (None, version):
+            assert before is not None
+            self._switch(before, earlier, system, journal_limits)
+            if earlier is None:
+                (self.root / "previous").unlink(missing_ok=True)
+            still = [unit for unit in running if not system.restarted(unit)]
+            end = f"; {', '.join(still)} does not start with that one either" if still else ""
+            raise InstallError(f"{', '.join(failed)} did not start with {version.name}; back to {before.name}{end}")
+        if failed:
+            raise InstallError(f"{', '.join(failed)} did not start: journalctl -u {failed[0]} -n 20")
+        say(f"{version.name}: in use" + (f", restarted {', '.join(running)}" if running else ""))
+
+    def _switch(self, version: Path, previous: Path | None, system: System, journal_limits: bool) -> None:
+        if previous is not None and previous != version:
+            self.point("previous", previous)
+        self.point("current", version)
+        self.put_system_files(version, journal_limits=journal_limits)
+        system.reload()
+
+
+class System:
+    """What is asked of the running system; nothing where files go to another root.
+
+    Parameters
+    ----------
+    touch : bool
+        Whether the running system may be touched.
+    """
+
+    def __init__(self, *, touch: bool) -> None:
+        self._touch = touch
+        self._systemd = touch and Path("/run/systemd/system").is_dir()
+
+    def reload(self) -> None:
+        """Have the system read its files again: user, folders, device names, units."""
+        if self._touch:
+            run(["systemd-sysusers"])
+            run(["systemd-tmpfiles", "--create", "--prefix=/etc", "--prefix=/var/lib", "--prefix=/var/log"])
+        if self._systemd:
+            run(["systemctl", "daemon-reload"])
+        if self._systemd and Path("/run/udev/control").exists():
+            run(["udevadm", "control", "--reload"])
+            run(["udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=usb-serial"])
+
+    def forget(self) -> None:
+        """Have the system see that the units are gone."""
+        if self._systemd:
+            run(["systemctl", "daemon-reload"])
+
+    def running(self) -> list[str]:
+        """Return the services that run or try to."""
+        if not self._systemd:
+            return []
+        done = run(["systemctl", "list-units", "--plain", "--no-legend", "--state=active,activating,failed",
+                    "compensator@*.service"])  # fmt: skip
+        return [line.split()[0] for line in done.splitlines() if line.strip()]
+
+    def restarted(self, unit: str) -> bool:
+        """Restart a service and tell whether it became ready."""
+        return subprocess.run(["systemctl", "restart", unit], check=False).returncode == 0
+
+    def enable(self, unit: str) -> None:
+        """Have a service start now and with the PC."""
+        if self._systemd:
+            run(["systemctl", "enable", "--now", unit])
+            say(f"{unit}: runs, and starts with the PC")
+
+    def disable(self) -> None:
+        """Stop all services, for good."""
+        wanted = Path("/etc/systemd/system/multi-user.target.wants").glob("compensator@*.service")
+        units = sorted({*self.running(), *(path.name for path in wanted)}) if self._systemd else []
+        if units:
+            run(["systemctl", "disable", "--now", *units])
+            say(f"{', '.join(units)}: stopped, recordings finished")
+
+    def check_python(self) -> None:
+        """Refuse a Python that cannot make the environment, or that the service could not see.
+
+        Raises
+        ------
+        InstallError
+            With what to use instead.
+        """
+        if importlib.util.find_spec("ensurepip") is None:
+            raise InstallError(f"{sys.executable}: no ensurepip, expected the package python3-venv")
+        real = Path(sys.executable).resolve()
+        if self._touch and real.parts[1] in ("home", "root"):
+            raise InstallError(
+                f"{real}: services see no home folders, expected a Python outside, such as /usr/bin/python3"
+            )
+
+    def own(self, path: Path, mode: int) -> None:
+        """Give a file to root and the service's group."""
+        if self._touch:
+            shutil.chown(path, "root", USER)
+        path.chmod(mode)
+
+    def remove_user(self) -> None:
+        """Remove the service's user."""
+        if self._touch:
+            subprocess.run(["userdel", USER], check=False, capture_output=True)
+
+
+# ---------------------------------------------------------------------------- commands
+
+
+def install(given: argparse.Namespace, installation: Installation, system: System) -> None:
+    """Install or upgrade."""
+    wheel = given.wheel or newest(given.wheels)
+    if not wheel.is_file():
+        raise InstallError(f"{wheel}: no such file, expected a wheel of {DISTRIBUTION}")
+    system.check_python()
+    version = installation.build(wheel, given.wheels, dependencies=not given.no_deps)
+    installation.activate(version, system, journal_limits=given.journal_limits)
+    installation.prune()
+
+
+def newest(wheels: Path | None) -> Path:
+    """Return the wheel of the highest version in a folder."""
+    found = sorted(wheels.glob(f"{DISTRIBUTION}-*.whl"), key=_version_of) if wheels else []
+    if not found:
+        raise InstallError(f"{wheels or 'no --wheel and no --wheels'}: no {DISTRIBUTION}-*.whl, expected one")
+    return found[-1]
+
+
+def _version_of(wheel: Path) -> list[int]:
+    return [int(part) if part.isdecimal() else 0 for part in wheel.name.split("-")[1].split(".")]
+
+
+def machine(given: argparse.Namespace, installation: Installation, system: System) -> None:
+    """Make the folder of a machine, put its configuration there, check it, and start its service."""
+    version = installation.link("current")
+    if version is None:
+        raise InstallError(f"{installation.root}: nothing is installed, expected `install.py install` first")
+    folder = installation.path(CONFIGURATIONS) / given.name
+    folder.mkdir(parents=True, exist_ok=True)
+    system.own(folder, 0o750)
+    for source, name in ((given.config, "machine.toml"), *((path, path.name) for path in given.model)):
+        if source is not None:
+            _copy(source, folder / name, system)
+    if not (folder / "machine.toml").exists():
+        raise InstallError(f"{folder / 'machine.toml'}: is not there, expected --config FILE")
+    installation.check(version, folder / "machine.toml")
+    system.enable(f"compensator@{given.name}.service")
+
+
+def _copy(source: Path, target: Path, system: System) -> None:
+    data = source.read_bytes()
+    if target.exists() and target.read_bytes() != data:
+        beside = target.with_name(target.name + ".new")
+        beside.write_bytes(data)
+        system.own(beside, 0o640)
+        say(f"{target}: differs and stays; the other one is {beside.name}")
+        return
+    if not target.exists():
+        target.write_bytes(data)
+        say(f"{target}: written")
+    system.own(target, 0o640)
+
+
+def back(given: argparse.Namespace, installation: Installation, system: System) -> None:
+    """Return to the version before; given again it returns from there."""
+    previous = installation.link("previous")
+    if previous is None:
+        raise InstallError(f"{installation.root}: no version before is kept")
+    installation.activate(previous, system)
+
+
+def uninstall(given: argparse.Namespace, installation: Installation, system: System) -> None:
+    """Remove the program; configuration and recordings only where that is asked for."""
+    system.disable()
+    installation.remove_system_files()
+    for name in ("current", "previous", "manifest.json", ".lock"):
+        (installation.root / name).unlink(missing_ok=True)
+    shutil.rmtree(installation.root / "versions", ignore_errors=True)
+    with contextlib.suppress(OSError):
+        installation.root.rmdir()
+    for name in (CONFIGURATIONS, RECORDINGS, LOGS):
+        path = installation.path(name)
+        if given.purge:
+            shutil.rmtree(path, ignore_errors=True)
+        elif path.exists():
+            say(f"{path}: stays")
+    if given.purge:
+        system.remove_user()
+        say("configuration, recordings, logs and user: removed")
+    system.forget()
+
+
+def say(text: str) -> None:
+    """Say what was done."""
+    print(text, flush=True)  # noqa: T201
+
+
+def run(command: Sequence[str]) -> str:
+    """Run a command and return what it printed.
+
+    Raises
+    ------
+    InstallError
+        If it fails; with its last line.
+    """
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        lines = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()
+        raise InstallError(f"{' '.join(command)}: {lines[-1]}")
+    return done.stdout
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--prefix", default=PREFIX, help=f"folder of the program (default {PREFIX})")
+    parser.add_argument("--destdir", default="", help="folder that stands for /; the running system is not touched")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    one = commands.add_parser("install", help="install or upgrade")
+    one.set_defaults(command=install)
+    one.add_argument("--wheel", type=Path, help="the program")
+    one.add_argument("--wheels", type=Path, help="folder of wheels: the program and all that it needs; offline")
+    one.add_argument("--no-deps", action="store_true", help="what it needs is brought in otherwise")
+    one.add_argument(
+        "--journal-limits", action="store_true", help="limit this PC's journal to 1 GB and a year, on disk"
+    )
+    one = commands.add_parser("machine", help="configuration and service of a machine")
+    one.set_defaults(command=machine)
+    one.add_argument("name")
+    one.add_argument("--config", type=Path, help="becomes /etc/compensator/NAME/machine.toml, unless there is one")
+    one.add_argument("--model", type=Path, action="append", default=[], help="model file to put beside it")
+    commands.add_parser("back", help="the version before").set_defaults(command=back)
+    one = commands.add_parser("uninstall", help="remove the program")
+    one.set_defaults(command=uninstall)
+    one.add_argument("--purge", action="store_true", help="remove configuration, recordings and user, too")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code: 0 done, 1 failed."""
+    given = _parser().parse_args(argv)
+    installation, system = Installation(given.prefix, given.destdir), System(touch=not given.destdir)
+    try:
+        if not given.destdir and os.geteuid() != 0:
+            raise InstallError("only root can install; expected sudo, or --destdir")
+        with installation.alone():
+            given.command(given, installation, system)
+    except (InstallError, OSError) as error:
+        print(f"install.py: {error}", file=sys.stderr)  # noqa: T201
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
