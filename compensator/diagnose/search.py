@@ -3,10 +3,10 @@
 An effect is worth its parameters where the residual's sum of squares falls by more than chance would make it fall
 with so many hypotheses tried:
 
-    J = N/c · log(Σ e²) + Σ_effects [ p log(N/c) + 2 log M ]
+    J = N/c · log(Σ e² + A) + Σ_effects [ p log(N/c) + 2 log M ]
 
-with N samples, p parameters, M places tried, and *c* the colour of what is left in the end: a coloured residual has
-fewer independent samples than its length says.
+with N samples, p parameters, M places tried, A what the base model's own error may leave, and *c* the colour of what is
+left in the end: a coloured residual has fewer independent samples than its length says.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """`delay`: a path or its sensor is late.
 
-path     y += y_path(t − d) − y_path(t)
+path     y += L(lag) · y_path(t − d) − y_path(t)
 sensor   y += y_path(t + d) + lag · dy_path/dt (t + d) − y_path(t): the machine was where the late sensor is now
 """
 

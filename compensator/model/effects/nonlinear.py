@@ -1,7 +1,9 @@
 """`nonlinear`: a path's strength depends on its own size.
 
-share    y += change · y_path · |y_path| / 100 µm   or  change · y_path² / 100 µm
-drive    y += change · G · (drive · |drive|), the size of what drives it
+square       y += change · y_path² / 100 µm
+odd square   y += change · y_path · |y_path| / 100 µm
+cube         y += change · y_path³ / (100 µm)²
+drive        y += change · G · (drive · |drive|) / 100, the size of what drives it
 """
 
 from __future__ import annotations
