@@ -413,7 +413,7 @@ def uninstall(given: argparse.Namespace, installation: Installation, system: Sys
 
 def say(text: str) -> None:
     """Say what was done."""
-    print(text, flush=True)  # noqa: T201
+    print(text, flush=True)
 
 
 def run(command: Sequence[str]) -> str:
@@ -466,7 +466,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with installation.alone():
             given.command(given, installation, system)
     except (InstallError, OSError) as error:
-        print(f"install.py: {error}", file=sys.stderr)  # noqa: T201
+        print(f"install.py: {error}", file=sys.stderr)
         return 1
     return 0
 
