@@ -42,8 +42,8 @@ class Voice:
     def polled(self) -> None:
         """Take a poll that is wholly done: the only thing that counts as a sign of life.
 
-        A sensor that does not answer, or a sample that ended in an internal error and was held, is no standstill: it
-        is published, and another start would not say more.
+        A sensor that does not answer, a disk that is late, or a sample that ended in an internal error and was held is
+        no standstill: the offset says so, and another start would not say more.
         """
         if not self._polled:
             self._polled = True

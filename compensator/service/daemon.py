@@ -126,7 +126,7 @@ class Daemon:
         on_sample : callable, optional
             Called with the outcome after each sample was published.
         on_poll : callable, optional
-            Called after each poll, when its sample, if one ended there, is on disk and published.
+            Called after each poll, when its sample, if one ended there, is decided and published.
         """
         self._commands.open()
         period_s = self._compensation.model.period_s
