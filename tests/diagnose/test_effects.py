@@ -8,6 +8,7 @@ import pytest
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.joint import Part, response
 from compensator.errors import ModelError
+from compensator.model.effects import kinds
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model, parse_model
@@ -54,7 +55,7 @@ def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
         scale = max(1.0, float(np.max(np.abs(whole))))
         assert streamed == pytest.approx(whole, abs=2e-6 * scale), (hypothesis.place, hypothesis.form)
         seen.add(hypothesis.kind)
-    assert seen == {"input", "gain", "dynamics", "delay", "nonlinear", "scheduled", "hysteresis"}
+    assert seen == set(kinds())
 
 
 def test_a_restart_in_between_changes_no_bit(day, evidence):
