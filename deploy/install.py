@@ -40,12 +40,14 @@ CONFIGURATIONS, RECORDINGS, LOGS = "/etc/compensator", "/var/lib/compensator", "
 #: File of a version's share/compensator → where the system looks for it.
 SYSTEM_FILES = {
     "systemd/compensator@.service": "/usr/local/lib/systemd/system/compensator@.service",
+    "systemd/compensator-router.service": "/usr/local/lib/systemd/system/compensator-router.service",
     "systemd/compensator.sysusers.conf": "/usr/local/lib/sysusers.d/compensator.conf",
     "systemd/compensator.tmpfiles.conf": "/usr/local/lib/tmpfiles.d/compensator.conf",
     "systemd/70-compensator.rules": "/usr/local/lib/udev/rules.d/70-compensator.rules",
 }
 JOURNAL_LIMITS = {"systemd/journald.conf": "/etc/systemd/journald.conf.d/compensator.conf"}
 COMMAND = "/usr/local/bin/compensator"
+UNITS = ("compensator-router.service", "compensator@*.service")
 
 
 class InstallError(Exception):
@@ -275,8 +277,7 @@ class System:
         """Return the services that run or try to."""
         if not self._systemd:
             return []
-        done = run(["systemctl", "list-units", "--plain", "--no-legend", "--state=active,activating,failed",
-                    "compensator@*.service"])  # fmt: skip
+        done = run(["systemctl", "list-units", "--plain", "--no-legend", "--state=active,activating,failed", *UNITS])
         return [line.split()[0] for line in done.splitlines() if line.strip()]
 
     def restarted(self, unit: str) -> bool:
@@ -291,7 +292,7 @@ class System:
 
     def disable(self) -> None:
         """Stop all services, for good."""
-        wanted = Path("/etc/systemd/system/multi-user.target.wants").glob("compensator@*.service")
+        wanted = Path("/etc/systemd/system/multi-user.target.wants").glob("compensator[@-]*.service")
         units = sorted({*self.running(), *(path.name for path in wanted)}) if self._systemd else []
         if units:
             run(["systemctl", "disable", "--now", *units])

@@ -31,18 +31,18 @@ def settings() -> dict[str, list[str]]:
     return found
 
 
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    """The unit with a program that exists here."""
-    path = tmp_path / UNIT
-    text = (SYSTEMD / UNIT).read_text()
-    assert "ExecStart=/opt/compensator/current/bin/compensator run " in text
+@pytest.fixture(params=[UNIT, "compensator-router.service"])
+def unit(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """A unit with a program that exists here."""
+    path = tmp_path / str(request.param)
+    text = (SYSTEMD / path.name).read_text()
+    assert "ExecStart=/opt/compensator/current/bin/compensator r" in text
     path.write_text(text.replace("/opt/compensator/current/bin/compensator", "/bin/true"))
     return path
 
 
 def test_systemd_finds_nothing_to_complain_about(unit: Path) -> None:
-    instance = unit.with_name("compensator@vmc-07.service")
+    instance = unit.with_name(unit.name.replace("@", "@vmc-07"))
     command = [tool("systemd-analyze"), "verify", "--man=no", str(instance)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     # Of other units on this PC it may say what it likes.
