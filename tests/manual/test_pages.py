@@ -76,3 +76,67 @@ def test_the_table_of_the_published_model_is_the_models() -> None:
         found = sorted({round(z.real, 3) for z in path.in_s().zeros_per_min()})
         printed = sorted({round(float(z.split()[0].replace("−", "-")), 3) for z in zeros.split(", ")})
         assert printed == pytest.approx(found, abs=1.5e-3)
+
+
+# ---------------------------------------------------------------------------- every folder's page
+
+ROOMS = ("compensator", "drivers", "sim_hardware", "tests", "deploy")
+PAGES = sorted(
+    page for page in [TOP / "README.md", *(p for room in ROOMS for p in (TOP / room).rglob("*.md"))]
+    if not {".venv", "node_modules"} & set(page.parts)
+)  # fmt: skip
+CODE = re.compile(r"```.*?```", flags=re.DOTALL)
+#: A cell that names files: nothing but names in backticks.
+NAMES = re.compile(r"^(?:`[\w./@-]+`(?:, )?)+$")
+
+
+def test_every_folder_of_python_opens_with_a_page() -> None:
+    folders = {p.parent for room in ROOMS for p in (TOP / room).rglob("*.py") if "node_modules" not in p.parts}
+    without = [str(f.relative_to(TOP)) for f in sorted(folders) if not (f / "README.md").exists()]
+    assert without == []
+
+
+def named_files(text: str) -> list[str]:
+    """Names of files and folders in the first column of tables whose head says that this is what stands there."""
+    found: list[str] = []
+    listing = False
+    for line in CODE.sub("", text).splitlines():
+        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else []
+        if not cells:
+            listing = False
+        elif cells[0] in ("file", "module", "folder", "where"):
+            listing = True
+        elif listing and NAMES.match(cells[0]):
+            found += re.findall(r"`([^`]+)`", cells[0])
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(TOP)))
+def test_files_in_tables_and_links_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    gone = [
+        name for name in named_files(text)
+        if not any((page.parent / way).exists() for way in (name, f"{name}.py"))
+    ]  # fmt: skip
+    for target in re.findall(r"\]\(([^)\s]+)\)", CODE.sub("", text)):
+        where, _, part = target.partition("#")
+        if "://" in target:
+            continue
+        if where and not (page.parent / where).exists():
+            gone.append(target)
+        elif part:
+            aim = (page.parent / where if where else page).read_text(encoding="utf-8")
+            if part not in {anchor(heading) for heading in re.findall(r"^#+ (.*)$", aim, flags=re.MULTILINE)}:
+                gone.append(target)
+    assert gone == []
+
+
+def anchor(heading: str) -> str:
+    """Return what GitHub makes of a heading in a link."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+def test_the_reader_of_tables_sees_what_is_there_and_what_is_not() -> None:
+    text = "| file | what |\n| --- | --- |\n| `a.py`, `b` | x |\n\n| key | what |\n| --- | --- |\n| `c.py` | x |\n"
+    assert named_files(text) == ["a.py", "b"]
+    assert len(named_files((TOP / "compensator/README.md").read_text(encoding="utf-8"))) > 10
