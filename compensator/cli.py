@@ -61,6 +61,8 @@ COMMANDS = (
             arguments.diagnose, "compensator.commands.diagnose:run"),
     Command("replay", "audit recordings: nothing changed, all comes out again", "replay recordings/*.mcap",
             arguments.replay, "compensator.commands.replay:run"),
+    Command("report", "a page for people: of recordings, or of a folder with results", "report recordings/",
+            arguments.report, "compensator.commands.report:run"),
     Command("adopt", "the running service takes a model over without a jump",
             "adopt diagnosis/model.toml --config machine.toml", arguments.adopt, "compensator.commands.adopt:adopt"),
     Command("back", "the service returns to the model before", "back --config machine.toml",

@@ -91,6 +91,15 @@ def replay(parser: argparse.ArgumentParser) -> None:
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
 
+def report(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `report`."""
+    add = parser.add_argument
+    words = "recordings, a folder of them, or a folder that demo, identify or diagnose made"
+    add("what", type=Path, nargs="+", metavar="DIR_OR_FILE", help=words)
+    words = "the page: .html, .pdf, or .png for its first picture (default: NAME-report.html here)"
+    add("--out", type=Path, metavar="FILE", help=words)
+
+
 def adopt(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `adopt`."""
     parser.add_argument("model", metavar="MODEL", help="a model file, or quill")

@@ -27,9 +27,11 @@ _WIDE_IN, _NARROW_IN = 9.0, 4.8
 _NUMBER = re.compile(
     r"[-+−±–]?\s*\d[\d.,\s]*([eE][-+−]?\d+)?(\s*±\s*\d[\d.,eE+−-]*)?\s*%?(\s*\(.*\))?|nan|[-+−]?(inf|∞)|[-–—]"
 )
+#: Longest cell that stays on one line, letters.
+_SENTENCE = 36
 #: Heading of what the codes on a page mean.
 GLOSSARY = "What the words mean, and what to do"
-_TONE_WORDS: dict[Tone, str] = {"good": "✓ good", "warn": "⚠ mind", "bad": "✗ no"}
+TONE_WORDS: dict[Tone, str] = {"good": "✓ good", "warn": "⚠ mind", "bad": "✗ no"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +162,7 @@ def html_of(page: Page) -> str:
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style></head><body>'
-        f'<main><h1>{title}</h1><p class="verdict {page.tone}"><b>{_TONE_WORDS[page.tone]}</b>'
+        f'<main><h1>{title}</h1><p class="verdict {page.tone}"><b>{TONE_WORDS[page.tone]}</b>'
         f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}</main></body></html>"
     )
 
@@ -264,19 +266,29 @@ def _table(table: Table, level: int) -> str:
     note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
     label = html.escape(table.title or "table")
     return (
-        f'{title}<div class="scroll" role="region" aria-label="{label}" tabindex="0"><table class="{_words_in(table)}">'
+        f'{title}<div class="scroll" role="region" aria-label="{label}" tabindex="0"><table class="{_classes(table)}">'
         f"{f'<thead><tr>{head}</tr></thead>' if head else ''}<tbody>{rows}</tbody></table></div>{note}"
     )
 
 
-def _words_in(table: Table) -> str:
-    """Return the classes that set columns left whose cells are words for the most part, the first being one of them."""
-    classes = ["text-1"]
+def columns_of_words(table: Table) -> set[int]:
+    """Return which columns hold words for the most part, the first being one of them; they stand left."""
+    found = {0}
     for i in range(1, max((len(row) for row in table.rows), default=0)):
         cells = [text_of(row[i]) for row in table.rows if i < len(row) and row[i]]
         if 2 * sum(bool(_NUMBER.fullmatch(cell)) for cell in cells) < len(cells):
-            classes.append(f"text-{i + 1}")
-    return " ".join(classes)
+            found.add(i)
+    return found
+
+
+def _classes(table: Table) -> str:
+    """Return the classes that set columns of words left, and break lines in those of sentences."""
+    words = sorted(columns_of_words(table))
+    long = [
+        i for i in words
+        if max((len(text_of(row[i])) for row in table.rows if i < len(row)), default=0) > _SENTENCE
+    ]  # fmt: skip
+    return " ".join([*(f"text-{i + 1}" for i in words), *(f"long-{i + 1}" for i in long)])
 
 
 def _cell(cell: Cell, scope: str) -> str:
@@ -316,6 +328,7 @@ __all__ = [
     "Tone",
     "Words",
     "codes_of",
+    "columns_of_words",
     "html_of",
     "text_of",
     "write_page",

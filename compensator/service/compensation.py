@@ -382,7 +382,8 @@ class Compensation:
         notes.append((
             "zero",
             f"zero on a {'warm machine' if warm else 'machine at rest'}: "
-            f"T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C, Y {values.y:.3f} µm",
+            f"T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C, "
+            + ("Y not measured" if math.isnan(values.y) else f"Y {values.y:.3f} µm"),
         ))  # fmt: skip
 
     def _is_warm(self, mode: ZeroMode) -> bool:

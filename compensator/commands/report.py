@@ -1,0 +1,77 @@
+"""`compensator report`: a page for people, of recordings or of a folder with results."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from compensator.commands import Answer
+from compensator.commands.progress import progress
+from compensator.errors import UsageError
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command.
+
+    Raises
+    ------
+    CompensatorError
+        If there is nothing in what was given that a page could show.
+    """
+    from compensator.report.formats import checked
+
+    given: list[Path] = arguments.what
+    out = checked(arguments.out or Path(f"{_name(given[0])}-report.html"), option="--out")
+    if len(given) == 1 and given[0].is_dir() and not any(given[0].glob("*.mcap")):
+        return _results(given[0], out)
+    return _recordings(_files(given), out)
+
+
+def _recordings(paths: Sequence[Path], out: Path) -> Answer:
+    from compensator.report.formats import write
+    from compensator.report.gathering import read_history
+    from compensator.report.recordings import figures, page_of, verdict
+
+    with progress("reading") as told:
+        history = read_history(paths, told=told)
+    write(out, page_of(history))
+    return Answer({**figures(history), "report": str(out)}, f"{verdict(history)}\npage: {out}")
+
+
+def _results(folder: Path, out: Path) -> Answer:
+    from compensator.report.formats import write
+    from compensator.report.results import overview, pages_in
+
+    pages = [page for page in pages_in(folder) if page.path.resolve() != out.resolve()]
+    if not pages:
+        raise UsageError(f"{folder}: neither recordings (*.mcap) nor pages (report.html) in it")
+    write(out, overview(folder, pages, beside=out.parent))
+    result = {
+        "report": str(out),
+        "pages": [{"page": str(p.path), "title": p.title, "verdict": p.verdict} for p in pages],
+    }
+    lines = [f"{page.path}\n  {page.verdict}" for page in pages]
+    return Answer(result, "\n".join([*lines, f"page: {out}"]))
+
+
+def _files(given: Sequence[Path]) -> list[Path]:
+    """Return the recordings given; a folder stands for those in it."""
+    paths: list[Path] = []
+    for path in given:
+        if path.is_dir():
+            inside = sorted(path.glob("*.mcap"))
+            if not inside:
+                raise UsageError(f"{path}: no recordings in it, expected FILE.mcap")
+            paths += inside
+        elif path.suffix != ".mcap":
+            raise UsageError(f"{path}: expected a recording (FILE.mcap) or a folder")
+        else:
+            paths.append(path)
+    return paths
+
+
+def _name(path: Path) -> str:
+    """Return what the page is called after; `recordings` alone says too little."""
+    whole = path.resolve()
+    return whole.stem if whole.suffix == ".mcap" else whole.name or "all"

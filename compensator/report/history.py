@@ -1,0 +1,206 @@
+"""What recordings tell, gathered in little memory: a day as well as a year."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+
+from compensator.report.envelope import Envelope, Stretches
+
+#: Events and episodes that are kept; the rest is counted.
+EVENTS, EPISODES = 500, 200
+#: A state of its own: the service was away.
+NO_RECORDING = "no recording"
+
+
+@dataclass(slots=True)
+class Spread:
+    """Root mean square and largest amount of a quantity, with its sign and time.
+
+    Parameters
+    ----------
+    samples : int
+        Number of values.
+    peak, at_s : float
+        The value of the largest amount, and its time, s since 1970 UTC; NaN where there is none.
+    """
+
+    samples: int = 0
+    peak: float = math.nan
+    at_s: float = math.nan
+    _squares: float = 0.0
+
+    def add(self, value: float, at_s: float) -> None:
+        """Take a value in; one that is missing counts nowhere."""
+        if math.isnan(value):
+            return
+        self.samples += 1
+        self._squares += value * value
+        if not abs(value) <= abs(self.peak):
+            self.peak, self.at_s = value, at_s
+
+    def join(self, other: Spread) -> None:
+        """Take in what another one holds."""
+        self.samples += other.samples
+        self._squares += other._squares
+        if not abs(other.peak) <= abs(self.peak) and other.samples:
+            self.peak, self.at_s = other.peak, other.at_s
+
+    @property
+    def rms(self) -> float:
+        """Root mean square; NaN where there is nothing."""
+        return math.sqrt(self._squares / self.samples) if self.samples else math.nan
+
+
+@dataclass(slots=True)
+class Period:
+    """Figures of a stretch of time: a day, a month, or all of it.
+
+    Parameters
+    ----------
+    samples : int
+        Number of samples.
+    seconds : dict of str to float
+        Time in each state, s.
+    offset, residual, measured, left, std : Spread
+        The offset; measured − predicted; measured deformation, alone and with the offset; the standard deviation. µm.
+    """
+
+    samples: int = 0
+    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    offset: Spread = field(default_factory=Spread)
+    residual: Spread = field(default_factory=Spread)
+    measured: Spread = field(default_factory=Spread)
+    left: Spread = field(default_factory=Spread)
+    std: Spread = field(default_factory=Spread)
+
+    def join(self, other: Period) -> None:
+        """Take in what another one holds."""
+        self.samples += other.samples
+        for state, seconds in other.seconds.items():
+            self.seconds[state] += seconds
+        for name in ("offset", "residual", "measured", "left", "std"):
+            getattr(self, name).join(getattr(other, name))
+
+
+@dataclass(slots=True)
+class Missed:
+    """What was missed of a channel.
+
+    Parameters
+    ----------
+    samples, missing : int
+        Samples, and those without a usable value.
+    qualities, errors : collections.Counter
+        Why samples had none; single readings that were bad, by code.
+    """
+
+    samples: int = 0
+    missing: int = 0
+    qualities: Counter[str] = field(default_factory=Counter)
+    errors: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Episode:
+    """A stretch in one state that is not `ok`, with its reasons; `state` is empty where nothing was recorded."""
+
+    seconds: float
+    number: int
+    first_s: float
+    last_s: float
+    state: str
+    reasons: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class File:
+    """A recording.
+
+    Parameters
+    ----------
+    name : str
+        Of the file.
+    samples : int
+        Number of samples in it.
+    first_s, last_s : float
+        Times of the first and last, s since 1970 UTC; NaN where there is none.
+    end : str
+        How it ends: `finished`, `no end`, or where it is damaged.
+    """
+
+    name: str
+    samples: int = 0
+    first_s: float = math.nan
+    last_s: float = math.nan
+    end: str = "finished"
+
+    def add(self, at_s: float) -> None:
+        """Count a sample."""
+        self.samples += 1
+        self.first_s = at_s if math.isnan(self.first_s) else self.first_s
+        self.last_s = at_s
+
+
+@dataclass(slots=True)
+class History:
+    """What the recordings of a machine tell.
+
+    Parameters
+    ----------
+    machine : str
+        Its name.
+    files : list of File
+        In the order in which they were begun.
+    curves : dict of str to Envelope
+        `offset`, `predicted`, `measured`, `left`, `residual`, `heat`, `share …` and `channel …`.
+    states, reasons : dict of str to Stretches
+        When each stood; `no recording` is a state here.
+    reason_seconds : dict of str to float
+        Time with each reason, s.
+    whole : Period
+        Figures of all of it.
+    days : dict of str to Period
+        By date, UTC.
+    channels : dict of str to Missed
+        By name.
+    events : list of (float, str, str)
+        Time, kind and text of the last events.
+    events_count : int
+        How many there were.
+    episodes : list of Episode
+        The longest.
+    episodes_count : int
+        How many there were.
+    models : dict of str to (str, float)
+        Name and first time of each model, by its SHA-256.
+    """
+
+    machine: str = ""
+    files: list[File] = field(default_factory=list)
+    curves: dict[str, Envelope] = field(default_factory=dict)
+    states: dict[str, Stretches] = field(default_factory=dict)
+    reasons: dict[str, Stretches] = field(default_factory=dict)
+    reason_seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    whole: Period = field(default_factory=Period)
+    days: dict[str, Period] = field(default_factory=dict)
+    channels: dict[str, Missed] = field(default_factory=dict)
+    events: list[tuple[float, str, str]] = field(default_factory=list)
+    events_count: int = 0
+    episodes: list[Episode] = field(default_factory=list)
+    episodes_count: int = 0
+    models: dict[str, tuple[str, float]] = field(default_factory=dict)
+
+    @property
+    def first_s(self) -> float:
+        """Begin of the first sample, s since 1970 UTC."""
+        return min(a for s in self.states.values() for a, _ in s.pieces)
+
+    @property
+    def last_s(self) -> float:
+        """End of the last sample, s since 1970 UTC."""
+        return max(b for s in self.states.values() for _, b in s.pieces)
+
+
+NO_RECORDING = "no recording"

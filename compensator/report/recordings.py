@@ -1,0 +1,357 @@
+"""The page of recordings: how a machine was compensated over a day, a week, a year."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+
+from compensator.reasons import explain
+from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
+from compensator.report.page import (
+    Block,
+    Cell,
+    Code,
+    Details,
+    Figure,
+    Line,
+    Page,
+    Section,
+    Span,
+    Strip,
+    Table,
+    Tone,
+    Words,
+)
+
+TIME = "time, UTC"
+#: Order in which states stand on the page, the gravest last; what nobody recorded comes behind them.
+STATES = ("ok", "degraded", "starting", "hold", "fault", NO_RECORDING)
+#: States in which the offset follows the machine.
+_FOLLOWS = ("ok", "degraded")
+#: Largest share of the time without a following offset that is worth a warning only.
+_MUCH = 0.1
+#: Days that stand one below the other; more are put together by months.
+_DAYS = 31
+#: So many rows stand on the page at once; more are there to open.
+_ROWS = 12
+#: Curves in a picture of channels, and pieces of time shaded in one.
+_CURVES, _SHADED = 5, 100
+_UNITS = (("_degc", "temperature, °C"), ("_um", "displacement, µm"), ("_w", "power, W"), ("_rpm", "speed, 1/min"),
+          ("_k", "temperature difference, K"), ("_pct", "share, %"), ("_a", "current, A"), ("_v", "voltage, V"),
+          ("_bar", "pressure, bar"), ("_l_per_min", "flow, l/min"))  # fmt: skip
+
+
+def page_of(history: History) -> Page:
+    """Make the page of a machine's recordings.
+
+    Parameters
+    ----------
+    history : History
+        What they tell.
+    """
+    blocks: list[Block] = [_offset(history), _band(history), _figures(history), _states(history)]
+    if history.reasons:
+        blocks.append(_reasons(history))
+    if history.episodes:
+        blocks.append(_episodes(history))
+    blocks += [_shares(history), *_residual(history), *_temperatures(history), *_days(history), _missed(history)]
+    blocks += [_events(history), *_other_channels(history), _files(history)]
+    return Page(
+        title=f"{history.machine or 'Recordings'}: {span(history)}", verdict=verdict(history), blocks=blocks,
+        tone=_tone(history),
+    )  # fmt: skip
+
+
+def figures(history: History) -> dict[str, object]:
+    """Return the figures of the page, for `--json`."""
+    whole = history.whole
+    return {
+        "machine": history.machine, "from_utc": _utc(history.first_s), "to_utc": _utc(history.last_s),
+        "samples": whole.samples, "files": len(history.files),
+        "minutes": {state: round(seconds / 60.0, 1) for state, seconds in whole.seconds.items()},
+        "largest_offset_um": _null(whole.offset.peak), "residual_rms_um": _null(whole.residual.rms),
+        "measured_rms_um": _null(whole.measured.rms), "left_rms_um": _null(whole.left.rms),
+        "models": list(history.models), "events": history.events_count, "alarms": history.episodes_count,
+    }  # fmt: skip
+
+
+def span(history: History) -> str:
+    """Return from when to when the recordings go."""
+    first, last = (datetime.fromtimestamp(t, UTC) for t in (history.first_s, history.last_s))
+    same_day = first.date() == last.date()
+    return f"{first:%Y-%m-%d %H:%M} to {last:{'%H:%M' if same_day else '%Y-%m-%d %H:%M'}} UTC"
+
+
+def verdict(history: History) -> str:
+    """Return one sentence that needs no knowledge of the service."""
+    whole, seconds = history.whole, history.whole.seconds
+    total = sum(seconds.values())
+    followed = sum(seconds[state] for state in _FOLLOWS)
+    # All of the time only where nothing at all is missing.
+    words = "all" if followed == total else f"{min(100.0 * followed / total, 99.9):.1f} %"
+    words = f"The correction followed the machine for {words} of {_hours(total)}"
+    if whole.left.samples:
+        words += (
+            f"; the probe saw an error in Y of {whole.measured.rms:.1f} µm rms, of which {whole.left.rms:.1f} "
+            "are left with the correction"
+        )
+    elif whole.offset.samples:
+        words += f"; it reached {_um(whole.offset.peak, 1)} µm"
+    return f"{words}."
+
+
+def _tone(history: History) -> Tone:
+    seconds = history.whole.seconds
+    total = sum(seconds.values())
+    without = total - sum(seconds[state] for state in _FOLLOWS)
+    worse = history.whole.left.samples and history.whole.left.rms > history.whole.measured.rms
+    if "fault" in history.states or without > _MUCH * total or worse:
+        return "bad"
+    return "warn" if without or seconds["degraded"] > _MUCH * total else "good"
+
+
+# ---------------------------------------------------------------------------- pictures
+
+
+def _picture(history: History, title: str, y_label: str, curves: Mapping[str, str], note: str = "", height: float = 2.8,
+             spans: tuple[Span, ...] = ()) -> Figure:  # fmt: skip
+    lines = tuple(Line(name, *history.curves[key].points()) for name, key in curves.items() if key in history.curves)
+    return Figure(title=title, x_label=TIME, y_label=y_label, lines=lines, clock=True, height=height, note=note,
+                  x_limits=(history.first_s, history.last_s), spans=spans)  # fmt: skip
+
+
+def _offset(history: History) -> Figure:
+    stood = [
+        Span("offset held", *piece) for state in ("hold", "fault") if state in history.states
+        for piece in history.states[state].pieces
+    ]  # fmt: skip
+    curves = {"offset": "offset"}
+    words = f"Largest offset {_um(history.whole.offset.peak, 1)} µm."
+    if history.whole.left.samples:
+        curves = {"measured": "measured", "left (measured + offset)": "left"} | curves
+        words += f" Left of the measured error: {history.whole.left.rms:.2f} µm rms."
+    return _picture(history, "Offset, and what is left", "Y, µm", curves, words, 3.4, tuple(stood[:_SHADED]))
+
+
+def _band(history: History) -> Figure:
+    strips = [
+        Strip(state, tuple(history.states[state].pieces), 1 if state == "ok" else 0)
+        for state in STATES if state in history.states
+    ]  # fmt: skip
+    strips += [Strip(reason, tuple(stretch.pieces), 3) for reason, stretch in history.reasons.items()]
+    if history.events:
+        strips.append(Strip("events", tuple((t, t) for t, _, _ in history.events), 4))
+    shares = [f"{state} {_share(history, state)}" for state in STATES if state in history.states]
+    return Figure(
+        title="States and reasons", x_label=TIME, y_label="state, reason", strips=tuple(strips), clock=True,
+        x_limits=(history.first_s, history.last_s), height=1.1 + 0.27 * len(strips), note=f"{', '.join(shares)}.",
+    )  # fmt: skip
+
+
+def _shares(history: History) -> Figure:
+    curves = {key.removeprefix("share "): key for key in history.curves if key.startswith("share ")}
+    note = "Since the zero; the offset is minus their sum, within its limits."
+    return _picture(history, "Share of each path in the predicted deformation", "Y, µm", curves, note)
+
+
+def _residual(history: History) -> list[Block]:
+    residual = history.whole.residual
+    if not residual.samples:
+        return [Words(title="Residual", lines=["Y was not measured, so nothing can be said of the residual."])]
+    note = f"{residual.rms:.2f} µm rms; the largest is {_um(residual.peak, 1)} µm, {_utc(residual.at_s)}."
+    return [_picture(history, "Residual, measured − predicted", "residual, µm", {"residual": "residual"}, note)]
+
+
+def _temperatures(history: History) -> list[Block]:
+    curves = {"T_Q": "channel t_q_degc", "AT": "channel at_degc"}
+    heat = _picture(history, "Heat, estimated from T_Q and AT", "heat, W", {"heat": "heat"}, height=2.4)
+    note = "Where a curve is missing there was no value that could be used."
+    temperatures = _picture(history, "Temperatures that the model uses", "temperature, °C", curves, note, 2.6)
+    return [temperatures, heat] if history.curves["heat"].known else [temperatures]
+
+
+def _other_channels(history: History) -> list[Block]:
+    groups: defaultdict[str, list[str]] = defaultdict(list)
+    for name in history.channels:
+        if name not in ("t_q_degc", "at_degc", "y_um"):
+            unit = next((words for ending, words in _UNITS if name.endswith(ending)), f"{name}, unit as in its name")
+            groups[unit].append(name)
+    pictures = [
+        _picture(history, f"Other channels: {unit.partition(',')[0]}", unit,
+                 {name: f"channel {name}" for name in names[i : i + _CURVES]}, height=2.4)
+        for unit, names in groups.items() for i in range(0, len(names), _CURVES)
+    ]  # fmt: skip
+    return [Details(title="Other channels", blocks=pictures)] if pictures else []
+
+
+# ---------------------------------------------------------------------------- tables
+
+
+def _figures(history: History) -> Table:
+    whole = history.whole
+    rows = [
+        ["largest offset", _um(whole.offset.peak, 1), "µm", _at(whole.offset)],
+        ["largest standard deviation of the offset", _plain(whole.std.peak, 2), "µm", _at(whole.std)],
+        ["error in Y as measured, rms", _plain(whole.measured.rms, 2), "µm", ""],
+        ["left with the correction, rms", _plain(whole.left.rms, 2), "µm", ""],
+        ["largest left with the correction", _um(whole.left.peak, 1), "µm", _at(whole.left)],
+        ["residual, rms", _plain(whole.residual.rms, 2), "µm", ""],
+        ["samples", str(whole.samples), "", ""],
+    ]
+    note = "" if whole.measured.samples else "Y was not measured: –."
+    return Table(title="Figures", head=["", "value", "unit", "when"], rows=rows, note=note)
+
+
+def _states(history: History) -> Table:
+    rows: list[list[Cell]] = []
+    for state in STATES:
+        if state in history.states:
+            seconds, times = history.whole.seconds[state], history.states[state].count
+            means, do = explain(state) or ("Nobody knows: the service was away.", "See the events around it.")
+            cell: Cell = state if state == NO_RECORDING else Code(state)
+            rows.append([cell, _minutes(seconds), _share(history, state), str(times), means, do])
+    return Table(title="Minutes by state", rows=rows, head=["state", "min", "share", "times", "means", "to do"])
+
+
+def _reasons(history: History) -> Table:
+    rows: list[list[Cell]] = []
+    for reason, stretch in sorted(history.reasons.items(), key=lambda item: -history.reason_seconds[item[0]]):
+        means, do = explain(reason) or ("", "")
+        seconds, last = history.reason_seconds[reason], stretch.pieces[-1][1]
+        rows.append([Code(reason), _minutes(seconds), str(stretch.count), _utc(last), means, do])
+    return Table(title="Reasons", rows=rows, head=["reason", "min", "times", "last at, UTC", "means", "to do"])
+
+
+def _episodes(history: History) -> Block:
+    def row(episode: Episode) -> list[Cell]:
+        reasons: list[str | Code] = []
+        for reason in episode.reasons:
+            reasons += [", ", Code(reason)] if reasons else [Code(reason)]
+        state: Cell = Code(episode.state) if episode.state else NO_RECORDING
+        return [_utc(episode.first_s), _minutes(episode.seconds), state, tuple(reasons)]
+
+    note = f"The longest {EPISODES} of {history.episodes_count}." if history.episodes_count > EPISODES else ""
+    rows = [row(episode) for episode in history.episodes]
+    return _folded("Alarms: every time it was not ok", ["from, UTC", "min", "state", "reasons"], rows, note)
+
+
+def _days(history: History) -> list[Block]:
+    if len(history.days) < 2:
+        return []
+    head = ["day", "samples", "ok, min", "degraded, min", "held, min", "away, min", "largest offset, µm",
+            "left, µm rms", "residual, µm rms"]  # fmt: skip
+    days = [_day(date, period) for date, period in sorted(history.days.items())]
+    if len(days) <= _DAYS:
+        return [Table(title="Day by day", head=head, rows=days)]
+    months: defaultdict[str, Period] = defaultdict(Period)
+    for date, period in sorted(history.days.items()):
+        months[date[:7]].join(period)
+    rows = [_day(month, period) for month, period in months.items()]
+    return [
+        Table(title="Month by month", head=["month", *head[1:]], rows=rows),
+        Details(title=f"Day by day, {len(days)} days", blocks=[Table(head=head, rows=days)]),
+    ]
+
+
+def _day(name: str, period: Period) -> list[Cell]:
+    seconds = period.seconds
+    held = sum(seconds[state] for state in ("starting", "hold", "fault"))
+    times = (seconds["ok"], seconds["degraded"], held, seconds[NO_RECORDING])
+    return [name, str(period.samples), *map(_minutes, times), _um(period.offset.peak, 1), _plain(period.left.rms, 2),
+            _plain(period.residual.rms, 2)]  # fmt: skip
+
+
+def _missed(history: History) -> Block:
+    rows: list[list[Cell]] = []
+    for name, missed in history.channels.items():
+        if missed.missing or missed.errors:
+            why = _codes(missed.qualities)
+            rows.append([name, f"{missed.missing}", f"{100.0 * missed.missing / missed.samples:.1f} %", why,
+                         _codes(missed.errors)])  # fmt: skip
+    if not rows:
+        return Words(
+            title="What the devices missed", lines=["Nothing: every channel had a good value in every sample."]
+        )
+    whole = len(history.channels) - len(rows)
+    return Table(
+        title="What the devices missed", rows=rows,
+        head=["channel", "samples missing", "share", "why", "single bad readings"],
+        note=f"{whole} other channel(s) had a good value in every sample." if whole else "",
+    )  # fmt: skip
+
+
+def _codes(counts: Mapping[str, int]) -> Cell:
+    parts: list[str | Code] = []
+    for code, number in sorted(counts.items(), key=lambda item: -item[1]):
+        parts += [", ", Code(code), f" {number}"] if parts else [Code(code), f" {number}"]
+    return tuple(parts) or ""
+
+
+def _events(history: History) -> Block:
+    rows: list[list[Cell]] = [[_utc(t), kind, text] for t, kind, text in history.events]
+    note = f"The last {EVENTS} of {history.events_count}." if history.events_count > EVENTS else ""
+    return _folded("Events", ["at, UTC", "kind", "what happened"], rows, note)
+
+
+def _files(history: History) -> Details:
+    files: list[list[Cell]] = [
+        [file.name, str(file.samples), _utc(file.first_s), _utc(file.last_s), file.end] for file in history.files
+    ]
+    models: list[list[Cell]] = [[name, _utc(first), sha] for sha, (name, first) in history.models.items()]
+    return Details(
+        title=f"{len(files)} recording(s), {len(models)} model(s)",
+        blocks=[
+            Table(title="Recordings", head=["file", "samples", "first, UTC", "last, UTC", "end"], rows=files,
+                  note="A file without an end is still being written, or the service was ended hard. Whether anything "
+                  "was changed is not looked at here: compensator replay does."),
+            Table(title="Models", head=["model", "from, UTC", "SHA-256"], rows=models),
+        ],
+    )  # fmt: skip
+
+
+def _folded(title: str, head: Sequence[str], rows: Sequence[Sequence[Cell]], note: str) -> Block:
+    """Return a table, folded where it is long."""
+    if len(rows) <= _ROWS:
+        return Table(title=title, head=head, rows=rows, note=note)
+    table = Table(head=head, rows=rows, note=note)
+    return Section(title=title, blocks=[Details(title=f"All {len(rows)}", blocks=[table])])
+
+
+# ---------------------------------------------------------------------------- words
+
+
+def _utc(t_s: float) -> str:
+    return "–" if math.isnan(t_s) else f"{datetime.fromtimestamp(t_s, UTC):%Y-%m-%d %H:%M}"
+
+
+def _at(spread: Spread) -> str:
+    return "" if math.isnan(spread.at_s) else _utc(spread.at_s)
+
+
+def _um(value: float, digits: int) -> str:
+    return "–" if math.isnan(value) else f"{value:+.{digits}f}".replace("-", "−")
+
+
+def _plain(value: float, digits: int) -> str:
+    return "–" if math.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60.0:.0f}" if seconds >= 600.0 or seconds == 0.0 else f"{seconds / 60.0:.1f}"
+
+
+def _hours(seconds: float) -> str:
+    return f"{seconds / 3600.0:.1f} h" if seconds < 48 * 3600.0 else f"{seconds / 86400.0:.1f} days"
+
+
+def _share(history: History, state: str) -> str:
+    share = history.whole.seconds[state] / sum(history.whole.seconds.values())
+    # Neither nothing nor all where it is not.
+    shown = share if share in (0.0, 1.0) else min(max(share, 0.0005), 0.9995)
+    return f"{100.0 * shown:.1f} %"
+
+
+def _null(value: float) -> float | None:
+    return None if math.isnan(value) else value

@@ -1,0 +1,277 @@
+"""`compensator report`: what recordings tell, in little memory, and the pages of a folder with results."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensator.cli import main
+from compensator.reasons import explain
+from compensator.recording import recordings
+from compensator.report.envelope import COLUMNS, Envelope, Stretches
+from compensator.report.gathering import read_history
+from compensator.report.history import NO_RECORDING, History, Period
+from compensator.report.page import Page, codes_of, html_of, write_page
+from compensator.report.recordings import page_of, verdict
+from tests.audit.made import CONFIG, MACHINE, Service, readings
+from tests.service.simulated import START_NS
+
+START_S = START_NS / 1e9
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Thirty hours over two days: T_Q lost for a short and a long time, a hold, half an hour without the service."""
+    service = Service(tmp_path_factory.mktemp("made") / "rec")
+    for i, values in enumerate(readings(1800)):
+        lost = 200 <= i < 205 or 500 <= i < 540
+        if i == 900:
+            service.command("hold")
+        if i == 960:
+            service.command("resume")
+        service.take({**values, "t_q_degc": math.nan} if lost else values, lost=1000 <= i < 1030)
+    service.stop()
+    return service.folder
+
+
+@pytest.fixture(scope="module")
+def history(folder: Path) -> History:
+    return read_history(sorted(folder.glob("*.mcap")))
+
+
+@pytest.fixture(scope="module")
+def text(history: History) -> str:
+    return html.unescape(html_of(page_of(history)))
+
+
+def test_time_is_counted_once_and_wholly(history: History) -> None:
+    seconds = history.whole.seconds
+    assert sum(seconds.values()) == pytest.approx(1800 * 60.0)
+    assert seconds[NO_RECORDING] == pytest.approx(30 * 60.0)
+    # The long loss is predicted for 10 min and held for 30; the operator holds an hour.
+    assert seconds["hold"] == pytest.approx((30 + 60) * 60.0)
+    assert history.reason_seconds["operator_hold"] == pytest.approx(3600.0)
+    assert sum(sum(day.seconds.values()) for day in history.days.values()) == pytest.approx(1800 * 60.0)
+    assert list(history.days) == ["2026-01-05", "2026-01-06"]
+
+
+def test_what_was_lost_is_no_value_and_is_counted(history: History) -> None:
+    t, y = history.curves["channel t_q_degc"].points()
+    at = (t - START_S) / 60.0
+    assert np.all(np.isnan(y[(at > 500) & (at < 539)])) and np.isfinite(y[at < 199]).all()
+    # Where nothing was recorded the curve is broken, too.
+    assert np.isnan(y[(at > 1000) & (at < 1029)]).any()
+    missed = history.channels["t_q_degc"]
+    assert (missed.missing, missed.samples) == (45, 1770)
+    assert missed.qualities == {"device_timeout": 45}
+
+
+def test_the_figures_are_those_of_the_samples(history: History, folder: Path, tmp_path: Path) -> None:
+    offsets, left = [], []
+    for path in recordings(folder, MACHINE):
+        out = tmp_path / "day.csv"
+        main(["export", str(path), "--out", str(out)])
+        rows = [line.split(",") for line in out.read_text().splitlines()]
+        column = rows[0].index("y_offset_um")
+        offsets += [float(row[column]) for row in rows[1:]]
+        left += [float(row[rows[0].index("residual_um")] or "nan") for row in rows[1:]]
+    assert abs(history.whole.offset.peak) == pytest.approx(np.max(np.abs(offsets)))
+    assert history.whole.residual.rms == pytest.approx(np.sqrt(np.nanmean(np.square(left))))
+
+
+def test_every_state_and_reason_stands_with_its_sentences(history: History, text: str) -> None:
+    codes = codes_of(page_of(history).blocks)
+    assert {"ok", "degraded", "hold", "t_q_missing", "operator_hold", "device_timeout"} <= set(codes)
+    for code in codes:
+        means, do = explain(code) or ("", "")
+        assert f'<div id="word-{code}">' in text and f'href="#word-{code}"' in text
+        assert means in text and do in text
+
+
+def test_the_verdict_says_how_long_the_machine_was_followed(history: History) -> None:
+    share = 100.0 * (1800 - 30 - 90) / 1800
+    assert f"for {share:.1f} % of 30.0 h" in verdict(history)
+    assert "µm rms, of which" in verdict(history)
+    assert page_of(history).tone == "warn"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "measured", "left", "tone"),
+    [({"ok": 1e5}, 9.0, 1.0, "good"), ({"ok": 1e5, "hold": 60.0}, 9.0, 1.0, "warn"), ({"ok": 1.0}, 1.0, 2.0, "bad"),
+     ({"ok": 8e4, "degraded": 2e4}, 9.0, 1.0, "warn"), ({"ok": 8e4, "starting": 2e4}, 9.0, 1.0, "bad"),
+     ({"ok": 9e4, "fault": 60.0}, 9.0, 1.0, "bad"), ({"ok": 9e4, NO_RECORDING: 60.0}, 9.0, 1.0, "warn")],
+)  # fmt: skip
+def test_the_tone(seconds: dict[str, float], measured: float, left: float, tone: str) -> None:
+    whole = Period(samples=1)
+    whole.seconds.update(seconds)
+    whole.measured.add(measured, 0.0)
+    whole.left.add(left, 0.0)
+    whole.offset.add(-measured, 0.0)
+    states = {}
+    for state in seconds:
+        states[state] = Stretches()
+        states[state].add(0.0, 60.0)
+    history = History(machine="m", whole=whole, states=states, curves={"heat": Envelope()})
+    assert page_of(history).tone == tone
+    # "All" is said only where nothing is missing.
+    assert ("for all of" in verdict(history)) == (set(seconds) <= {"ok", "degraded"})
+
+
+def test_a_minute_is_not_rounded_away() -> None:
+    whole = Period(samples=1)
+    whole.seconds.update({"ok": 1e8, "hold": 60.0})
+    assert "99.9 %" in verdict(History(whole=whole))
+
+
+def test_a_recording_without_a_probe_says_so(tmp_path: Path) -> None:
+    config = re.sub(rb'\[\[channel\]\]\nname = "y_um"\n.*?(?=\[\[)', b"", CONFIG, flags=re.S)
+    service = Service(tmp_path / "rec", config=config)
+    for values in readings(90):
+        service.take({name: value for name, value in values.items() if name != "y_um"})
+    service.stop()
+    history = read_history(sorted((tmp_path / "rec").glob("*.mcap")))
+    shown = html.unescape(html_of(page_of(history)))
+    assert "Y was not measured" in shown and "nan" not in shown.lower().replace("nano", "")
+    assert f"it reached {history.whole.offset.peak:+.1f} µm".replace("-", "−") in shown
+
+
+def test_a_torn_and_a_damaged_file_are_shown_up_to_there(tmp_path: Path) -> None:
+    service = Service(tmp_path / "rec").run(90)
+    service.kill()
+    data = recordings(tmp_path / "rec", MACHINE)[0].read_bytes()
+    for name, changed, end in (("torn", data[: len(data) // 2], "no end"),
+                               ("damaged", data[: len(data) // 2] + b"\xff" * 4000, "damaged from byte")):  # fmt: skip
+        broken = tmp_path / f"{name}.mcap"
+        broken.write_bytes(changed)
+        history = read_history([broken])
+        assert 0 < history.whole.samples < 90
+        assert history.files[0].end.startswith(end)
+
+
+def test_the_command(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", str(folder), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["report"] == "rec-report.html" and (tmp_path / "rec-report.html").stat().st_size > 10_000
+    assert (found["machine"], found["samples"], found["minutes"]["hold"]) == (MACHINE, 1770, 90.0)
+    for arguments, expected in (
+        (["none.mcap"], "none.mcap: No such file"),
+        (["x.csv"], "x.csv: expected a recording"),
+        ([str(folder), "--out", "page.txt"], "--out page.txt: expected a name that ends in .html, .pdf or .png"),
+        ([str(folder), "--out", "none/page.html"], "--out none/page.html: no such folder"),
+        ([str(tmp_path / "empty")], "empty: neither recordings (*.mcap) nor pages"),
+    ):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        assert main(["report", *arguments]) == 2, arguments
+        assert expected in capsys.readouterr().err
+
+
+def test_recordings_of_two_machines_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.mcap"
+    # Eight letters for eight, so that every length stays what it is.
+    other.write_bytes(recordings(folder, MACHINE)[0].read_bytes().replace(b"vmc-07", b"vmc-08"))
+    assert main(["report", str(recordings(folder, MACHINE)[0]), str(other), "--out", str(tmp_path / "p.html")]) == 2
+    assert "recordings of vmc-07, vmc-08; expected those of one machine" in capsys.readouterr().err
+
+
+def test_a_folder_with_results_leads_to_its_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    inner = tmp_path / "demo out" / "calibration"
+    inner.mkdir(parents=True)
+    write_page(inner.parent / "report.html", Page(title="The <day>", verdict="It & works.", tone="warn"))
+    write_page(inner / "report.html", Page(title="Calibration", verdict="0.5 µm rms."))
+    (inner / "other.html").write_text("<h1>not ours</h1>")
+    assert main(["report", str(inner.parent), "--out", str(tmp_path / "all.html")]) == 0
+    assert "It & works." in capsys.readouterr().out
+    page = (tmp_path / "all.html").read_text(encoding="utf-8")
+    assert re.findall(r'<a href="([^"]*)"', page) == ["demo%20out/report.html", "demo%20out/calibration/report.html"]
+    assert '<p class="verdict warn"><b>⚠ mind</b>It &amp; works.</p>' in page and "not ours" not in page
+
+
+# ---------------------------------------------------------------------------- paper
+
+
+def letters(pdf: bytes) -> str:
+    """What is written on the sheets: the letters of every text operator, in the order in which they are drawn."""
+    found = []
+    for stream in re.findall(rb"stream\r?\n(.*?)endstream", pdf, re.S):
+        try:
+            content = zlib.decompress(stream)
+        except zlib.error:
+            continue
+        for shown in re.findall(rb"\[(.*?)\] TJ|\(((?:[^()\\]|\\.)*)\) Tj", content, re.S):
+            parts = re.findall(rb"\(((?:[^()\\]|\\.)*)\)", shown[0]) or [shown[1]]
+            found.append(b"".join(parts).decode("latin-1").replace("\0", "").replace("\\(", "(").replace("\\)", ")"))
+    return "\n".join(found)
+
+
+def test_a_pdf_has_sheets_and_words(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "page.pdf"
+    assert main(["report", str(folder), "--out", str(out)]) == 0
+    data = out.read_bytes()
+    assert data.startswith(b"%PDF-1.") and data.rstrip().endswith(b"%%EOF")
+    assert len(re.findall(rb"/Type /Page\b", data)) >= 3
+    words = letters(data)
+    for expected in ("Minutes by state", "operator_hold", "What the devices missed", "time, UTC", "vmc-07: 2026-01-05"):
+        assert expected in words
+
+
+def test_a_png_is_a_picture(folder: Path, tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    out = tmp_path / "page.png"
+    assert main(["report", str(folder), "--out", str(out)]) == 0
+    picture = imread(out)
+    assert picture.shape[1] > 1000 and picture.shape[0] > 500
+    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
+
+
+# ---------------------------------------------------------------------------- memory
+
+
+def test_a_year_is_as_small_as_a_day_and_keeps_every_peak() -> None:
+    rng, curve = np.random.default_rng(1), Envelope()
+    t = START_S + 60.0 * np.arange(525_600)
+    y = rng.normal(size=t.size)
+    y[300_000:310_000] = np.nan
+    peaks = rng.choice(t.size, 40, replace=False)
+    peaks = peaks[np.isfinite(y[peaks])]
+    y[peaks] = 50.0 * np.where(np.arange(peaks.size) % 2, 1.0, -1.0)
+    keep = np.ones(t.size, bool)
+    keep[400_000:403_000] = False
+    for part in np.array_split(np.flatnonzero(keep), 300):
+        curve.add(t[part], y[part])
+        assert sum(a.size for a in curve._t) <= 8 * COLUMNS + 5000
+    at, values = curve.points()
+    assert at.size < 6 * COLUMNS
+    kept = dict(zip(at.tolist(), values.tolist(), strict=True))
+    seen = [i for i in peaks if keep[i]]
+    assert all(kept[t[i]] == y[i] for i in seen)
+    assert np.isnan(values[(at > t[300_500]) & (at < t[309_500])]).all()
+    assert np.isnan(values[(at > t[400_000]) & (at < t[403_000])]).any()
+
+
+def test_points_out_of_order_make_the_same_curve() -> None:
+    t, y = 60.0 * np.arange(3000), np.sin(np.arange(3000.0))
+    one, other = Envelope(), Envelope()
+    one.add(t, y)
+    other.add(t[1500:], y[1500:])
+    other.add(t[:1500], y[:1500])
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one.points(), other.points(), strict=True))
+
+
+def test_a_state_that_flickers_for_a_year_takes_no_memory() -> None:
+    strip = Stretches()
+    for i in range(0, 200_000, 2):
+        strip.add(60.0 * i, 60.0 * (i + 1))
+        assert len(strip.pieces) <= 1001
+    assert strip.count == 100_000
+    assert strip.pieces[0][0] == 0.0 and strip.pieces[-1][1] == 60.0 * 199_999
