@@ -116,7 +116,7 @@ def test_files_in_tables_and_links_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     gone = [
         name for name in named_files(text)
-        if not any((page.parent / way).exists() for way in (name, f"{name}.py"))
+        if not name.startswith("/") and not any((page.parent / way).exists() for way in (name, f"{name}.py"))
     ]  # fmt: skip
     for target in re.findall(r"\]\(([^)\s]+)\)", CODE.sub("", text)):
         where, _, part = target.partition("#")
