@@ -84,9 +84,10 @@ def check_files(source: str, files: TlsFiles) -> Certificate | None:
         if not path.is_file():
             raise ConfigError(f"{source}: {name} = {str(path)!r}: no such file, expected a PEM file")
     mode = stat.S_IMODE(files.key.stat().st_mode)
-    if mode & 0o077:
+    if mode & 0o037:
         raise ConfigError(
-            f"{source}: {files.names[2]} = {str(files.key)!r}: mode {mode:04o}, expected 0600: others can read the key"
+            f"{source}: {files.names[2]} = {str(files.key)!r}: mode {mode:04o}, expected 0600, or 0640 where a group of "
+            f"the service's own reads it: others can use the key"
         )
     try:
         from cryptography import x509

@@ -1,0 +1,142 @@
+"""What `check` says of TLS files, open doors and serial ports."""
+
+from __future__ import annotations
+
+import datetime
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from compensator.certificates import check_files, remarks
+from compensator.cli import main
+from compensator.config import load_config
+from compensator.demo import configuration
+from compensator.service.session import tls_files
+from tests.security.shop import script
+
+LINES = {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 10001, "command": 10023}
+TLS = """connect = ["tls/127.0.0.1:7447"]
+tls_ca = "keys/ca.pem"
+tls_certificate = "keys/{stem}.pem"
+tls_key = "keys/{stem}.key"
+"""
+
+
+def written(folder: Path, zenoh: str = "", **lines: object) -> Path:
+    text = configuration("vmc-07", {**LINES, **lines}, 7447)
+    text = re.sub(r'listen = \["tcp/127.0.0.1:7447"\]\n', zenoh.replace("\\", "\\\\"), text)
+    path = folder / "machine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def secured(folder: Path, keys: Path, stem: str = "machine-vmc-07") -> Path:
+    shutil.copytree(keys, folder / "keys")
+    return written(folder, TLS.format(stem=stem))
+
+
+def refused(config: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(["check", "--config", str(config)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "machine.toml" in error
+    return error
+
+
+def test_good_files_pass_without_a_word(tmp_path: Path, keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "--config", str(secured(tmp_path, keys))]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = secured(tmp_path, keys)
+    key, ca = tmp_path / "keys/machine-vmc-07.key", tmp_path / "keys/ca.pem"
+    good = key.read_bytes()
+    for mode in (0o644, 0o660, 0o604):
+        key.chmod(mode)
+        assert f"mode {mode:04o}, expected 0600" in refused(config, capsys)
+    key.chmod(0o640)  # a service with a user and group of its own
+    assert main(["check", "--config", str(config)]) == 0
+    capsys.readouterr()
+    key.write_bytes((keys / "machine-vmc-08.key").read_bytes())
+    assert "not the key of" in refused(config, capsys)
+    key.write_bytes(b"nonsense")
+    assert "no PEM" in refused(config, capsys)
+    key.write_bytes(good)
+    ca.write_bytes((keys.parent / "other/ca.pem").read_bytes())
+    assert "not of the authority" in refused(config, capsys)
+    ca.unlink()
+    assert "zenoh.tls_ca" in refused(config, capsys)
+
+
+def test_an_expired_certificate_is_said_with_its_date(
+    tmp_path: Path, keys: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = secured(tmp_path, keys, "operator-old")
+    error = refused(config, capsys)
+    files = tls_files(load_config(config).config.zenoh)
+    assert files is not None
+    ended = check_files("test", files)
+    assert ended is not None and f"has expired on {ended.ends:%Y-%m-%d}" in error and "'old'" in error
+    assert "valid from" in str(ended.wrong_at(ended.begins - datetime.timedelta(days=1)))
+    assert ended.wrong_at(ended.begins + datetime.timedelta(hours=1)) is None
+    assert remarks(ended, ended.ends - datetime.timedelta(days=31)) == []
+    assert "in 12 day(s)" in remarks(ended, ended.ends - datetime.timedelta(days=12))[0]
+
+
+@pytest.mark.parametrize(
+    ("zenoh", "expected"),
+    [
+        (TLS.format(stem="a") + 'listen = ["tcp/127.0.0.1:7447"]\n', "connect alone"),
+        (TLS.format(stem="a").replace("tls/127", "tcp/127"), "expected tls/HOST:PORT"),
+        ('connect = ["tls/127.0.0.1:7447"]\n', "tls_ca, … beside it"),
+        ('connect = ["tls/127.0.0.1:7447"]\ntls_ca = "keys/ca.pem"\n', "zenoh.tls_certificate: missing"),
+        ('listen = ["tls/127.0.0.1:7447"]\n', "compensator router"),
+    ],
+)
+def test_what_would_not_be_secure_is_refused(
+    tmp_path: Path, zenoh: str, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert expected in refused(written(tmp_path, zenoh), capsys)
+
+
+def test_open_doors_and_numbered_ports_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = written(tmp_path, 'listen = ["tcp/0.0.0.0:7447"]\nconnect = ["tcp/router.shop:7447"]\n'
+                               "unproven_commands = true\n", rtu="/dev/ttyUSB0")  # fmt: skip
+    assert main(["check", "--config", str(config)]) == 0
+    said = capsys.readouterr().err
+    for words in ("zenoh.listen tcp/0.0.0.0:7447", "zenoh.connect tcp/router.shop:7447", "zenoh.unproven_commands",
+                  "port /dev/ttyUSB0 goes by the order of plugging in"):  # fmt: skip
+        assert words in said, words
+    assert said.count("\n") == 4
+    written(tmp_path, 'listen = ["tcp/[::1]:7447", "tcp/127.0.0.1:7447"]\n', rtu="/dev/serial/by-id/usb-x-port0")
+    assert main(["check", "--config", str(config)]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_commands_of_nobody_are_taken_on_loopback_only(tmp_path: Path, keys: Path) -> None:
+    def taken(zenoh: str) -> bool:
+        return load_config(written(tmp_path, zenoh)).config.zenoh.takes_unproven()
+
+    assert taken("") and taken('listen = ["tcp/127.0.0.1:1"]\n') and taken('listen = ["unixsock-stream/run/z"]\n')
+    for other in ("tcp/0.0.0.0:1", "tcp/[::]:1", "tcp/10.0.0.7:1", "tcp/localhost.evil:1"):
+        assert not taken(f'listen = ["{other}"]\n')
+    assert not taken(TLS.format(stem="a"))
+    assert taken(TLS.format(stem="a") + "unproven_commands = true\n")
+
+
+def test_certificates_are_made_once_and_for_the_owner_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    first = script("certificates.py", str(folder), "--router", "localhost", "--operator", "anna")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert first.count("new") == 2 and folder.stat().st_mode & 0o777 == 0o700
+    assert {path.stat().st_mode & 0o777 for path in folder.glob("*.key")} == {0o600}
+    again = script("certificates.py", str(folder), "--router", "localhost", "--operator", "anna", "--machine", "m1")
+    assert again.count("new") == 1
+    assert all((folder / name).read_bytes() == data for name, data in before.items())
+    # One name in two roles would have the rights of both.
+    assert "both machine and operator" in script("certificates.py", str(folder), "--machine", "anna", code=1)
+    script("certificates.py", str(folder), "--operator", "anna", "--renew", "--renew-below", "9999")
+    assert (folder / "operator-anna.pem").read_bytes() != before["operator-anna.pem"]
+    assert (folder / "router.pem").read_bytes() == before["router.pem"]

@@ -1,0 +1,124 @@
+"""`compensator router` as its users call it, and the shipped files."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from compensator.cli import main
+from compensator.commands.router import checked
+from compensator.service.session import read_config_file
+from tests.security.shop import DEPLOY, Shop, script
+
+
+def test_the_router_serves_says_who_comes_and_ends_on_sigterm(shop: Shop, tmp_path: Path) -> None:
+    own = Shop(tmp_path, shop.keys)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "compensator", "router", "--config", str(own.router_file)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stderr is not None and process.stdout is not None
+        assert own.endpoint in process.stderr.readline()
+        with zenoh.open(own.config("receiver-cnc-07")):
+            line = process.stderr.readline()
+            assert "cnc-07" in line and "is connected" in line
+        assert "is gone" in process.stderr.readline()
+        refused = own.config("operator-old")
+        with pytest.raises(zenoh.ZError):
+            zenoh.open(refused)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=30) == 0
+        # Whoever is refused leaves nothing behind in the log.
+        assert process.stderr.read() == "compensator: router stopped\n" and process.stdout.read() == ""
+    finally:
+        process.kill()
+        process.wait()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def changed(shop: Shop, tmp_path: Path, change: Any) -> Path:
+    text = "".join(line for line in shop.router_file.read_text().splitlines(True) if not line.startswith("//"))
+    table = json.loads(text)
+    change(table)
+    path = tmp_path / "router.json5"
+    path.write_text(json.dumps(table), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda t: t.update(lissten={}), "lissten"),
+        (lambda t: t["access_control"].update(enabled=False), "access_control/enabled"),
+        (lambda t: t["access_control"].pop("enabled"), "access_control/enabled"),
+        (lambda t: t["access_control"].update(default_permission="allow"), "default_permission"),
+        (lambda t: t["transport"]["link"]["tls"].update(enable_mtls=False), "enable_mtls"),
+        (lambda t: t["listen"]["endpoints"].append("tcp/0.0.0.0:7447"), "tcp/0.0.0.0:7447"),
+        (lambda t: t["listen"].update(endpoints=[]), "listen/endpoints"),
+        (lambda t: t.update(plugins={"rest": {"http_port": 8000}}), "plugins"),
+        (lambda t: t.update(mode="client"), "expected router"),
+        (lambda t: t["transport"]["link"]["tls"].update(listen_private_key="nowhere.key"), "nowhere.key"),
+    ],
+)
+def test_what_would_not_do_what_it_looks_like_is_refused(
+    shop: Shop, tmp_path: Path, change: Any, expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = changed(shop, tmp_path, change)
+    assert main(["router", "--config", str(path), "--check"]) == 2
+    error = capsys.readouterr().err
+    assert expected in error and "router.json5" in error and error.count("\n") == 1 and ".rs:" not in error
+
+
+def test_a_rule_that_names_nothing_ends_the_router_in_one_line(
+    shop: Shop, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def change(table: dict[str, Any]) -> None:
+        table["access_control"]["policies"][0]["rules"] = ["nonsense"]
+
+    assert main(["router", "--config", str(changed(shop, tmp_path, change))]) == 1
+    error = capsys.readouterr().err
+    assert "nonsense" in error and error.count("\n") == 1
+
+
+def test_a_good_file_is_said_to_be_good(shop: Shop, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["router", "--config", str(shop.router_file), "--check", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["access_control"] is True
+    config = checked(shop.router_file, read_config_file(shop.router_file))
+    for name in ("multicast", "gossip"):
+        assert json.loads(config.get_json(f"scouting/{name}/enabled")) is False
+
+
+def test_the_shipped_router_is_made_of_the_shipped_list() -> None:
+    shipped = (DEPLOY / "router.json5").read_text(encoding="utf-8")
+    assert shipped == script("access_list.py", str(DEPLOY / "shop.toml"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('name = "cnc-07"', 'name = "anna"', "no name twice"),
+        ('prefix = "shop/vmc-07"', 'prefix = "shop/**"', "prefix"),
+        ('name = "anna"', 'name = "*"', "name '*'"),
+        ('machines = ["vmc-07"]', 'machines = ["vmc-70"]', "vmc-70"),
+        ('listen = ["tls/', 'listen = ["tcp/', "tls/HOST:PORT"),
+        ("[[operator]]", "[[operater]]", "operater"),
+    ],
+)
+def test_a_list_that_gives_other_rights_than_meant_is_refused(
+    tmp_path: Path, old: str, new: str, expected: str
+) -> None:
+    text = (DEPLOY / "shop.toml").read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "shop.toml"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    assert expected in script("access_list.py", str(path), code=1)

@@ -1,0 +1,113 @@
+"""Every command says in the recording who sent it, and the audit covers that."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from compensator.config import Zenoh
+from compensator.recording import read_messages, recordings
+from compensator.service.publisher import Publisher, Sender
+from compensator.service.session import session_config
+from tests.audit.made import MACHINE
+from tests.audit.tampering import Line, rewrite
+from tests.audit.test_replay import look, replayable
+from tests.security.shop import free_port
+
+ANNA = Sender("anna", "certificate")
+
+
+def events(folder: Path, kind: str) -> list[dict[str, Any]]:
+    found = [json.loads(r.data) for path in recordings(folder, MACHINE) for r in read_messages(path, ("event",))]
+    return [event for event in found if event["kind"] == kind]
+
+
+async def test_the_recording_says_who_commanded_whatever_the_payload_says(tmp_path: Path) -> None:
+    bench = replayable(tmp_path)
+    liar = b'{"mode": "warm", "by": "the boss", "by_proof": "certificate"}'
+    bench.at_sample[40] = lambda: bench.daemon.command("zero", liar, Sender("bert", "none"))
+    bench.at_sample[50] = lambda: bench.daemon.command("hold", b"", ANNA)
+    bench.at_sample[60] = lambda: bench.daemon.command("resume", b"")
+    await bench.run(70)
+    said = [(e["text"], e["data"]["by"], e["data"]["by_proof"]) for e in events(tmp_path / "rec", "command")]
+    assert said == [("zero", "bert", "none"), ("hold", "anna", "certificate"), ("resume", "unnamed", "none")]
+    found = look(tmp_path / "rec")
+    assert found.clean and found.samples == 70
+    # Another name in the place of hers is found.
+    changed = []
+
+    def rename(lines: list[Line]) -> list[Line]:
+        for i, line in enumerate(lines):
+            if line.topic == "event" and b'"by":"anna"' in line.data:
+                lines[i] = dataclasses.replace(line, data=line.data.replace(b'"anna"', b'"otto"'))
+                changed.append(i)
+        return lines
+
+    rewrite(recordings(tmp_path / "rec", MACHINE)[0], rename)
+    assert len(changed) == 1 and not look(tmp_path / "rec").clean
+
+
+async def test_without_proof_nothing_is_obeyed_where_the_network_is_more_than_this_computer(tmp_path: Path) -> None:
+    bench = replayable(tmp_path)
+    bench.daemon._commands._unproven = False
+    answers = []
+
+    def ask() -> None:
+        for sender in (Sender(), Sender("anna", "none"), ANNA):
+            answers.append(bench.daemon.command("hold", b"", sender))
+        answers.append(bench.daemon.command("hold", b"nonsense", ANNA))
+
+    bench.at_sample[40] = ask
+    outcomes = await bench.run(45)
+    assert [answer["ok"] for answer in answers] == [False, False, True, False]
+    assert "thermal/command/hold/<common name" in answers[0]["text"]
+    assert "operator_hold" in outcomes[-1].offset.reasons
+    assert [e["data"]["by"] for e in events(tmp_path / "rec", "command")] == ["anna"]
+    refused = [(e["data"]["by"], e["data"]["name"]) for e in events(tmp_path / "rec", "command_refused")]
+    assert refused == [("unnamed", "hold"), ("anna", "hold"), ("anna", "hold")]
+    assert look(tmp_path / "rec").clean
+
+
+async def test_a_flood_of_refused_commands_pushes_no_other_event_out(tmp_path: Path) -> None:
+    bench = replayable(tmp_path)
+    bench.at_sample[40] = lambda: [bench.daemon.command("hold", b"nonsense", ANNA) for _ in range(3000)]
+    await bench.run(42)
+    assert len(events(tmp_path / "rec", "command_refused")) == 10
+    assert len(events(tmp_path / "rec", "start")) == 1
+
+
+def test_the_name_stands_in_the_key_and_a_wide_question_is_no_command() -> None:
+    heard: list[tuple[str, Sender]] = []
+    port = free_port()
+    settings = Zenoh(prefix="shop/vmc-07", listen=[f"tcp/127.0.0.1:{port}"])
+
+    def hear(name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
+        heard.append((name, sender))
+        return {"ok": True, "text": name}
+
+    with Publisher(settings, hear) as service:
+        service.publish("offset", b"{}")
+        client = session_config(Zenoh(prefix="x", mode="client", connect=settings.listen))
+        with zenoh.open(client) as session:
+
+            def ask(key: str) -> list[str]:
+                return sorted(str(reply.ok.key_expr) for reply in session.get(key, timeout=10.0) if reply.ok)
+
+            # Whoever looks around gets the latest, and neither zeroes nor holds the machine.
+            for key in (
+                "**",
+                "shop/vmc-07/thermal/**",
+                "shop/*/thermal/command/*",
+                "shop/vmc-07/thermal/command/*/anna",
+            ):
+                assert not [one for one in ask(key) if "command" in one]
+            assert "shop/vmc-07/thermal/y/offset" in ask("**")
+            assert heard == []
+            hold = "shop/vmc-07/thermal/command/hold"
+            assert ask(hold) == [hold] and ask(f"{hold}/anna") == [f"{hold}/anna"]
+            assert ask(f"{hold}/anna/bert") == []
+    assert heard == [("hold", Sender()), ("hold", Sender("anna", "none"))]
