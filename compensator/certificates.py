@@ -86,8 +86,8 @@ def check_files(source: str, files: TlsFiles) -> Certificate | None:
     mode = stat.S_IMODE(files.key.stat().st_mode)
     if mode & 0o037:
         raise ConfigError(
-            f"{source}: {files.names[2]} = {str(files.key)!r}: mode {mode:04o}, expected 0600, or 0640 where a group of "
-            f"the service's own reads it: others can use the key"
+            f"{source}: {files.names[2]} = {str(files.key)!r}: mode {mode:04o}, expected 0600, or 0640 where a "
+            f"group of the service's own reads it: others can use the key"
         )
     try:
         from cryptography import x509
