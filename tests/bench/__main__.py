@@ -26,7 +26,7 @@ from compensator.model.engine import Engine
 from compensator.model.model_file import load_model
 from compensator.service.composition import run_service
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
-from tests.bench import audit, diagnosis, identification, machines, spindle
+from tests.bench import audit, diagnosis, faults, identification, machines, spindle
 
 PORT = 17461
 
@@ -180,6 +180,7 @@ def main() -> None:
     calibrations()
     diagnoses()
     audit.measurements()
+    faults.report()
 
 
 if __name__ == "__main__":

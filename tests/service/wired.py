@@ -30,12 +30,21 @@ from compensator.service.publisher import Publisher, session_config
 from compensator.service.recorder import Recorder
 from drivers.errors import DriverError
 from sim_hardware.physics import World
-from sim_hardware.wire import CapaNcdt, DconLine, DconSettings, IcpDas, ModbusRtuLine, ModbusTcpServer, Rack
+from sim_hardware.wire import (
+    CapaNcdt,
+    DconLine,
+    DconSettings,
+    IcpDas,
+    ModbusRtuLine,
+    ModbusTcpServer,
+    Rack,
+    Register,
+    RegisterMap,
+)
 from sim_hardware.wire.faults import Faults
 from tests.service.simulated import START_NS, TABLE, config
 
-#: Reply times on a busy machine are no fault.
-TIMEOUT_S = 0.5
+TIMEOUT_S = 0.25
 PATIENCE_S = 60.0
 KINDS: dict[str, type] = {"offset": Offset, "sample": Sample, "event": Event}
 KEYS = {"offset": "thermal/y/offset", "sample": "thermal/sample", "event": "thermal/event"}
@@ -78,7 +87,7 @@ class WiredMachine:
     """One machine on its wires.
 
     Layouts: `apart` has T_Q on a serial Modbus line, AT on Modbus TCP; `one line` has both on one serial line, `dcon`
-    on one DCON line with checksums. Y is always on a capaNCDT controller.
+    on one DCON line with checksums, `map` both in the registers of one device. Y is always on a capaNCDT controller.
     """
 
     def __init__(
@@ -95,6 +104,8 @@ class WiredMachine:
         self.devices: list[dict[str, Any]] = []
         #: Faults that act on the device of a channel, and the number of its input.
         self.faults: dict[str, tuple[Faults, int]] = {}
+        #: Device and input of each channel.
+        self._inputs = {"t_q_degc": ("couples", 0), "at_degc": ("cabinet", 0), "y_um": ("probe", 0)}
         self._build(rack)
         self.fleet = drivers.build(self.lines, self.devices, source="test")
         self.config = self._config(changes)
@@ -139,6 +150,22 @@ class WiredMachine:
                 {"name": name, "line": "a", "model": "icpdas-m7018r", "address": i, "format": "hex", **couple}
                 for i, name in ((1, "couples"), (2, "cabinet"))
             ]
+        elif self.layout == "map":
+            plc = RegisterMap({
+                0: Register(source=self.read("t_q_degc"), kind="float32"),
+                2: Register(source=self.read("at_degc"), per_unit=100.0),
+            })  # fmt: skip
+            tcp = rack.add(ModbusTcpServer({1: plc}))
+            self.lines.append({"name": "b", "protocol": "modbus-tcp", "tcp_port": tcp.port, **host})
+            number = {"unit": "degc", "type": "int16"}
+            self.devices.append({
+                "name": "couples", "line": "b", "model": "modbus-map", "address": 1, "max_gap": 2, "inputs": [
+                    {"input": 0, "unit": "degc", "type": "float32", "address": 0},
+                    {"input": 1, **number, "address": 2, "scale": 0.01, "bad_values": {"32767": "stale"}},
+                ],
+            })  # fmt: skip
+            self._inputs["at_degc"] = "couples", 1
+            self.faults = {"t_q_degc": (plc.faults, 0), "at_degc": (plc.faults, 2)}
         else:
             at = IcpDas("m-7018r", couples="K", sources={0: self.read("at_degc")})
             settings = dict.fromkeys((1, 2), DconSettings(checksum=True))
@@ -148,18 +175,20 @@ class WiredMachine:
                 {"name": name, "line": "a", "model": "dcon", "address": i, "checksum": True, **couple}
                 for i, name in ((1, "couples"), (2, "cabinet"))
             ]
+        if self.layout != "map":
+            self.faults = {"t_q_degc": (t_q.faults, 0), "at_degc": (at.faults, 0)}
         self.capa = rack.add(CapaNcdt({1: lambda: 250.0 + self.sources["y_um"]()}, 500.0))
         self.lines.append({"name": "c", "protocol": "capancdt", "data_port": self.capa.data_port,
                            "command_port": self.capa.command_port, **host})  # fmt: skip
         self.devices.append({"name": "probe", "line": "c", "model": "capancdt-6200", "inputs": [{"input": 0}]})
-        self.faults = {"t_q_degc": (t_q.faults, 0), "at_degc": (at.faults, 0), "y_um": (self.capa.faults, 1)}
+        self.faults["y_um"] = self.capa.faults, 1
 
     def _config(self, changes: Mapping[str, Any]) -> Config:
-        names = ("couples", "cabinet", "probe")
+        names = [device["name"] for device in self.devices]
         limits: tuple[dict[str, Any], ...] = ({}, {}, {"range": [10.0, 490.0]})
         channels = [
-            {**channel, "device": device, "input": 0, "stuck_after_min": 30.0, **more}
-            for channel, device, more in zip(TABLE["channel"][:3], names, limits, strict=True)
+            {**channel, "device": device, "input": number, "stuck_after_min": 30.0, **more}
+            for channel, (device, number), more in zip(TABLE["channel"][:3], self._inputs.values(), limits, strict=True)
         ]
         table = {
             "machine": {"name": self.name}, "sampling": {"poll_interval_s": 60.0},
@@ -171,12 +200,11 @@ class WiredMachine:
         self.world.advance_to(t_s)
         self.capa.push(1)
         # A device that is asked again after a few seconds is back long before the minute is over.
-        by_channel = dict(zip(("t_q_degc", "at_degc", "y_um"), ("couples", "cabinet", "probe"), strict=True))
         for channel in sorted(self.waits_for):
             async with asyncio.timeout(PATIENCE_S):
                 while True:
                     with contextlib.suppress(DriverError):
-                        await self.fleet.devices[by_channel[channel]].read()
+                        await self.fleet.devices[self._inputs[channel][0]].read()
                         break
                     await asyncio.sleep(0.02)
                     self.capa.push(1)
