@@ -241,7 +241,7 @@ class Follower:
             self._check_age(message, age_s)
         if message.y_offset_um is not None and abs(message.y_offset_um) > self.limits.offset_max_um:
             detail = f"{message.y_offset_um:.2f} µm, expected at most {self.limits.offset_max_um:g}"
-            raise Rejected(Reason("out_of_range", detail))
+            raise Rejected(Reason("beyond_limit", detail))
         return True
 
     def _check_age(self, message: OffsetMessage, age_s: float) -> None:
@@ -303,14 +303,14 @@ class Follower:
         if self._mode == "fade":
             return "fading", 0.0, reasons
         if self._mode == "hold":
-            return "holding", None, [Reason("operator_hold"), *reasons]
+            return "holding", None, [Reason("held_here"), *reasons]
         held = self._held
         if held is None:
             return "starting", None, [Reason("no_message"), *reasons]
         message, age_s = held.message, now_s - held.measured_s
         codes = ", ".join(message.reasons)
         if age_s > held.valid_s:
-            return "holding", None, [Reason("stale", f"{age_s:.0f} s old, valid for {held.valid_s:g} s"), *reasons]
+            return "holding", None, [Reason("expired", f"{age_s:.0f} s old, valid for {held.valid_s:g} s"), *reasons]
         if not message.usable or message.y_offset_um is None:
             return "holding", None, [Reason(f"service_{message.state}", codes), *reasons]
         if message.state == "degraded":
@@ -320,7 +320,7 @@ class Follower:
         largest = self.limits.offset_max_um
         if abs(target_um) > largest:
             target_um = math.copysign(largest, target_um)
-            reasons.append(Reason("offset_limited", f"{largest:g} µm"))
+            reasons.append(Reason("limit_reached", f"{largest:g} µm"))
         return "following", target_um, reasons
 
     # ------------------------------------------------------------------ over a restart

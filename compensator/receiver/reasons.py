@@ -11,7 +11,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "No usable offset has been received since the start; what was applied before stands.",
         "Check that service and router run, and that machine and prefix are the service's.",
     ),
-    "stale": (
+    "expired": (
         "The newest offset is older than its valid_for_s; the applied offset stands and no longer follows the machine.",
         "Look for the service, the router and the network.",
     ),
@@ -40,7 +40,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Find out who publishes below the prefix. Where the machine's service was set up anew and counts lower, stop "
         "the receiver and delete its state file.",
     ),
-    "out_of_range": (
+    "beyond_limit": (
         "An offset beyond the receiver's offset_max_um was dropped.",
         "Check sensors and model; the limits of service and receiver belong together.",
     ),
@@ -50,8 +50,8 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Set both clocks (NTP).",
     ),
     "catching_up": ("The offset is still under way at the permitted rate.", "Wait before the next precise cut."),
-    "offset_limited": ("The followed offset has reached offset_max_um.", "Check sensors and model."),
-    "operator_hold": ("Somebody has frozen the offset here.", "Allow it to follow again."),
+    "limit_reached": ("The followed offset has reached offset_max_um.", "Check sensors and model."),
+    "held_here": ("Somebody has frozen the offset here.", "Allow it to follow again."),
     "fading": ("Told to take the offset away, the receiver moves it to zero.", "Allow it to follow again when wanted."),
     "faded": ("Told to take the offset away, the receiver applies zero.", "Allow it to follow again when wanted."),
     "state_not_saved": (

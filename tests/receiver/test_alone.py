@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from compensator.reasons import WORDS as SERVICE_WORDS
 from compensator.receiver import WORDS, ReceiverError, load_settings
 
 ROOT = Path(__file__).parents[2]
@@ -95,3 +96,8 @@ def test_bad_settings_get_one_line(tmp_path: Path, old: str, new: str, expected:
         load_settings(path)
     text = str(caught.value)
     assert expected in text and str(path) in text and "\n" not in text
+
+
+def test_a_code_has_one_meaning() -> None:
+    """`compensator explain` knows the codes of service, devices and receiver."""
+    assert not set(WORDS) & set(SERVICE_WORDS)

@@ -58,7 +58,7 @@ def test_follows_the_rate_for_half_of_the_validity_then_stands_then_holds() -> N
     after = {round(t + 1 + i): a for i, a in enumerate(run(f, t, 200.0, step_s=1.0))}
     assert after[90].offset_um == pytest.approx(3.0 + 2.0 * 0.5)
     assert after[136].offset_um == pytest.approx(3.0 + 2.0 * 75.0 / 60.0) == after[209].offset_um
-    assert after[209].state == "following" and after[212].state == "holding" and codes(after[212]) == {"stale"}
+    assert after[209].state == "following" and after[212].state == "holding" and codes(after[212]) == {"expired"}
     assert after[212].offset_um == after[209].offset_um
     assert "150 s" in after[259].reasons[0].text
 
@@ -67,7 +67,7 @@ def test_what_is_followed_never_leaves_the_size_limit() -> None:
     f = follower(applied_um=49.0)
     f.advance(0.0, offset(1, 49.5, y_offset_rate_um_per_min=5.0))
     last = run(f, 0.0, 70.0)[-1]
-    assert last.offset_um == MAX_UM and codes(last) == {"offset_limited"}
+    assert last.offset_um == MAX_UM and codes(last) == {"limit_reached"}
 
 
 def test_a_message_that_claims_to_be_valid_for_ever_is_not() -> None:
@@ -133,7 +133,7 @@ def test_hold_freezes_and_follow_goes_on_from_there() -> None:
     moving = f.advance(t + 1.0).offset_um
     f.hold()
     held = run(f, t + 1.0, 50.0)
-    assert all(a.offset_um == moving and "operator_hold" in codes(a) for a in held)
+    assert all(a.offset_um == moving and "held_here" in codes(a) for a in held)
     f.follow()
     assert f.advance(t + 52.0).offset_um == pytest.approx(moving + 0.1)
 
@@ -187,8 +187,8 @@ BAD: list[tuple[bytes, str]] = [
     (offset(9, time_utc_ns=None), "malformed"),
     (offset(9, schema=2), "other_schema"),
     (offset(9, machine="vmc-08"), "other_machine"),
-    (offset(9, 50.01), "out_of_range"),
-    (offset(9, -1e300), "out_of_range"),
+    (offset(9, 50.01), "beyond_limit"),
+    (offset(9, -1e300), "beyond_limit"),
     (offset(2, 9.0), "replayed"),  # the newest number with another value
     (offset(1, 9.0), "replayed"),
 ]

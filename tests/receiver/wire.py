@@ -83,8 +83,8 @@ class ScriptedService:
         self.close()
 
 
-def until(condition: Callable[[], object], what: str, timeout_s: float = 40.0) -> None:
+def until(condition: Callable[[], object], what: str | Callable[[], str], timeout_s: float = 40.0) -> None:
     end = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < end, f"not within {timeout_s} s: {what}"
+        assert time.monotonic() < end, f"not within {timeout_s} s: {what if isinstance(what, str) else what()}"
         time.sleep(0.01)

@@ -1,0 +1,35 @@
+"""The offset at a real control: LinuxCNC without a screen, from the panel to the Y joint."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.linuxcnc.control import NAMESPACES, ROOT, why_not
+
+REASON = why_not()
+pytestmark = [pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(300)]
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A folder with a short path that LinuxCNC's other user may enter."""
+    folder = Path(tempfile.mkdtemp(prefix="lcnc-"))
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("name", ["scripted", "service", "refused"])
+def test_at_the_control(name: str, place: Path) -> None:
+    done = subprocess.run(
+        [*NAMESPACES, sys.executable, "-m", "tests.linuxcnc.scenario", name, str(place)],
+        cwd=ROOT, capture_output=True, text=True, timeout=280, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stdout.endswith("done\n"), done.stdout + done.stderr
