@@ -14,11 +14,16 @@ from dataclasses import dataclass
 SETTLE_S = 0.1
 #: How long a change of the counts may take to show in the request, and how many may get lost in a row.
 ANSWER_S, MISSES_MAX = 0.2, 3
+#: While nothing arrives, one count is tried this often.
+PAUSE_S = 1.0
 #: An offset that should move and does not is nudged after this, and again; the second time it counts as stuck.
 NUDGE_S = 3.0
 #: Longest time between two steps that counts for moving.
 STEP_MAX_S = 0.02
 _COUNTS_MAX = 2**31 - 1
+_UNLINKED = "axis.L.eoffset-counts does not follow this component: link it, and nothing else to it"
+_UNHEARD = "axis.L.eoffset-request does not follow the counts"
+_STUCK = "axis.L.eoffset stays while eoffset-request asks: is OFFSET_AV_RATIO above 0?"
 
 
 @dataclass(frozen=True)
@@ -101,17 +106,17 @@ class Reconciler:
             # Not linked yet, or by another writer. Whoever links this pin must find the value that is there: the
             # difference would be a jump of any size.
             self.counts, self._expected = view.counts, None
-            self._ready_since = None
-            self.trouble = "axis.L.eoffset-counts does not follow this component: link it, and nothing else to it"
+            self._pause_until = now_s + PAUSE_S
+            self.trouble = _UNLINKED
             return self.counts
         if not view.ready or view.scale_um <= 0.0:
             self._ready_since = self._expected = self._still_since = None
             self._misses = self._nudges = 0
-            self.trouble = "" if view.scale_um > 0.0 else "axis.L.eoffset-scale is not above 0"
+            if self.trouble != _UNLINKED:
+                self.trouble = "" if view.scale_um > 0.0 else "axis.L.eoffset-scale is not above 0"
             return self.counts
         if self._ready_since is None:
             self._ready_since = now_s
-            self.trouble = ""
         if now_s - self._ready_since >= SETTLE_S and not self._waits(now_s, view):
             self._correct(now_s, wanted_um, view)
         self._watch(now_s, view)
@@ -124,6 +129,8 @@ class Reconciler:
         request_um, until_s = self._expected
         if abs(view.request_um - request_um) < 0.5 * view.scale_um:
             self._expected, self._misses = None, 0
+            if self.trouble in (_UNLINKED, _UNHEARD):
+                self.trouble = ""
             return False
         if now_s < until_s:
             return True
@@ -138,14 +145,13 @@ class Reconciler:
         if delta == 0:
             return
         if self._misses >= MISSES_MAX:
+            self.trouble = _UNHEARD
+        if self.trouble in (_UNLINKED, _UNHEARD):
             # Nothing of what is written arrives. It must not pile up, or it all comes at once: a count a second.
-            self.trouble = "axis.L.eoffset-request does not follow the counts"
             if now_s < self._pause_until:
                 return
-            self._pause_until = now_s + 1.0
+            self._pause_until = now_s + PAUSE_S
             delta = 1 if delta > 0 else -1
-        elif self.trouble.startswith("axis.L.eoffset-request"):
-            self.trouble = ""
         self._change(now_s, delta, view)
 
     def _change(self, now_s: float, delta: int, view: AxisView) -> None:
@@ -169,7 +175,7 @@ class Reconciler:
             self._still_since = None
             if there:
                 self._nudges = 0
-                if self.trouble.startswith("axis.L.eoffset stays"):
+                if self.trouble == _STUCK:
                     self.trouble = ""
             return
         if self._still_since is None:
@@ -178,5 +184,5 @@ class Reconciler:
             self._still_since = now_s
             self._nudges += 1
             if self._nudges > 1:
-                self.trouble = "axis.L.eoffset stays while eoffset-request asks: is OFFSET_AV_RATIO above 0?"
+                self.trouble = _STUCK
             self._change(now_s, 1, view)

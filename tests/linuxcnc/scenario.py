@@ -276,16 +276,19 @@ def machine(folder: Path) -> Iterator[Path]:
     """A machine that warms up in real time, and its configuration with a sample a second."""
     duty = Duty.working_day(1, hours=2)
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
-    world.advance_to(600.0)
+    world.advance_to(1850.0)
     ended = threading.Event()
 
     def warm() -> None:
+        at_s = 1850.0
         while not ended.wait(0.1):
-            world.advance_to(world.time_s + 2.0)
+            at_s += 1.0
+            world.advance_to(at_s)
 
     with hardware(world) as (lines, _):
         quill = (Path(__file__).parents[2] / "compensator/model/quill.toml").read_text(encoding="utf-8")
-        fast = quill.replace("sample_period_s = 60.0", "sample_period_s = 1.0")
+        # A day in minutes: what warms up that fast takes more heat than the machine has.
+        fast = changed(quill, {"sample_period_s = 60.0": "sample_period_s = 1.0", "[-20.0, 120.0]": "[-9e3, 9e3]"})
         (folder / "fast.toml").write_text(fast, encoding="utf-8")
         text = configuration("vmc-07", lines, PORT, model="fast.toml")
         text = changed(text, {
@@ -336,7 +339,7 @@ def service(folder: Path) -> None:
                 lambda: f"{nominal_um} + {witness.wanted_um()} µm: joint at {control.um()}",
             )
 
-        until(lambda: witness.messages and abs(witness.messages[-1][1]["y_offset_um"] or 0.0) > 0.5, "an offset", 90.0)
+        until(lambda: witness.messages and abs(witness.messages[-1][1]["y_offset_um"] or 0.0) > 0.3, "an offset", 90.0)
         control.do("mdi", "G0 Y0")
         follows()
         in_motion(bench.program(lambda: None))
@@ -375,7 +378,6 @@ def refused(folder: Path) -> None:
     for number, (ini, toml, expected) in enumerate((
         ({"OFFSET_AV_RATIO = 0.01": ""}, ("", ""), "OFFSET_AV_RATIO = 0: expected above 0"),
         ({}, ("unit_um = 1000.0 ", "unit_um = 25400.0 "), "is another unit"),
-        ({}, ("slew_um_per_s", "slew"), "axis.slew: unknown key"),
     )):  # fmt: skip
         one = folder.parent / f"refused-{number}"
         try:
