@@ -217,7 +217,7 @@ def _reloaded(bench: Bench, service: ScriptedService) -> None:
     counts = control.get("axis.y.eoffset-counts")
     with control.watched() as periods:
         assert control.do("halcmd", "unload", "thermal-offset")[0] == 0
-        assert "thermal-offset" not in control.do("halcmd", "show", "comp")[1]
+        until(lambda: "thermal-offset" not in control.do("halcmd", "show", "comp")[1], "the component is gone")
         service.put(12, -8.0, heard=False)
         assert control.get("axis.y.eoffset-counts") == counts
         code, text = control.do("halcmd", *(word.format("thermal-offset") for word in load))
