@@ -92,9 +92,14 @@ class Installation:
         link = self.root / name
         return link.resolve() if link.is_symlink() and link.exists() else None
 
-    def build(self, wheel: Path, wheels: Path | None, *, dependencies: bool) -> Path:
+    def extras(self) -> list[str]:
+        """Return the extras that the version in use was installed with: an upgrade brings them along."""
+        current = self.link("current")
+        return (current / ".complete").read_text(encoding="utf-8").split() if current else []
+
+    def build(self, wheel: Path, wheels: Path | None, extras: Sequence[str], *, dependencies: bool) -> Path:
         """Make the virtual environment of a wheel; a whole one is left as it is, half of one is made anew."""
-        digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
+        digest = hashlib.sha256(wheel.read_bytes() + " ".join(extras).encode()).hexdigest()
         version = self.root / "versions" / f"{wheel.name.split('-')[1]}-{digest[:8]}"
         if (version / ".complete").exists():
             say(f"{version.name}: is there already")
@@ -104,11 +109,12 @@ class Installation:
         run([sys.executable, "-m", "venv", str(version)])
         pip = [str(version / "bin/python"), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
         offline = ["--no-index", "--find-links", str(wheels)] if wheels else []
-        run([*pip, *offline, *([] if dependencies else ["--no-deps"]), str(wheel)])
+        wanted = f"{wheel}[{','.join(extras)}]" if extras else str(wheel)
+        run([*pip, *offline, *([] if dependencies else ["--no-deps"]), wanted])
         for path in (version, version / "share/compensator"):
             if not path.is_dir():
                 raise InstallError(f"{wheel}: no {path.relative_to(version)} in it, expected a whole wheel")
-        (version / ".complete").write_text(digest + "\n", encoding="utf-8")
+        (version / ".complete").write_text(" ".join(extras) + "\n", encoding="utf-8")
         os.sync()
         return version
 
@@ -260,8 +266,8 @@ class System:
     def reload(self) -> None:
         """Have the system read its files again: user, folders, device names, units."""
         if self._touch:
-            run(["systemd-sysusers"])
-            run(["systemd-tmpfiles", "--create", "--prefix=/etc", "--prefix=/var/lib", "--prefix=/var/log"])
+            run(["systemd-sysusers", SYSTEM_FILES["systemd/compensator.sysusers.conf"]])
+            run(["systemd-tmpfiles", "--create", SYSTEM_FILES["systemd/compensator.tmpfiles.conf"]])
         if self._systemd:
             run(["systemctl", "daemon-reload"])
         if self._systemd and Path("/run/udev/control").exists():
@@ -335,7 +341,8 @@ def install(given: argparse.Namespace, installation: Installation, system: Syste
     if not wheel.is_file():
         raise InstallError(f"{wheel}: no such file, expected a wheel of {DISTRIBUTION}")
     system.check_python()
-    version = installation.build(wheel, given.wheels, dependencies=not given.no_deps)
+    extras = sorted({*installation.extras(), *given.extra})
+    version = installation.build(wheel.resolve(), given.wheels, extras, dependencies=not given.no_deps)
     installation.activate(version, system, journal_limits=given.journal_limits)
     installation.prune()
 
@@ -441,6 +448,7 @@ def _parser() -> argparse.ArgumentParser:
     one.set_defaults(command=install)
     one.add_argument("--wheel", type=Path, help="the program")
     one.add_argument("--wheels", type=Path, help="folder of wheels: the program and all that it needs; offline")
+    one.add_argument("--extra", action="append", default=[], help="sign or tls: with the package cryptography; stays")
     one.add_argument("--no-deps", action="store_true", help="what it needs is brought in otherwise")
     one.add_argument(
         "--journal-limits", action="store_true", help="limit this PC's journal to 1 GB and a year, on disk"
@@ -460,6 +468,7 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 1 failed."""
     given = _parser().parse_args(argv)
+    os.umask(0o022)  # root's own may be narrower, and then the service could not read its program
     installation, system = Installation(given.prefix, given.destdir), System(touch=not given.destdir)
     try:
         if not given.destdir and os.geteuid() != 0:

@@ -118,7 +118,7 @@ class Box:
             self.pid = int(found[0])
             return "running" in self.run("systemctl", "is-system-running", check=False)
 
-        wait(booted, 30.0)
+        wait(booted, 60.0)
         self.run("sh", "-c", "ip link set lo up || true")
 
     def __exit__(self, *_: object) -> None:
@@ -138,7 +138,7 @@ class Box:
         enter = ["nsenter", "--target", str(self.pid), "--all"]
         done = subprocess.run([*enter, *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                               env={"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", **(environment or {})}, check=False,
-                              timeout=100)  # fmt: skip
+                              timeout=300)  # fmt: skip
         if check and done.returncode != 0:
             raise AssertionError(f"{' '.join(command)}: exit {done.returncode}\n{done.stdout}")
         return done.stdout
@@ -160,7 +160,7 @@ def try_to(action: Callable[[], object]) -> bool:
     return True
 
 
-def wait(done: Callable[[], bool], timeout_s: float = 15.0, explain: Callable[[], str] = str) -> None:
+def wait(done: Callable[[], bool], timeout_s: float = 200.0, explain: Callable[[], str] = str) -> None:
     """Look again and again until it is so."""
     end = time.monotonic() + timeout_s
     while not done():

@@ -18,7 +18,7 @@ from tests.deploy.test_install import load
 TEXT = GUIDE.read_text(encoding="utf-8")
 LINES = commands(TEXT)
 #: Guides that are still being written.
-PENDING = {"zenoh/README.md", "linuxcnc/README.md"}
+PENDING = {"linuxcnc/README.md"}
 OF_OTHERS = {"systemctl", "journalctl", "rsync", "sh"}
 
 

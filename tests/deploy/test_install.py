@@ -44,9 +44,9 @@ def test_the_wheel_holds_all_that_is_used_and_nothing_else(wheel: Path) -> None:
     shipped = {name.removeprefix(data) for name in names if name.startswith(data)}
     inside = {name for name in names if not name.startswith(data) and ".dist-info/" not in name}
     assert inside == here
-    assert {path.name for path in (ROOT / "deploy/systemd").iterdir()} == {
-        name.removeprefix("systemd/") for name in shipped if name.startswith("systemd/")
-    }
+    for folder in ("systemd", "zenoh", "receiver"):
+        there = {path.name for path in (ROOT / "deploy" / folder).iterdir() if path.is_file()}
+        assert {f"{folder}/{name}" for name in there} == {name for name in shipped if name.startswith(f"{folder}/")}
     assert {"install.py", "README.md", "machine.example.toml"} <= shipped
     assert not [name for name in shipped if "__pycache__" in name or name.endswith(".pyc")]
     # What the installer puts into the system comes out of the wheel.
@@ -156,6 +156,46 @@ def test_an_upgrade_keeps_the_version_before_and_back_returns_to_it(pc: Pc) -> N
     install.back(argparse.Namespace(), pc.installation, pc.system)
     assert pc.installation.link("current") == old and pc.installation.link("previous") == new
     assert (pc / UNIT).read_text().endswith("# 1\n")
+
+
+def test_an_upgrade_brings_the_extras_along(pc: Pc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def pretended(command: list[str]) -> str:
+        if command[1:3] == ["-m", "venv"]:
+            (Path(command[3]) / "share/compensator").mkdir(parents=True)
+        else:
+            asked.append(command[-1])
+        return ""
+
+    monkeypatch.setattr(install, "run", pretended)
+    wheel = tmp_path / "quill_compensator-1.2.3-py3-none-any.whl"
+    wheel.write_bytes(b"one")
+    version = pc.installation.build(wheel, None, ["sign", "tls"], dependencies=True)
+    assert asked == [f"{wheel}[sign,tls]"] and version.name.startswith("1.2.3-")
+    pc.installation.point("current", version)
+    assert pc.installation.extras() == ["sign", "tls"]
+    assert pc.installation.build(wheel, None, ["sign", "tls"], dependencies=True) == version and len(asked) == 1
+    assert pc.installation.build(wheel, None, [], dependencies=True) != version  # another set is another environment
+
+
+def test_half_a_version_is_made_anew(pc: Pc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    wheel = tmp_path / "quill_compensator-1.2.3-py3-none-any.whl"
+    wheel.write_bytes(b"one")
+    made: list[str] = []
+
+    def broken(command: list[str]) -> str:
+        if command[1:3] != ["-m", "venv"]:
+            raise install.InstallError("no space left on device")
+        made.append(command[3])
+        (Path(command[3]) / "share/compensator").mkdir(parents=True)
+        return ""
+
+    monkeypatch.setattr(install, "run", broken)
+    for _ in range(2):
+        with pytest.raises(install.InstallError, match="no space left"):
+            pc.installation.build(wheel, None, [], dependencies=True)
+    assert len(made) == 2 and pc.installation.link("current") is None
 
 
 def test_a_changed_unit_stays_and_the_new_one_lies_beside_it(pc: Pc, capsys: pytest.CaptureFixture[str]) -> None:
