@@ -75,6 +75,8 @@ COMMANDS = (
             arguments.order, "compensator.commands.order:resume"),
     Command("router", "a Zenoh router, where no zenohd is installed", "router --config router.json5",
             arguments.router, "compensator.commands.router:run"),
+    Command("watch", "live view of one machine or many", "watch --connect tcp/127.0.0.1:7447 --prefix shop",
+            arguments.watch, "compensator.commands.watch:run"),
     Command("export", "a recording as a table", "export day.mcap --out day.csv",
             arguments.export, "compensator.commands.export:run"),
     Command("explain", "a state or reason in words", "explain degraded",

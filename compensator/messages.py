@@ -182,6 +182,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     ----------
     devices : dict of str to str
         `ok` or the last error of each device.
+    effects : list of str
+        Names of the model's effects, in the order of `y_effects_um`.
     """
 
     schema: int
@@ -197,6 +199,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     started_utc_ns: int
     recording: str
     devices: dict[str, str]
+    effects: list[str] = []
 
 
 class ChainPart(msgspec.Struct, frozen=True, kw_only=True):

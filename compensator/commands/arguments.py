@@ -139,3 +139,24 @@ def router(parser: argparse.ArgumentParser) -> None:
     add("--check", action="store_true", help="look at the configuration, open nothing")
     words = "have Zenoh log to stdout as well; debug says who is refused what"
     add("--log", choices=("error", "warn", "info", "debug"), help=words)
+
+
+def watch(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `watch`."""
+    add = parser.add_argument
+    words = "listen where the service of this configuration is reached, and show its last day from its recordings"
+    add("--config", metavar="FILE", help=words)
+    words = "listen at this endpoint, such as tcp/127.0.0.1:7447; may be repeated, the first that answers is used"
+    add("--connect", action="append", default=[], metavar="ENDPOINT", help=words)
+    words = "Zenoh configuration with a receiver's or operator's certificate, such as receiver.json5; needed over TLS"
+    add("--zenoh", type=Path, metavar="FILE", help=words)
+    words = "watch this machine, or all below (default: that of the configuration, else everything)"
+    add("--prefix", help=words)
+    add("--once", action="store_true", help="look once and end; --json does so, too")
+    add("--wait", type=float, default=0.0, metavar="S", help="with --once: listen for so long as well, s (0)")
+    add("--page", action="store_true", help="serve a live page on 127.0.0.1 instead of drawing in the terminal")
+    add("--port", type=int, default=8710, help="port of the page (8710; 0 takes a free one)")
+    words = "record everything that arrives, of all machines, as MCAP in this folder"
+    add("--record", type=Path, metavar="FOLDER", help=words)
+    add("--foxglove", action="store_true", help="serve Foxglove on 127.0.0.1 (needs the extra foxglove)")
+    add("--foxglove-port", type=int, default=8765, metavar="PORT", help="port for Foxglove (8765)")

@@ -114,6 +114,11 @@ class EffectTable:
     kind: str
     table: Mapping[str, Any]
 
+    @property
+    def label(self) -> str:
+        """Name for people: its kind with the path and channel that it acts on."""
+        return " ".join(str(part) for part in (self.kind, self.table.get("path"), self.table.get("channel")) if part)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThermalModel:

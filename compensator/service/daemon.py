@@ -302,6 +302,7 @@ class Daemon:
             started_utc_ns=self._started_utc_ns,
             recording=self._journal.file,
             devices={name: state.error or "ok" for name, state in self._devices.items()},
+            effects=[effect.label for effect in model.effects],
         )  # fmt: skip
 
     # ------------------------------------------------------------------ events and commands

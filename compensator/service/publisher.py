@@ -104,7 +104,7 @@ class Publisher:
                 priority=zenoh.Priority.INTERACTIVE_HIGH if name == "offset" else zenoh.Priority.DATA,
                 express=name == "offset",
             )
-        for name in ("offset", "status"):
+        for name in ("offset", "status", "sample", "estimate"):
             self._declared.append(session.declare_queryable(self.key(name), self._answer_latest(name)))
         for name in COMMANDS:
             for key in (self.key(name), f"{self.key(name)}/*"):

@@ -26,7 +26,7 @@ KEYS = {
     "operator": {"name", "machines"},
 }
 #: What a receiver may ask for; anything else below a prefix comes by itself or is a command.
-ANSWERED = ("thermal/y/offset", "thermal/status")
+ANSWERED = ("thermal/y/offset", "thermal/status", "thermal/sample", "thermal/estimate")
 
 HEADER = """\
 // Configuration of the Zenoh router: compensator router --config router.json5, or zenohd --config router.json5.

@@ -1,0 +1,170 @@
+"""`compensator watch`: live view of one machine or many, in the terminal, as a page, for Foxglove, into a recording."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import re
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.live import Live
+
+from compensator.clock import SystemClock
+from compensator.commands import Answer
+from compensator.config import LoadedConfig, load_config
+from compensator.errors import UsageError
+from compensator.watch.listener import Listener, Sink, Source, of_endpoints, of_file, of_settings
+from compensator.watch.past import last_day
+from compensator.watch.shop import Shop, headline
+from compensator.watch.terminal import line, view
+
+log = logging.getLogger("compensator")
+
+#: How often a view is drawn anew, s: ages grow also while nothing arrives.
+REFRESH_S = 1.0
+
+
+def run(arguments: argparse.Namespace) -> Answer | None:
+    """Run the command until Ctrl-C or SIGTERM, or for one look.
+
+    Raises
+    ------
+    UsageError
+        If it is not said where to listen.
+    ServiceError
+        For one look, if nobody answers.
+    """
+    loaded = load_config(arguments.config) if arguments.config else None
+    source = _source(arguments, loaded)
+    shop = Shop(SystemClock())
+    if loaded is not None:
+        folder = loaded.resolve(loaded.config.recording.folder)
+        shop.past(loaded.config.zenoh.prefix, last_day(folder, loaded.config.machine.name, SystemClock().utc_ns()))
+    beside = arguments.page or arguments.record or arguments.foxglove
+    if arguments.once or (arguments.json and not beside):
+        return _once(arguments, source, shop)
+    with until_stopped() as stopped, ExitStack() as stack:
+        sinks: list[Sink] = [shop]
+        recorder = None
+        watch = _Watch(shop, source, stopped)
+        if arguments.record:
+            from compensator.watch.shop_recorder import ShopRecorder
+
+            recorder = ShopRecorder(arguments.record, source.prefix, SystemClock())
+            sinks.append(recorder)
+            stack.enter_context(recorder)
+        if arguments.foxglove:
+            from compensator.watch.foxglove import FoxgloveServer
+
+            sinks.append(stack.enter_context(FoxgloveServer(source.prefix, arguments.foxglove_port)))
+        if arguments.page:
+            from compensator.watch.server import PageServer
+
+            server = stack.enter_context(PageServer(shop, watch.status, arguments.port))
+            log.info("compensator: live page at %s (Ctrl-C ends it)", server.address)
+        listener = stack.enter_context(Listener(source, *sinks, on_connection=watch.connection))
+        listener.start()
+        watch.show(terminal=sys.stdout.isatty() and not beside, lines=not beside)
+    return Answer(*recorder.answer()) if recorder is not None else None
+
+
+def _source(arguments: argparse.Namespace, loaded: LoadedConfig | None) -> Source:
+    """Return where to listen, and below which prefix."""
+    prefix = arguments.prefix
+    if prefix is not None and not re.fullmatch(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*", prefix):
+        raise UsageError(f"--prefix {prefix!r}: expected words between single slashes, such as shop/vmc-07")
+    if arguments.connect and arguments.zenoh:
+        raise UsageError("--connect: stands beside --zenoh, whose file has the endpoints; expected one of them")
+    if prefix is None:
+        prefix = loaded.config.zenoh.prefix if loaded is not None else ""
+    if arguments.zenoh:
+        return of_file(arguments.zenoh, prefix)
+    if arguments.connect:
+        return of_endpoints(prefix, arguments.connect)
+    if loaded is None:
+        words = "watch: expected --config FILE, --zenoh FILE or --connect ENDPOINT, such as tcp/127.0.0.1:7447"
+        raise UsageError(words)
+    return of_settings(msgspec.structs.replace(loaded.config.zenoh, prefix=prefix))
+
+
+def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
+    """Look once: ask for the latest, and listen for a while where that is wanted."""
+    with Listener(source, shop) as listener:
+        listener.open()
+        listener.look()
+        if arguments.wait:
+            with until_stopped() as stopped:
+                stopped.wait(arguments.wait)
+        console = Console(file=sys.stdout)
+        with console.capture() as captured:
+            console.print(view(shop, prefix=source.prefix, where=source.where, connected=True, console=console))
+    machines = shop.overview()
+    result = {"machines": machines, "headline": headline(machines), "ignored": shop.ignored}
+    return Answer(result, captured.get().rstrip("\n"), 0 if machines else 1)
+
+
+@contextmanager
+def until_stopped() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C and SIGTERM set."""
+    stopped = threading.Event()
+    before = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stopped
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _Watch:
+    """What is going on, shown until it is stopped."""
+
+    def __init__(self, shop: Shop, source: Source, stopped: threading.Event) -> None:
+        self._shop, self._source, self._stopped = shop, source, stopped
+        self._connected = False
+
+    def connection(self, connected: bool) -> None:
+        """Hear that the connection came or went."""
+        if connected != self._connected:
+            log.info("compensator: %s %s", "connected to" if connected else "no connection to", self._source.where)
+        self._connected = connected
+        if not connected:
+            self._shop.unknown_alive()
+
+    def status(self) -> dict[str, Any]:
+        """Return how the watch itself is."""
+        return {"connected": self._connected, "where": self._source.where, "prefix": self._source.prefix,
+                "ignored": self._shop.ignored}  # fmt: skip
+
+    def show(self, *, terminal: bool, lines: bool) -> None:
+        """Draw on the terminal, or write a line for each change, until it is stopped."""
+        if terminal:
+            return self._draw()
+        said: dict[str, tuple[Any, ...]] = {}
+        while True:
+            for machine in self._shop.overview() if lines else ():
+                now = (machine["shown"], machine["seq"], machine["alive"], machine["malformed"])
+                if said.get(machine["prefix"]) != now and (machine["seq"] is not None or machine["malformed"]):
+                    said[machine["prefix"]] = now
+                    sys.stdout.write(line(machine) + "\n")
+                    sys.stdout.flush()
+            if self._stopped.wait(REFRESH_S / 2.0):
+                return None
+
+    def _draw(self) -> None:
+        console = Console()
+        # The log would tear the picture; what it says of the connection stands in the view.
+        log.setLevel(logging.WARNING)
+        with Live(console=console, screen=True, auto_refresh=False) as live:
+            while True:
+                live.update(
+                    view(self._shop, prefix=self._source.prefix, where=self._source.where, connected=self._connected,
+                         console=console), refresh=True)  # fmt: skip
+                if self._stopped.wait(REFRESH_S):
+                    return

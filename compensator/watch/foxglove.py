@@ -1,0 +1,135 @@
+"""A live connection for the Foxglove application: what is heard goes on over its WebSocket protocol.
+
+Needs the extra `foxglove`. The topics of the watched machine are those of its recordings (`/sample`, `/estimate`,
+`/offset`, `/event`), so that one layout opens both; those of machines below the prefix have their name before them.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from compensator.errors import ServiceError
+from compensator.messages import shipped_schema
+from compensator.watch.machine import KINDS, Malformed, decoded
+
+#: The only address that is bound.
+HOST = "127.0.0.1"
+#: Events that a viewer gets when it joins.
+EVENTS = 20
+
+
+def topic_of(key: str, prefix: str) -> tuple[str, str] | None:
+    """Return topic and kind for a key, None where it is none of ours.
+
+    Examples
+    --------
+    >>> topic_of("shop/vmc-07/thermal/y/offset", "shop/vmc-07"), topic_of("shop/vmc-07/thermal/sample", "shop")
+    (('/offset', 'offset'), ('/vmc-07/sample', 'sample'))
+    """
+    before, _, rest = key.rpartition("/thermal/")
+    kind = KINDS.get(rest)
+    if kind is None:
+        return None
+    below = before if not prefix else before.removeprefix(prefix).strip("/")
+    return (f"/{below}/{kind}" if below else f"/{kind}"), kind
+
+
+class FoxgloveServer:
+    """Serves viewers on loopback. Use it as a context manager.
+
+    Parameters
+    ----------
+    prefix : str
+        What is watched.
+    port : int
+        0 takes a free one.
+
+    Raises
+    ------
+    ServiceError
+        If the extra is not installed, or the port is taken.
+    """
+
+    def __init__(self, prefix: str, port: int) -> None:
+        try:
+            import foxglove
+        except ImportError as error:
+            raise ServiceError("--foxglove: needs the extra: pip install quill-compensator[foxglove]") from error
+        self._foxglove: Any = foxglove
+        self._prefix, self._port = prefix, port
+        self._context: Any = foxglove.Context()
+        self._lock = threading.Lock()
+        self._channels: dict[str, Any] = {}
+        #: What a viewer that joins gets at once, by topic: the latest message, the last events.
+        self._latest: dict[str, list[tuple[bytes, int]]] = {}
+        self._server: Any = None
+
+    @property
+    def port(self) -> int:
+        """Port that is served."""
+        return int(self._server.port) if self._server is not None else self._port
+
+    def __enter__(self) -> FoxgloveServer:
+        try:
+            self._server = self._foxglove.start_server(
+                name="thermal compensation", host=HOST, port=self._port, context=self._context,
+                server_listener=_Listener(self._join),
+            )  # fmt: skip
+        except (RuntimeError, OSError, OverflowError) as error:
+            raise ServiceError(f"--foxglove-port {self._port}: {error}; 0 takes a free one") from error
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        server, self._server = self._server, None
+        if server is not None:
+            server.stop()
+
+    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+        """Pass a message on, at its own time; what is malformed is left out."""
+        found = topic_of(key, self._prefix)
+        if found is None:
+            return
+        topic, kind = found
+        try:
+            message = decoded(kind, payload)
+        except Malformed:
+            return
+        with self._lock:
+            kept = self._latest.setdefault(topic, [])
+            if asked and kept:
+                return
+            kept.append((payload, message.time_utc_ns))
+            del kept[: -(EVENTS if kind == "event" else 1)]
+            channel = self._channels.get(topic)
+            if channel is None:
+                schema = json.loads(shipped_schema(kind))
+                channel = self._channels[topic] = self._foxglove.Channel(topic, schema=schema, context=self._context)
+        channel.log(payload, log_time=message.time_utc_ns)
+
+    def alive(self, key: str, alive: bool) -> None:
+        """Leave it out: a recording has none either."""
+
+    def _join(self, topic: str) -> None:
+        """Give a viewer that joins what is known, so that it need not wait for the next sample.
+
+        The library does not say how to reach this one alone: others get the same message with the same time again.
+        """
+        with self._lock:
+            known, channel = list(self._latest.get(topic, ())), self._channels.get(topic)
+        if channel is not None:
+            for payload, time_ns in known:
+                channel.log(payload, log_time=time_ns)
+
+
+class _Listener:
+    """What the server calls; everything that a viewer could send is refused by offering no capability for it."""
+
+    def __init__(self, join: Callable[[str], None]) -> None:
+        self._join = join
+
+    def on_subscribe(self, client: Any, channel: Any) -> None:
+        """Hear that a viewer has opened a topic."""
+        self._join(str(channel.topic))

@@ -1,0 +1,251 @@
+"""Hears everything below a prefix over Zenoh, and asks once for the latest; never sends anything else.
+
+Commands are queries, too: a question to `thermal/**` would zero and hold every machine of the shop. So only the keys
+that are named here are ever asked.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import msgspec
+import zenoh
+
+from compensator.config import Zenoh
+from compensator.errors import ServiceError, UsageError
+from compensator.service.asking import operator_of_file
+from compensator.service.session import get, in_words, put, session_config
+
+#: Seconds between two attempts where nobody is there to connect to.
+RETRY_S = 1.0
+#: Longest wait for the answers to the first question, s.
+ANSWER_S = 3.0
+
+
+class Sink(Protocol):
+    """Where goes what is heard; called on Zenoh's threads."""
+
+    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+        """Take a message, or the answer to a question."""
+
+    def alive(self, key: str, alive: bool) -> None:
+        """Take that a liveliness token came or went."""
+
+
+class Source(NamedTuple):
+    """Where to listen.
+
+    Parameters
+    ----------
+    prefix : str
+        Below which; empty for everything.
+    where : str
+        Endpoints, for people.
+    config : callable
+        Returns the configuration of a Zenoh client.
+    """
+
+    prefix: str
+    where: str
+    config: Callable[[], zenoh.Config]
+
+
+#: What is asked: services answer these with the latest.
+ASKED = ("y/offset", "status", "sample", "estimate")
+
+
+def endpoints_of(settings: Zenoh) -> list[str]:
+    """Return where the service of a configuration is reached: its routers first, then itself."""
+    listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
+    return [*settings.connect, *(endpoint for endpoint in listened if not endpoint.endswith(":0"))]
+
+
+def below(prefix: str, rest: str) -> str:
+    """Return the key expression for a key of the machine of a prefix and of all machines below it.
+
+    Examples
+    --------
+    >>> below("shop", "sample"), below("", "sample")
+    ('shop/**/thermal/sample', '**/thermal/sample')
+    """
+    return f"{prefix}/**/thermal/{rest}" if prefix else f"**/thermal/{rest}"
+
+
+class Listener:
+    """A Zenoh session that listens. Use it as a context manager: an open session would hang the exit.
+
+    Parameters
+    ----------
+    source : Source
+        Where to listen.
+    sinks : sequence of Sink
+        Get everything.
+    on_connection : callable
+        Called with whether there is a connection, whenever that changes.
+    """
+
+    def __init__(self, source: Source, *sinks: Sink, on_connection: Callable[[bool], None] = lambda _: None) -> None:
+        self._source = source
+        self._sinks = sinks
+        self._on_connection = on_connection
+        self._session: Any = None
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._wanted = threading.Event()
+
+    def open(self) -> None:
+        """Connect and listen.
+
+        Raises
+        ------
+        ServiceError
+            If nobody is there, or an endpoint cannot be used.
+        """
+        config = self._source.config()
+        put(config, "connect/timeout_ms", 0)
+        put(config, "connect/exit_on_failure", True)
+        try:
+            session = self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise ServiceError(f"zenoh: nobody answers at {self._source.where}: {in_words(error)}") from error
+        prefix = self._source.prefix
+        session.declare_subscriber(below(prefix, "**"), self._heard)
+        session.liveliness().declare_subscriber(below(prefix, "alive"), self._token, history=True)
+        session.info.declare_transport_events_listener(self._transport, history=False)
+        self._on_connection(True)
+
+    def look(self, *, tokens: bool = True) -> None:
+        """Ask everybody for the latest, and wait for the answers.
+
+        Parameters
+        ----------
+        tokens : bool
+            Whether to ask for liveliness tokens, too. Who listens on hears of them without asking, and an answer that
+            was overtaken by an end would bring the dead back.
+        """
+        session = self._session
+        if session is None:
+            return
+        prefix = self._source.prefix
+        keys = [below(prefix, rest) for rest in ASKED]
+        # A reader of one machine may be let through with its own keys alone.
+        keys += [f"{prefix}/thermal/{rest}" for rest in ASKED] if prefix else []
+        asked = [session.get(key, timeout=ANSWER_S) for key in keys]
+        alive = session.liveliness().get(below(prefix, "alive"), timeout=ANSWER_S) if tokens else ()
+        for answers in asked:
+            for answer in answers:
+                if answer.ok is not None:
+                    self._heard(answer.ok, asked=True)
+        for answer in alive:
+            if answer.ok is not None:
+                self._token(answer.ok)
+
+    def start(self) -> None:
+        """Connect in the background, again and again until somebody is there, and ask after each new connection."""
+        self._thread = threading.Thread(target=self._keep_connected, name="watch")
+        self._thread.start()
+
+    def close(self) -> None:
+        """End everything; may be called twice."""
+        self._stop.set()
+        self._wanted.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()
+
+    def __enter__(self) -> Listener:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------ on other threads
+
+    def _keep_connected(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self.open()
+                break
+            except ServiceError:
+                self._stop.wait(RETRY_S)
+        while not self._stop.is_set():
+            try:
+                self.look(tokens=False)
+            except zenoh.ZError:
+                self._on_connection(False)
+            self._wanted.wait()
+            self._wanted.clear()
+
+    def _transport(self, event: Any) -> None:
+        """Zenoh reconnects by itself; what was said meanwhile is asked for."""
+        came = event.kind == zenoh.SampleKind.PUT
+        self._on_connection(came)
+        if came:
+            self._wanted.set()
+
+    def _heard(self, sample: Any, asked: bool = False) -> None:
+        key = str(sample.key_expr)
+        if sample.kind != zenoh.SampleKind.PUT or key.endswith("/alive"):
+            return
+        payload = sample.payload.to_bytes()
+        for sink in self._sinks:
+            sink.take(key, payload, asked=asked)
+
+    def _token(self, sample: Any) -> None:
+        alive = sample.kind == zenoh.SampleKind.PUT
+        if alive:
+            # Its token is the last thing that a service declares: from now on it can be asked.
+            self._wanted.set()
+        for sink in self._sinks:
+            sink.alive(str(sample.key_expr), alive)
+
+
+def of_endpoints(prefix: str, endpoints: list[str]) -> Source:
+    """Listen at endpoints, without TLS files.
+
+    Raises
+    ------
+    UsageError
+        If one cannot be an endpoint.
+    """
+    for endpoint in endpoints:
+        if not re.fullmatch(r"(tcp|tls|quic|ws|unixsock-stream)/\S+", endpoint):
+            raise UsageError(f"--connect {endpoint!r}: expected an endpoint such as tcp/127.0.0.1:7447")
+    return of_settings(Zenoh(prefix=prefix, mode="client", connect=endpoints))
+
+
+def of_settings(settings: Zenoh) -> Source:
+    """Listen where the service of a configuration is reached from its own computer.
+
+    Raises
+    ------
+    UsageError
+        If it is reached nowhere, or over TLS: the machine's own certificate reads nothing.
+    """
+    if settings.secured():
+        raise UsageError("--zenoh: missing; over TLS a receiver's or operator's certificate is needed, expected a "
+                         "Zenoh configuration such as receiver.json5")  # fmt: skip
+    endpoints = endpoints_of(settings)
+    if not endpoints:
+        raise UsageError("zenoh: neither listen nor connect has an endpoint to reach the service at")
+    client = msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints)
+    return Source(settings.prefix, ", ".join(endpoints), lambda: session_config(client))
+
+
+def of_file(path: Path, prefix: str) -> Source:
+    """Listen with a receiver's or operator's Zenoh configuration.
+
+    Raises
+    ------
+    ConfigError
+        If it, or a file that it names, cannot be used.
+    """
+    endpoints = get(operator_of_file(path).config, "connect/endpoints")
+    return Source(prefix, ", ".join(endpoints), lambda: operator_of_file(path).config)

@@ -1,0 +1,42 @@
+"""The last day before the watch began, from the recordings of a machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from compensator.errors import DataError
+from compensator.messages import EstimateMessage, Event, Offset, Sample
+from compensator.recording import decode, read_messages, recordings
+from compensator.watch.history import SPAN_NS
+
+_TOPICS = ("sample", "estimate", "offset", "event")
+
+
+def last_day(folder: Path, machine: str, now_ns: int) -> Iterator[Sample | EstimateMessage | Offset | Event]:
+    """Yield what the recordings of a machine have of the last day; what cannot be read is left out.
+
+    The file that is being written is read as far as it goes.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Folder of the recordings.
+    machine : str
+        Name of the machine.
+    now_ns : int
+        Now, ns since 1970 UTC.
+    """
+    since_ns = now_ns - SPAN_NS
+    # A file is at most a day long, and finished after its last message: what ended before need not be read.
+    for path in recordings(folder, machine):
+        try:
+            if path.stat().st_mtime_ns < since_ns:
+                continue
+            for record in read_messages(path, _TOPICS):
+                if record.log_time_ns >= since_ns:
+                    message = decode(record, path)
+                    assert isinstance(message, (Sample, EstimateMessage, Offset, Event))
+                    yield message
+        except (DataError, OSError):
+            continue

@@ -1,0 +1,356 @@
+"""Records everything that a shop publishes to MCAP: every message as it came, with its key and when it arrived.
+
+A copy to look at and to compare machines with. The evidence are the recordings of each service: they have the sample
+before its offset went out, and a hash chain. Here a message is on disk within `SYNC_S` of its arrival, a kill loses no
+more than that, and what never arrived is counted from the numbers of the messages.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import threading
+from collections import deque
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcap.writer import CompressionType, Writer
+
+from compensator import __version__
+from compensator.clock import NS, Clock
+from compensator.messages import MESSAGES, shipped_schema
+from compensator.watch.machine import KINDS, Malformed, decoded
+from compensator.watch.sequence import Sequence
+from compensator.watch.shop_file import compact
+
+log = logging.getLogger("compensator")
+
+#: Longest time between the arrival of a message and its being on disk, s.
+SYNC_S = 2.0
+#: Messages that wait for the disk at most; the oldest go first, and are counted.
+WAITING = 200_000
+#: Channels in one file at most: a program that makes up keys fills no memory.
+CHANNELS = 20_000
+#: Topic of what is no message of the contract, before its key.
+OTHER = "other/"
+
+
+class _Arrival(NamedTuple):
+    """What came, where and when."""
+
+    time_ns: int
+    key: str
+    payload: bytes
+
+
+class ShopRecorder:
+    """Recorder of a shop. Use it as a context manager; on the way out everything is on disk and compact.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Made when it is not there.
+    prefix : str
+        What is recorded, for the metadata.
+    clock : Clock
+        Handed in.
+    """
+
+    def __init__(self, folder: Path, prefix: str, clock: Clock) -> None:
+        self._folder, self._prefix, self._clock = folder, prefix, clock
+        self._lock = threading.Lock()
+        self._waiting: deque[_Arrival] = deque()
+        self._wake, self._ended = threading.Event(), False
+        self._thread: threading.Thread | None = None
+        self._finishers: list[threading.Thread] = []
+        self._file: _File | None = None
+        self._day, self._failed = "", False
+        self._numbers: dict[tuple[str, str], Sequence] = {}
+        self.files: list[Path] = []
+        self.messages = 0
+        #: Messages that arrived and are in no file: the disk did not take them for too long.
+        self.not_recorded = 0
+
+    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+        """Take a message, from any thread; the answer to a question was published before and is none."""
+        if asked:
+            return
+        with self._lock:
+            self._waiting.append(_Arrival(self._clock.utc_ns(), key, payload))
+            if len(self._waiting) > WAITING:
+                self._waiting.popleft()
+                self.not_recorded += 1
+
+    def alive(self, key: str, alive: bool) -> None:
+        """Record that a liveliness token came or went, as JSON of its own under its key."""
+        self.take(key, b'{"alive": true}' if alive else b'{"alive": false}')
+
+    def __enter__(self) -> ShopRecorder:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._finish_later(sorted(self._folder.glob("shop_*.mcap")))
+        self._thread = threading.Thread(target=self._work, name="shop recorder")
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended = True
+        self._wake.set()
+        if self._thread is not None:
+            self._thread.join()
+        for finisher in self._finishers:
+            finisher.join()
+
+    def answer(self) -> tuple[dict[str, Any], str]:
+        """Return what was recorded and what was lost, for the end of the command."""
+        missed = self.missed()
+        result = {
+            "files": [str(path) for path in self.files], "messages": self.messages, "not_recorded": self.not_recorded,
+            "missed": missed,
+        }  # fmt: skip
+        lost = ", ".join(f"{count} of {key}" for key, count in missed.items()) or "none"
+        text = f"{self.messages} messages in {len(self.files)} file(s) in {self._folder}; lost on the way: {lost}"
+        if self.not_recorded:
+            text += f"; not taken by the disk: {self.not_recorded}"
+        return result, text
+
+    def missed(self) -> dict[str, int]:
+        """Return how many messages of each key never arrived, by the gaps of their numbers, where any did not."""
+        found = {f"{prefix}/thermal/{kind}": one.missed for (prefix, kind), one in self._numbers.items()}
+        return {key: count for key, count in sorted(found.items()) if count}
+
+    # ------------------------------------------------------------------ on a thread of its own
+
+    def _work(self) -> None:
+        while not self._ended:
+            self._wake.wait(SYNC_S / 2.0)
+            self._turn()
+        # What came last, and once more what the disk refused before.
+        if not self._turn():
+            with self._lock:
+                self.not_recorded += len(self._waiting)
+        try:
+            self._finish()
+        except OSError as error:
+            log.error("compensator: the shop's recording could not be finished: %s", error)
+
+    def _turn(self) -> bool:
+        """Bring what waits to disk; tell whether the disk took it."""
+        with self._lock:
+            batch = list(self._waiting)
+            self._waiting.clear()
+        try:
+            self._write(batch)
+        except OSError as error:
+            self._give_up(batch, error)
+            return False
+        return True
+
+    def _write(self, batch: list[_Arrival]) -> None:
+        """Bring a batch to disk, each day into its own file; what is on disk is taken off it."""
+        while batch:
+            day = _day(batch[0])
+            part = next(list(same) for _, same in groupby(batch, _day))
+            if self._file is None or day != self._day:
+                self._finish()
+                self._file, self._day = _File(self._folder, part[0].time_ns, self._prefix), day
+                self.files.append(self._file.path)
+            taken = sum([self._file.add(arrival, self._numbered(arrival)) for arrival in part])
+            self._file.sync()
+            self.messages += taken
+            self.not_recorded += len(part) - taken
+            del batch[: len(part)]
+            if self._failed:
+                self._failed = False
+                log.info("compensator: the disk takes the shop's recording again")
+
+    def _numbered(self, arrival: _Arrival) -> tuple[str, int, int]:
+        """Return kind, number and time of a message, and follow its numbers; `other` where it is none."""
+        prefix, _, rest = arrival.key.rpartition("/thermal/")
+        kind = KINDS.get(rest, "")
+        if rest == "alive":
+            return "alive", 0, arrival.time_ns
+        try:
+            message = decoded(kind, arrival.payload) if kind else None
+        except Malformed:
+            message = None
+        if message is None:
+            return "other", 0, arrival.time_ns
+        numbers = self._numbers
+        if kind in ("offset", "sample", "estimate"):
+            numbers.setdefault((prefix, rest), Sequence()).take(message.seq, message.time_utc_ns)
+        started_ns = message.started_utc_ns if kind == "status" else 0
+        if kind == "event" and message.kind == "start":
+            started_ns = message.time_utc_ns
+        for other in ("y/offset", "sample", "estimate") if started_ns else ():
+            numbers.setdefault((prefix, other), Sequence()).started(started_ns)
+        return kind, message.seq & 0xFFFFFFFF, message.time_utc_ns
+
+    def _give_up(self, batch: list[_Arrival], error: OSError) -> None:
+        """Leave the file as it was at the last sync and try the batch again in another."""
+        file, self._file = self._file, None
+        if file is not None:
+            file.give_up()
+        if not self._failed:
+            self._failed = True
+            log.error("compensator: the disk does not take the shop's recording: %s", error)
+        with self._lock:
+            room = max(WAITING - len(self._waiting), 0)
+            self.not_recorded += max(len(batch) - room, 0)
+            self._waiting.extendleft(reversed(batch[len(batch) - room :] if room else []))
+
+    def _finish(self) -> None:
+        file, self._file = self._file, None
+        if file is None:
+            return
+        file.finish(self.messages, self.not_recorded, self.missed(), self._clock.utc_ns())
+        self._finish_later([file.path])
+
+    def _finish_later(self, paths: Iterable[Path]) -> None:
+        finisher = threading.Thread(target=_compact_all, args=(list(paths),), name="finish shop recordings")
+        self._finishers = [*(one for one in self._finishers if one.is_alive()), finisher]
+        finisher.start()
+
+
+def _day(arrival: _Arrival) -> str:
+    return datetime.fromtimestamp(arrival.time_ns / NS, UTC).strftime("%Y%m%d")
+
+
+def _compact_all(paths: list[Path]) -> None:
+    for path in paths:
+        try:
+            said = compact(path)
+        except (OSError, ValueError) as error:
+            said = f"could not be made compact and stays as it is: {error}"
+        if said:
+            log.info("%s: %s", path.name, said)
+
+
+@dataclass(slots=True)
+class _Sink:
+    """What the writer wrote since the last sync; the file gets it in one piece."""
+
+    data: bytearray = field(default_factory=bytearray)
+    size: int = 0
+
+    def write(self, data: bytes) -> None:
+        self.data += data
+        self.size += len(data)
+
+    def tell(self) -> int:
+        return self.size
+
+    def flush(self) -> None:
+        return
+
+
+class _File:
+    """The file that is being written; its channels come with their first message."""
+
+    def __init__(self, folder: Path, time_ns: int, prefix: str) -> None:
+        self.path, self._descriptor = _create(folder, time_ns)
+        self._sink = _Sink()
+        self._writer = Writer(self._sink, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)  # type: ignore[arg-type]
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._synced = 0
+        self._writer.start(profile="", library=f"compensator {__version__}")
+        metadata = {
+            "prefix": prefix,
+            "file": self.path.name,
+            "compensator": __version__,
+            "started_utc_ns": str(time_ns),
+        }
+        self._writer.add_metadata("shop", metadata)
+
+    def add(self, arrival: _Arrival, numbered: tuple[str, int, int]) -> bool:
+        """Write one message: log time is its arrival, publish time its own; tell whether there was room for it."""
+        kind, number, time_ns = numbered
+        topic = f"/{OTHER if kind == 'other' else ''}{arrival.key}"
+        channel = self._channels.get(topic)
+        if channel is None:
+            if len(self._channels) >= CHANNELS:
+                return False
+            channel = self._channels[topic] = self._register(topic, kind, arrival.key)
+        self._writer.add_message(channel, arrival.time_ns, arrival.payload, time_ns, sequence=number)
+        return True
+
+    def _register(self, topic: str, kind: str, key: str) -> int:
+        schema = 0
+        if kind in MESSAGES or kind == "alive":
+            if kind not in self._schemas:
+                data = shipped_schema(kind) if kind in MESSAGES else ALIVE
+                name = MESSAGES[kind].__name__ if kind in MESSAGES else "Alive"
+                self._schemas[kind] = self._writer.register_schema(name, "jsonschema", data)
+            schema = self._schemas[kind]
+        encoding = "octet-stream" if kind == "other" else "json"
+        about = {"key": key, "machine": key.rpartition("/thermal/")[0]}
+        return self._writer.register_channel(topic, encoding, schema, about)
+
+    def sync(self) -> None:
+        """Bring everything to disk."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        view = memoryview(bytes(self._sink.data))
+        while view:
+            view = view[os.write(self._descriptor, view) :]
+        self._sink.data.clear()
+        os.fsync(self._descriptor)
+        self._synced = self._sink.size
+
+    def finish(self, messages: int, not_recorded: int, missed: dict[str, int], time_ns: int) -> None:
+        """Say what never arrived since the recorder began, write the end and close."""
+        summary = {"messages": messages, "not_recorded": not_recorded, "missed": missed}
+        try:
+            schema = self._writer.register_schema("ShopSummary", "jsonschema", SUMMARY)
+            channel = self._writer.register_channel("/summary", "json", schema)
+            self._writer.add_message(channel, time_ns, json.dumps(summary).encode(), time_ns)
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self.sync()
+        except OSError:
+            self.give_up()
+            raise
+        os.close(self._descriptor)
+
+    def give_up(self) -> None:
+        """Cut off what is not whole and close."""
+        with suppress(OSError):
+            os.ftruncate(self._descriptor, self._synced)
+        with suppress(OSError):
+            os.close(self._descriptor)
+        if not self._synced:
+            with suppress(OSError):
+                self.path.unlink()
+
+
+#: Schema of the last message of a file.
+SUMMARY = (
+    b'{"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "thermal.shop_summary", "type": "object", '
+    b'"properties": {"messages": {"type": "integer"}, "not_recorded": {"type": "integer"}, "missed": '
+    b'{"type": "object", "additionalProperties": {"type": "integer"}}}, '
+    b'"required": ["messages", "not_recorded", "missed"]}'
+)
+#: Schema of what is recorded of liveliness tokens.
+ALIVE = (
+    b'{"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "thermal.alive", "type": "object", '
+    b'"properties": {"alive": {"type": "boolean"}}, "required": ["alive"]}'
+)
+
+
+def _create(folder: Path, time_ns: int) -> tuple[Path, int]:
+    """Create a file that did not exist, named by the time, and hold it until it is finished."""
+    stamp = datetime.fromtimestamp(time_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
+    for count in range(1000):
+        path = folder / f"shop_{stamp}{f'-{count:03d}' if count else ''}.mcap"
+        try:
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except FileExistsError:
+            continue
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return path, descriptor
+    raise OSError(f"{folder}: a thousand recordings of {stamp}")

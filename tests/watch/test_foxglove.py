@@ -1,0 +1,87 @@
+"""What a viewer gets over Foxglove's protocol."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import pytest
+
+from compensator.errors import ServiceError
+from compensator.watch.foxglove import FoxgloveServer, topic_of
+from tests.watch.heard import START_NS, estimate, event, offset
+
+pytest.importorskip("foxglove")
+connect = pytest.importorskip("websockets.sync.client").connect
+
+
+class Viewer:
+    """A client of the protocol as a program apart from the project would write it."""
+
+    def __init__(self, port: int) -> None:
+        self._connect = connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], proxy=None)
+        self.channels: dict[str, dict[str, Any]] = {}
+
+    def __enter__(self) -> Viewer:
+        self._socket = self._connect.__enter__()
+        return self
+
+    def __exit__(self, *told: Any) -> None:
+        self._connect.__exit__(*told)
+
+    def until_advertised(self, *topics: str) -> None:
+        while not set(topics) <= set(self.channels):
+            told = self._socket.recv(timeout=30)
+            if isinstance(told, str) and json.loads(told)["op"] == "advertise":
+                self.channels |= {channel["topic"]: channel for channel in json.loads(told)["channels"]}
+
+    def subscribe(self, topic: str) -> None:
+        subscription = {"id": 1, "channelId": self.channels[topic]["id"]}
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
+
+    def message(self) -> tuple[int, bytes]:
+        while True:
+            told = self._socket.recv(timeout=30)
+            if isinstance(told, bytes) and told[0] == 1:
+                _, _, time_ns = struct.unpack_from("<BIQ", told)
+                return time_ns, told[13:]
+
+
+def test_a_viewer_gets_the_latest_at_once_and_then_all_that_follows() -> None:
+    key = "shop/vmc-07/thermal/y/offset"
+    with FoxgloveServer("shop/vmc-07", 0) as server:
+        server.take(key, offset(5))
+        server.take("shop/vmc-07/thermal/estimate", estimate(5))
+        with Viewer(server.port) as viewer:
+            viewer.until_advertised("/offset", "/estimate")
+            channel = viewer.channels["/offset"]
+            assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
+            assert json.loads(channel["schema"])["properties"]["y_offset_um"]
+            viewer.subscribe("/offset")
+            assert viewer.message() == (START_NS, offset(5))
+            server.take(key, b"nonsense")
+            server.take(key, offset(5), asked=True)
+            server.take("shop/vmc-07/thermal/y/other", b"{}")
+            server.take(key, offset(6, START_NS + 1))
+            assert viewer.message() == (START_NS + 1, offset(6, START_NS + 1))
+
+
+def test_a_viewer_that_joins_gets_the_last_events() -> None:
+    with FoxgloveServer("shop", 0) as server:
+        for i in range(30):
+            server.take("shop/vmc-07/thermal/event", event(i, START_NS + i))
+        with Viewer(server.port) as viewer:
+            viewer.until_advertised("/vmc-07/event")
+            viewer.subscribe("/vmc-07/event")
+            assert [viewer.message()[0] for _ in range(20)] == [START_NS + i for i in range(10, 30)]
+
+
+def test_topics() -> None:
+    assert topic_of("shop/vmc-07/thermal/status", "") == ("/shop/vmc-07/status", "status")
+    assert topic_of("shop/vmc-07/thermal/alive", "shop") is None
+
+
+def test_a_port_that_is_taken_is_said_in_one_line() -> None:
+    with FoxgloveServer("shop", 0) as server, pytest.raises(ServiceError, match=f"--foxglove-port {server.port}"):
+        FoxgloveServer("shop", server.port).__enter__()

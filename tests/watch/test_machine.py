@@ -1,0 +1,221 @@
+"""What is shown of a machine is what it is: never an old value as new, never silence as ok."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from compensator.clock import NS
+from compensator.messages import EstimateMessage, Event, Offset, Sample
+from compensator.watch.machine import Machine, decoded
+from compensator.watch.shop import Shop
+from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
+
+KEY = "shop/vmc-07/thermal/"
+
+
+class Heard:
+    def __init__(self) -> None:
+        self.clock = Clock()
+        self.shop = Shop(self.clock)
+
+    def hear(self, **messages: bytes) -> None:
+        for kind, payload in messages.items():
+            self.shop.take(KEY + ("y/offset" if kind == "offset" else kind), payload)
+
+    @property
+    def machine(self) -> dict[str, Any]:
+        found = self.shop.one("shop/vmc-07")
+        assert found is not None
+        return found
+
+
+@pytest.fixture
+def heard() -> Heard:
+    return Heard()
+
+
+def test_a_machine_that_is_well(heard: Heard) -> None:
+    heard.hear(offset=offset(5), sample=sample(5), estimate=estimate(5), status=status(5))
+    heard.shop.alive(KEY + "alive", True)
+    heard.clock.advance(30)
+    machine = heard.machine
+    assert (machine["machine"], machine["shown"], machine["tone"], machine["alive"]) == ("vmc-07", "ok", "good", True)
+    assert (machine["y_offset_um"], machine["residual_um"], machine["t_q_degc"], machine["age_s"]) == (
+        -12.34,
+        -0.34,
+        31.5,
+        30,
+    )
+    assert {share["name"]: share["y_um"] for share in machine["shares"]} == {"DTF": 10.0, "TDTF": 0.84, "gain DTF": 1.5}
+    assert machine["warnings"] == []
+    json.dumps(machine, allow_nan=False)
+
+
+def test_what_is_silent_is_never_shown_as_ok(heard: Heard) -> None:
+    heard.hear(offset=offset(5), sample=sample(5), estimate=estimate(5))
+    heard.clock.advance(150)
+    assert heard.machine["shown"] == "ok"
+    heard.clock.advance(1)
+    machine = heard.machine
+    assert (machine["shown"], machine["tone"], machine["state"]) == ("silent", "bad", "ok")
+    # The last offset stands with its age; nothing that was measured then looks as if it were of now.
+    assert machine["y_offset_um"] == -12.34 and machine["age_s"] == 151
+    assert machine["t_q_degc"] is machine["residual_um"] is machine["y_offset_rate_um_per_min"] is None
+    assert machine["shares"] == [] and machine["channels"] == {}
+
+
+def test_values_of_an_older_sample_do_not_stand_beside_a_new_offset(heard: Heard) -> None:
+    heard.hear(offset=offset(5), sample=sample(5), estimate=estimate(5))
+    for i in range(1, 4):
+        heard.clock.advance(60)
+        heard.hear(offset=offset(5 + i, START_NS + 60 * i * NS))
+    assert heard.machine["shown"] == "ok"
+    assert heard.machine["t_q_degc"] is None and heard.machine["residual_um"] is None
+
+
+def test_a_wall_clock_that_stands_does_not_keep_a_machine_alive(heard: Heard) -> None:
+    heard.hear(offset=offset(5))
+    heard.clock.monotonic += 151 * NS  # the wall clock was set back meanwhile
+    assert heard.machine["shown"] == "silent"
+
+
+def test_an_old_offset_that_arrives_now_is_silent_and_the_clocks_are_doubted(heard: Heard) -> None:
+    heard.hear(offset=offset(5, START_NS - 600 * NS))
+    assert heard.machine["shown"] == "silent"
+    assert any("clocks is wrong" in text for text in heard.machine["warnings"])
+
+
+def test_a_missing_channel_is_missing(heard: Heard) -> None:
+    heard.hear(offset=offset(5, state="degraded", reasons=["t_q_missing", "outside_validity:heat_w"]),
+               sample=sample(5, t_q=31.5, quality="open_circuit"))  # fmt: skip
+    machine = heard.machine
+    assert machine["t_q_degc"] is None and machine["channels"]["t_q_degc"]["quality"] == "open_circuit"
+    assert [reason["code"] for reason in machine["reasons"]] == ["t_q_missing", "outside_validity:heat_w"]
+    assert all(reason["means"] and reason["do"] for reason in machine["reasons"])
+    assert heard.shop.history("shop/vmc-07")["t_q_degc"] == [None]
+
+
+def test_a_reason_that_nobody_knows_is_said_to_be_unknown(heard: Heard) -> None:
+    heard.hear(offset=offset(5, state="degraded", reasons=["flux_capacitor"]))
+    assert "does not know" in heard.machine["reasons"][0]["means"]
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"nonsense", b"[]", b"\xff\xfe", offset(6, schema=2), offset(6, seq=-1), offset(6, y_offset_um="3"),
+     offset(6, state="splendid"), offset(6, time_utc_ns=2**70), b'{"schema": 1}', b"[" * 100_000, b" " * (2**20 + 1),
+     offset(6).replace(b"-12.34", b"1e999"), offset(6).replace(b"-12.34", b"NaN")],
+)  # fmt: skip
+def test_malformed_messages_are_counted_and_change_nothing(heard: Heard, payload: bytes) -> None:
+    heard.hear(offset=offset(5))
+    before = heard.machine
+    heard.hear(offset=payload)
+    after = heard.machine
+    assert after["malformed"] == 1 and after["last_malformed"].startswith("offset:") and after["tone"] == "warn"
+    changed = {name for name in before if before[name] != after[name]}
+    assert changed == {"malformed", "last_malformed", "warnings", "tone"}
+
+
+def test_what_is_repeated_or_late_changes_nothing_and_is_counted(heard: Heard) -> None:
+    heard.hear(offset=offset(5), sample=sample(5), estimate=estimate(5))
+    heard.hear(offset=offset(4, y_offset_um=99.0), sample=sample(4, t_q=99.0), estimate=estimate(4, residual_um=99.0))
+    machine = heard.machine
+    assert (machine["y_offset_um"], machine["t_q_degc"], machine["residual_um"]) == (-12.34, 31.5, -0.34)
+    assert machine["repeated"] == 1
+    assert 99.0 not in heard.shop.history("shop/vmc-07")["y_offset_um"]
+
+
+def test_answers_to_a_question_are_nothing_repeated_or_missed(heard: Heard) -> None:
+    heard.shop.take(KEY + "y/offset", offset(5), asked=True)
+    heard.hear(offset=offset(8))
+    heard.shop.take(KEY + "y/offset", offset(7), asked=True)
+    assert (heard.machine["seq"], heard.machine["missed"], heard.machine["repeated"]) == (8, 0, 0)
+
+
+def test_what_was_lost_is_told_from_a_restart(heard: Heard) -> None:
+    heard.hear(offset=offset(5), status=status(5))
+    heard.hear(offset=offset(8), status=status(8))
+    assert heard.machine["missed"] == 2
+    heard.hear(offset=offset(20, START_NS + 720 * NS))
+    assert heard.machine["missed"] == 13
+    heard.hear(status=status(20, started_ns=START_NS + 660 * NS))
+    assert heard.machine["missed"] == 2
+    assert any("2 message(s) never arrived" in text for text in heard.machine["warnings"])
+
+
+def test_two_services_below_one_prefix_are_told(heard: Heard) -> None:
+    heard.hear(offset=offset(5))
+    heard.hear(offset=offset(3, machine="vmc-08"))
+    assert heard.machine["machine"] == "vmc-08" and heard.machine["tone"] == "bad"
+    assert any("Two services" in text and "vmc-07" in text for text in heard.machine["warnings"])
+    for i in range(1, 12):
+        heard.clock.advance(60)
+        heard.hear(offset=offset(3 + i, START_NS + i * 60 * NS, machine="vmc-08"))
+    assert heard.machine["tone"] == "good" and heard.machine["warnings"] == []
+
+
+def test_a_service_that_is_gone_is_told_before_its_offset_is_too_old(heard: Heard) -> None:
+    heard.hear(offset=offset(5))
+    heard.shop.alive(KEY + "alive", False)
+    assert heard.machine["shown"] == "ok" and heard.machine["tone"] == "warn"
+    assert any("liveliness token is gone" in text for text in heard.machine["warnings"])
+
+
+def test_events_say_what_to_do(heard: Heard) -> None:
+    heard.hear(event=event(5, ok=False))
+    heard.hear(event=event(6, text="couples: answers again", ok=True))
+    heard.hear(event=event(7, kind="state", text="hold operator_hold", state="hold", reasons=["operator_hold"]))
+    newest, back, gone = heard.machine["events"]
+    assert "resume" in newest["do"] and back["do"] == "" and "probe" in gone["do"]
+
+
+def test_machines_that_need_somebody_stand_first_and_strangers_are_counted(heard: Heard) -> None:
+    for name, state in (("a", "ok"), ("b", "hold"), ("c", "degraded")):
+        heard.shop.take(f"shop/{name}/thermal/y/offset", offset(1, machine=name, state=state))
+    assert [machine["prefix"] for machine in heard.shop.overview()] == ["shop/b", "shop/c", "shop/a"]
+    heard.shop.take("shop/a/thermal/y/other", b"{}")
+    assert heard.shop.ignored == 1 and len(heard.shop.overview()) == 3
+
+
+def test_effects_have_numbers_where_their_names_do_not_fit() -> None:
+    machine = Machine("shop/vmc-07")
+    machine.take("estimate", estimate(5, effects=(1.0, 2.0)), 0.0)
+    machine.take("status", status(5), 0.0)
+    assert machine.effects() == ["effect 1", "effect 2"]
+
+
+def test_the_day_is_one_point_a_minute_with_values_of_one_sample() -> None:
+    machine = Machine("shop/vmc-07")
+    for i in range(0, 3600, 10):  # an hour at ten seconds
+        t = START_NS + i * NS
+        machine.take("offset", offset(i, t, y_offset_um=float(i)), i)
+        machine.take("sample", sample(i, t, t_q=float(i)), i)
+        machine.take("estimate", estimate(i, t, residual_um=float(i)), i)
+    columns = machine.history.columns()
+    assert len(columns["t_s"]) == 60
+    assert (
+        columns["y_offset_um"] == columns["t_q_degc"] == columns["residual_um"] == [60.0 * k + 50.0 for k in range(60)]
+    )
+    since = machine.history.columns(START_NS + 1800 * NS)
+    assert len(since["t_s"]) == 30
+    machine.take("offset", offset(10**6, START_NS + 25 * 3600 * NS), 0.0)
+    assert len(machine.history) == 1
+
+
+def test_the_past_of_a_recording_says_nothing_of_now() -> None:
+    machine = Machine("shop/vmc-07")
+    for kind, payload in (("offset", offset(3)), ("sample", sample(3)), ("estimate", estimate(3)),
+                          ("event", event(3, kind="zero", text="zero"))):  # fmt: skip
+        message = decoded(kind, payload)
+        assert isinstance(message, (Offset, Sample, EstimateMessage, Event))
+        machine.past(message)
+    assert machine.shown(START_NS, 0.0) == "unknown" and machine.age_s(START_NS, 0.0) is None
+    assert machine.history.columns()["y_offset_um"] == [-12.34]
+    assert machine.snapshot(START_NS, 0.0)["t_q_degc"] == 31.5
+    assert machine.snapshot(START_NS + 200 * NS, 0.0)["t_q_degc"] is None
+    machine.take("event", event(2, START_NS - NS), 0.0)
+    machine.take("event", event(3, kind="zero", text="zero"), 0.0)  # heard again
+    assert len(machine.events) == 2

@@ -1,0 +1,141 @@
+"""The live page: for whoever sits at this computer, and for nobody else."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from compensator.clock import NS
+from compensator.errors import ServiceError
+from compensator.reasons import WORDS
+from compensator.watch.server import PageServer
+from compensator.watch.shop import Shop
+from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
+
+STATUS = {"connected": True, "where": "tcp/127.0.0.1:7447", "prefix": "shop", "ignored": 0}
+EVIL = '<img src=x onerror="document.title=1">'
+
+
+def filled() -> Shop:
+    clock = Clock()
+    shop = Shop(clock)
+    for i in range(180):
+        for name in ("vmc-07", "vmc-08"):
+            t, key = START_NS + i * 60 * NS, f"shop/{name}/thermal/"
+            state = {"state": "degraded", "reasons": ["t_q_missing"]} if 60 < i < 90 else {}
+            shop.take(key + "y/offset", offset(i, t, machine=name, y_offset_um=-i / 3.0, **state))
+            shop.take(key + "sample", sample(i, t, t_q=None if state else 20.0 + i / 20.0,
+                                             quality="open_circuit" if state else "good"))  # fmt: skip
+            shop.take(key + "estimate", estimate(i, t, residual_um=0.1))
+            shop.take(key + "status", status(i, t, devices={"couples": EVIL}))
+        clock.advance(60)
+    shop.take("shop/vmc-07/thermal/event", event(3, text=EVIL, ok=False))
+    return shop
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[PageServer]:
+    with PageServer(filled(), lambda: STATUS, 0) as served:
+        yield served
+
+
+def ask(server: PageServer, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
+    port = int(server.address.rsplit(":", 1)[1].strip("/"))
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    connection.request(method, path, headers=headers)
+    answer = connection.getresponse()
+    found = answer.status, dict(answer.getheaders()), answer.read()
+    connection.close()
+    return found
+
+
+def test_the_page_loads_nothing_from_anywhere(server: PageServer) -> None:
+    code, headers, body = ask(server, "/")
+    text = body.decode()
+    assert code == 200 and headers["Content-Type"].startswith("text/html")
+    assert not re.search(r"""(src|href)=["'](?!#|data:,)""", text) and "@import" not in text and "url(" not in text
+    assert set(re.findall(r"https?://[^\s\"'`]+", text)) <= {"http://www.w3.org/2000/svg"}
+    assert "{{" not in text
+    assert all(f'id="word={code}"' in text for code in (*WORDS, "silent"))
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy and "unsafe" not in policy and "frame-ancestors 'none'" in policy
+
+
+def test_what_is_known_comes_as_json(server: PageServer) -> None:
+    shop = json.loads(ask(server, "/shop.json")[2])
+    assert shop["headline"] == "2 machines: 2 ok" and [one["prefix"] for one in shop["machines"]] == [
+        "shop/vmc-07",
+        "shop/vmc-08",
+    ]
+    one = json.loads(ask(server, "/machine.json?prefix=shop%2Fvmc-07")[2])
+    assert one["machine"]["machine"] == "vmc-07" and one["effects"] == ["gain DTF"]
+    history: dict[str, list[Any]] = one["history"]
+    assert len(history["t_s"]) == 180 and history["t_q_degc"][70] is None and history["reasons"][70] == "t_q_missing"
+    since = json.loads(ask(server, f"/machine.json?prefix=shop%2Fvmc-07&since_s={history['t_s'][-3]}")[2])
+    assert since["history"]["t_s"] == history["t_s"][-3:]
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:80", "127.0.0.1", "", "127.0.0.1:1", "127.0.0.1.evil.example"]
+)
+def test_a_name_that_is_not_its_own_is_refused(server: PageServer, host: str) -> None:
+    for path in ("/", "/shop.json"):
+        code, _, body = ask(server, path, Host=host)
+        assert code == 421 and b"vmc" not in body
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE"])
+def test_nothing_but_looking_is_answered(server: PageServer, method: str) -> None:
+    assert ask(server, "/shop.json", method)[0] == 405
+
+
+def test_what_is_not_there_is_not_there(server: PageServer) -> None:
+    for path in ("/machine.json", "/machine.json?prefix=shop/none", "/machine.json?prefix=shop%2Fvmc-07&since_s=x",
+                 "/../../etc/passwd", "/live.js"):  # fmt: skip
+        assert ask(server, path)[0] == 404, path
+    assert ask(server, "/", "HEAD")[2] == b""
+
+
+def test_a_port_that_is_taken_is_one_line(server: PageServer) -> None:
+    port = int(server.address.rsplit(":", 1)[1].strip("/"))
+    with pytest.raises(ServiceError, match=f"--port {port}: "):
+        PageServer(Shop(Clock()), lambda: STATUS, port).__enter__()
+
+
+def drawn(address: str, folder: Path, width: int) -> tuple[str, str]:
+    """Return the page as a browser has it, and what its console said."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        pytest.skip("chromium is not installed")
+    done = subprocess.run(
+        [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", "--dump-dom",
+         f"--window-size={width},900", "--virtual-time-budget=4000", "--enable-logging=stderr", address],
+        capture_output=True, text=True, timeout=100, check=True,
+    )  # fmt: skip
+    return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
+
+
+def test_a_browser_draws_one_machine_and_takes_nothing_for_code(server: PageServer, tmp_path: Path) -> None:
+    text, console = drawn(f"{server.address}#m=shop%2Fvmc-07", tmp_path, 1400)
+    assert console == ""
+    assert text.count("<figure>") == 4 and "ok: offset −59.67 µm" in text
+    # T_Q is missing for half an hour: its curve has two parts, the offset's has one.
+    curves = re.findall(r'<path d="([^"]*)" class="curve c0">', text)
+    parts = [curve.count("M") for curve in curves if curve != "M0 6H32"]
+    assert parts == [1, 1, 1, 2]
+    assert "&lt;img src=x" in text and "<img" not in text
+    assert "gain DTF" in text and "spindle" not in text
+    assert re.search(r"<td>⚠ degraded</td><td>\d+ min</td><td>t_q_missing</td>", text)
+
+
+def test_a_browser_draws_the_shop(server: PageServer, tmp_path: Path) -> None:
+    text, console = drawn(server.address, tmp_path, 400)
+    assert console == "" and "2 machines: 2 ok" in text and text.count('data-prefix="shop/vmc-0') == 2
