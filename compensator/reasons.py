@@ -95,6 +95,44 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "too_fast": ("The value changed faster than the sensor's place can.", "Check for a loose sensor or a noisy line."),
     "stuck": ("The value has not moved at all for longer than it may.", "Check that sensor and module still measure."),
     "t_q_below_at": ("T_Q lies below AT although the machine is heated.", "Check for exchanged or fallen-off sensors."),
+    # Ends of a recording, and what an audit can find.
+    "finished": ("The recording has its end: sealed, with checksums and index.", "Nothing."),
+    "recovered": (
+        "The service was ended hard; the next start kept every whole record and sealed the file.",
+        "Nothing; see why the machine or the service went down.",
+    ),
+    "open": (
+        "The recording has no end: it is still being written, or the service was ended hard.",
+        "Audit it again once the next recording is there: that one names its last value.",
+    ),
+    "torn": (
+        "The recording ends within a group of records: it is still being written, or the service was ended hard.",
+        "Audit it again once the next recording is there: that one names its last value.",
+    ),
+    "truncated": (
+        "The end of the recording was cut off.", "Find out who had access to it; take the file from a backup."),
+    "damaged": (
+        "The file is no recording from some byte on, or a checksum is wrong.",
+        "Check disk and copy; take the file from a backup.",
+    ),
+    "altered": ("Something was changed after it was written.", "Find out who had access; take a copy from a backup."),
+    "removed": ("Something that was written is gone.", "Find out who had access; take a copy from a backup."),
+    "inserted": ("Something is there that the service did not write there.", "Find out who had access to the file."),
+    "reordered": ("Something stands in another place than it was written.", "Check names and copies of the files."),
+    "broken": (
+        "Two parts of the hash chain do not belong together: one of them was rewritten.",
+        "Compare with a backup of both files; a signature would tell which is the true one.",
+    ),
+    "missing_file": ("A recording between two others is not there.", "Add it and audit again."),
+    "unsigned": ("There is no signature where there must be one.", "Check [recording] signing_key of the machine."),
+    "false_signature": (
+        "A signature is not of the key given.", "Check whether the key is this machine's; else trust nothing in it."),
+    "state": (
+        "A recording opens with another state than the one before ended with.",
+        "Treat the offsets from there on as not proven, and report it.",
+    ),
+    "unreadable": (
+        "A record is intact and yet not what its schema says.", "Audit with the version that wrote it."),
 }  # fmt: skip
 
 

@@ -150,7 +150,7 @@ class Comparison:
 
 def compare(
     paths: Sequence[Path], model: ThermalModel, *, told: Callable[[int, int], None] | None = None,
-    row: Callable[[Iterable[Any]], Any] | None = None,
+    row: Callable[[Iterable[Any]], Any] | None = None, point: Callable[..., None] | None = None,
 ) -> Comparison:  # fmt: skip
     """Run another model over recordings, in the order in which they were begun.
 
@@ -164,6 +164,8 @@ def compare(
         Called with the number of bytes worked off, and of all.
     row : callable, optional
         Takes the rows of the table of both offsets, see `COLUMNS`.
+    point : callable, optional
+        Takes time (ns), and measured deformation and offset with the recorded and with the other model, µm.
 
     Raises
     ------
@@ -172,7 +174,7 @@ def compare(
     """
     ordered = _in_order(paths)
     whole = sum(path.stat().st_size for path in ordered)
-    run = _Run(model, row)
+    run = _Run(model, row, point)
     done = 0
     for path in ordered:
         with Container(path) as container:
@@ -200,8 +202,10 @@ def _in_order(paths: Sequence[Path]) -> list[Path]:
 
 
 class _Run:
-    def __init__(self, model: ThermalModel, row: Callable[[Iterable[Any]], Any] | None) -> None:
-        self._model, self._row = model, row
+    def __init__(
+        self, model: ThermalModel, row: Callable[[Iterable[Any]], Any] | None, point: Callable[..., None] | None
+    ) -> None:  # fmt: skip
+        self._model, self._row, self._point = model, row, point
         self._compensation: Compensation | None = None
         self._config = b""
         self._last_ns = 0
@@ -275,6 +279,8 @@ class _Run:
             result.left_before.add(y + recorded, time_ns)
             result.left_after.add(other_y + other, time_ns)
         result.offsets.add(other - recorded, time_ns)
+        if self._point is not None:
+            self._point(time_ns, y, recorded, other_y, other)
         if self._row is not None:
             values = (y, recorded, before, other_y, other, after)
             cells = ["" if math.isnan(value) else repr(value) for value in values]

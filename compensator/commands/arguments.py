@@ -10,6 +10,10 @@ _OPERATOR = "Zenoh configuration with the operator's certificate, such as operat
 _SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (default: all cores of this machine)"
 
 
+def _page(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--page", type=Path, metavar="FILE", help="a page for people, .html, .pdf or .png")
+
+
 def demo(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `demo`."""
     add = parser.add_argument
@@ -88,6 +92,7 @@ def replay(parser: argparse.ArgumentParser) -> None:
     add("--public-key", type=Path, metavar="FILE", help="Ed25519 key, PEM, that they must be signed with")
     add("--model", metavar="OTHER", help="no audit: what this model would have done; a model file, or quill")
     add("--out", type=Path, metavar="CSV", help="with --model: both offsets, sample by sample")
+    _page(parser)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
 

@@ -6,6 +6,7 @@ import argparse
 import csv
 from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
@@ -14,6 +15,9 @@ from compensator.commands.progress import progress
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
 from compensator.model.model_file import load_model
+
+if TYPE_CHECKING:
+    from compensator.report.page import Page
 
 #: Exit code where an audit found a difference.
 FOUND = 3
@@ -29,11 +33,15 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If something that was given cannot be read.
     """
-    paths = _files(arguments.recording)
+    paths, page = _files(arguments.recording), arguments.page
+    if page is not None:
+        from compensator.report.formats import checked
+
+        checked(page, option="--page")
     if arguments.model is not None:
         if arguments.public_key is not None:
             raise UsageError("--public-key: belongs to the audit, which --model does not make")
-        return _compare(paths, arguments.model, arguments.out)
+        return _compare(paths, arguments.model, arguments.out, page)
     if arguments.out is not None:
         raise UsageError("--out: is for --model, which is not given")
     public_key = arguments.public_key
@@ -43,19 +51,41 @@ def run(arguments: argparse.Namespace) -> Answer:
     worth = len(paths) if sum(path.stat().st_size for path in paths if path.exists()) > ALONE else 1
     with progress("auditing") as told, workers(worth, arguments.scheduler) as executor:
         found = audit(paths, public_key=public_key, told=told, executor=executor)
-    return Answer(found.as_json(), summary(found), 0 if found.clean else FOUND)
+    answer = Answer(found.as_json(), summary(found), 0 if found.clean else FOUND)
+    if page is None:
+        return answer
+    from compensator.audit.pages import audit_page
+
+    return _with_page(answer, page, audit_page(found))
 
 
-def _compare(paths: list[Path], name: str, out: Path | None) -> Answer:
+def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) -> Answer:
     model = load_model(name)
+    curves = None
+    if page is not None:
+        from compensator.audit.pages import Curves
+
+        curves = Curves()
     with progress("comparing") as told, out.open("w", newline="", encoding="utf-8") if out else nullcontext() as file:
         row = None
         if file is not None:
             row = csv.writer(file, lineterminator="\n").writerow
             row(COLUMNS)
-        found = compare(paths, model, told=told, row=row)
+        found = compare(paths, model, told=told, row=row, point=curves.add if curves is not None else None)
     text = found.text() + (f"\nboth offsets: {out}" if out else "")
-    return Answer(found.as_json() | ({"out": str(out)} if out else {}), text)
+    answer = Answer(found.as_json() | ({"out": str(out)} if out else {}), text)
+    if page is None or curves is None:
+        return answer
+    from compensator.audit.pages import comparison_page
+
+    return _with_page(answer, page, comparison_page(found, curves))
+
+
+def _with_page(answer: Answer, path: Path, page: Page) -> Answer:
+    from compensator.report.formats import write
+
+    write(path, page)
+    return Answer(answer.result | {"report": str(path)}, f"{answer.text}\npage: {path}", answer.code)
 
 
 def _files(given: list[Path]) -> list[Path]:

@@ -1,0 +1,324 @@
+"""The pages of `replay`: what an audit proved and what it did not, and what another model would have done."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from compensator import __version__
+from compensator.audit.comparison import Comparison, Spread
+from compensator.audit.findings import Difference, Finding, utc
+from compensator.audit.recording_audit import RecordingAudit
+from compensator.audit.series import Audit
+from compensator.chain import NOTHING
+from compensator.report.envelope import Envelope
+from compensator.report.page import (
+    Block,
+    Cell,
+    Code,
+    Details,
+    Figure,
+    Line,
+    Page,
+    Section,
+    Strip,
+    Table,
+    Tone,
+    Words,
+)
+
+_TIME = "time, UTC"
+#: So many files and findings stand on the page at once; more are there to open.
+_ROWS = 20
+#: Remarks that are shown; a year of files may have one each.
+_REMARKS = 40
+#: Letters of a hash that tell it from others.
+_SHORT = 12
+#: Values that are brought to a curve together.
+_TOGETHER = 5000
+_ENDS_WHOLE = ("finished", "recovered")
+#: Kinds of findings of whole files, not of what stands in one.
+_OF_FILES = ("missing_file", "broken", "state", "reordered")
+
+
+# ---------------------------------------------------------------------------- audit
+
+
+def audit_page(found: Audit) -> Page:
+    """Make the page of an audit.
+
+    Parameters
+    ----------
+    found : Audit
+        What it gave.
+    """
+    blocks: list[Block] = [*_timeline(found), _proven(found)]
+    if found.difference is not None:
+        blocks.append(_difference(found.difference))
+    if found.findings:
+        blocks.append(_findings(found))
+    blocks.append(_files(found.files))
+    if found.remarks:
+        lines = list(found.remarks[:_REMARKS])
+        if len(found.remarks) > _REMARKS:
+            lines.append(f"And {len(found.remarks) - _REMARKS} more; replay --json has all.")
+        blocks.append(Words(title="Remarks", lines=lines))
+    blocks.append(_hashes(found))
+    machines = ", ".join(dict.fromkeys(file.machine or "unnamed machine" for file in found.files))
+    return Page(title=f"Audit: {machines}{_span(found)}", verdict=verdict(found), blocks=blocks, tone=_tone(found))
+
+
+def verdict(found: Audit) -> str:
+    """Return one sentence: proven or not, and of how much."""
+    files = f"{len(found.files)} recording(s)"
+    if not found.clean:
+        said = []
+        if found.findings_count:
+            said.append(f"{found.findings_count} finding(s)")
+        if found.differing:
+            said.append(f"{found.differing} sample(s) that come out differently")
+        return f"Not proven: {' and '.join(said)} in {files} with {found.samples} samples."
+    if _partly(found):
+        return f"Proven in part: {found.samples} samples of {files} come out again; see what could not be looked at."
+    words = f"Proven: {found.samples} samples in {files} are as they were written, and every offset comes out again"
+    return words + (", signed by the key given." if found.signed else "; no signature was checked.")
+
+
+def _partly(found: Audit) -> bool:
+    """Tell whether something was found right only because it could not be looked at."""
+    return not found.samples or any(not file.last or file.not_worked_out for file in found.files)
+
+
+def _tone(found: Audit) -> Tone:
+    return "bad" if not found.clean else "warn" if _partly(found) else "good"
+
+
+def _span(found: Audit) -> str:
+    times = [ns for file in found.files if file.samples for ns in (file.first_ns, file.last_ns)]
+    return f", {utc(min(times))} to {utc(max(times))}" if times else ""
+
+
+def _timeline(found: Audit) -> list[Block]:
+    """Show when was proven what; nothing where there is no sample."""
+    files = [file for file in found.files if file.first_ns]
+    if not files:
+        return []
+    wrong = {finding.file for finding in found.findings} | {file.file for file in files if file.differing}
+    times = [f.time_utc_ns for f in found.findings if f.time_utc_ns] + [
+        file.difference.time_utc_ns for file in files if file.difference
+    ]
+    spans = {
+        words: [(file.first_ns * 1e-9, file.last_ns * 1e-9) for file in files if (file.file in wrong) == is_wrong]
+        for words, is_wrong in (("file: nothing found", False), ("file: something found", True))
+    }
+    spans["findings"] = [(t * 1e-9, t * 1e-9) for t in times]
+    strips = [Strip(words, tuple(spans[words]), line) for words, line in zip(spans, (1, 0, 3), strict=True)]
+    first, last = min(file.first_ns for file in files), max(file.last_ns for file in files)
+    note = f"{len(spans['file: nothing found'])} of {len(files)} file(s) with samples: nothing found."
+    return [
+        Figure(title="What was found, over time", x_label=_TIME, y_label="outcome", clock=True, note=note,
+               height=1.0 + 0.3 * sum(map(bool, spans.values())),
+               strips=tuple(strip for strip in strips if strip.spans),
+               x_limits=(first * 1e-9 - 60.0, last * 1e-9 + 60.0)),
+    ]  # fmt: skip
+
+
+def _proven(found: Audit) -> Table:
+    yes, no, open_ = "✓ proven", "✗ not proven", "– not looked at"
+    chained = [file for file in found.files if file.last]
+    records = sum(file.records for file in chained)
+    of_files = sum(finding.kind in _OF_FILES for finding in found.findings)
+    ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]
+    whole = bool(chained) and len(chained) == len(found.files)
+    worked_out = bool(found.samples) and not any(file.not_worked_out for file in found.files)
+    not_signed = sum(finding.kind in ("unsigned", "false_signature") for finding in found.findings)
+    cut = sum(finding.kind == "truncated" for finding in found.findings)
+    inside = found.findings_count - of_files - not_signed - cut
+    rows = [
+        ["Every estimate and every offset is what this program makes of the samples",
+         no if found.differing else yes if worked_out else open_,
+         f"{found.samples} samples worked out again, bit for bit; {found.differing} differ"],
+        ["No record was changed, removed, inserted or moved", no if inside > 0 else yes if whole else open_,
+         f"hash chain over {records} records in {len(chained)} of {len(found.files)} file(s)"],
+        ["No file is missing between the first and the last", no if of_files else yes if whole else open_,
+         "each chain begins with the last value of the file before"],
+        ["Nobody wrote all of it anew from some point on",
+         (no if not_signed else yes) if found.signed else open_,
+         "signatures checked against the key given" if found.signed else "only a signature can exclude that: "
+         "--public-key, and [recording] signing_key on the machine"],
+        ["Nothing was cut off behind the last record", no if cut or ends else yes if whole else open_,
+         f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end"],
+        ["What was before the first file", open_, "it was not given"],
+        ["The sensors told the truth", open_, "no recording can show that"],
+    ]  # fmt: skip
+    return Table(title="What was proven, and what was not", head=["statement", "outcome", "how"], rows=rows)
+
+
+def _difference(difference: Difference) -> Table:
+    return Table(
+        title="The first sample that comes out differently, field by field",
+        head=["field", "recorded", "worked out again"],
+        rows=[[field.name, _shown(field.recorded), _shown(field.recomputed)] for field in difference.fields],
+        note=f"{difference.file}: /{difference.topic} of sample {difference.seq}, {utc(difference.time_utc_ns)}.",
+    )  # fmt: skip
+
+
+def _shown(value: object) -> str:
+    return "null" if value is None else str(value)
+
+
+def _findings(found: Audit) -> Block:
+    def row(finding: Finding) -> list[Cell]:
+        where = f"/{finding.topic}" if finding.topic and " " not in finding.topic else finding.topic
+        number = "" if finding.sequence is None else f"record {finding.sequence}"
+        at = "" if finding.time_utc_ns is None else utc(finding.time_utc_ns)
+        return [finding.file, Code(finding.kind), finding.text, " ".join(filter(None, (where, number))), at]
+
+    more = found.findings_count - len(found.findings)
+    note = f"And {more} more: of each file the first are named." if more else ""
+    head = ["file", "kind", "what", "where", "time"]
+    return _folded("Findings", head, [row(finding) for finding in found.findings], note)
+
+
+def _files(files: Sequence[RecordingAudit]) -> Block:
+    rows: list[list[Cell]] = [
+        [
+            file.file, Code(file.end), str(file.samples), str(file.records), str(file.findings_count),
+            str(file.differing), "begins it" if file.previous == NOTHING.hex() else file.previous[:_SHORT] or "–",
+            file.last[:_SHORT] or "–",
+            f"{file.signed} seal(s)" if file.signed else "–",
+        ]
+        for file in files
+    ]  # fmt: skip
+    head = [
+        "file",
+        "end",
+        "samples",
+        "records",
+        "findings",
+        "differ",
+        "chain goes on from",
+        "chain ends with",
+        "signed",
+    ]
+    return _folded("File by file", head, rows, "Hashes are shown by their first letters; all of them stand below.")
+
+
+def _hashes(found: Audit) -> Details:
+    rows: list[list[Cell]] = [[file.file, file.last or "–", file.model or "–"] for file in found.files]
+    keys = sorted({key for file in found.files for key in file.keys})
+    blocks: list[Block] = [Table(head=["file", "last value of the chain", "model, SHA-256"], rows=rows)]
+    if keys:
+        blocks.append(Table(head=["public keys in the seals"], rows=[[key] for key in keys]))
+    blocks.append(Words(title="Made by", lines=[f"compensator {__version__} replay"]))
+    return Details(title="Hashes, keys, program", blocks=blocks)
+
+
+def _folded(title: str, head: Sequence[str], rows: Sequence[Sequence[Cell]], note: str) -> Block:
+    if len(rows) <= _ROWS:
+        return Table(title=title, head=head, rows=rows, note=note)
+    shown = Table(head=head, rows=rows[:_ROWS], note=note)
+    rest = Details(title=f"The other {len(rows) - _ROWS}", blocks=[Table(head=head, rows=rows[_ROWS:])])
+    return Section(title=title, blocks=[shown, rest])
+
+
+# ---------------------------------------------------------------------------- another model
+
+
+class Curves:
+    """Both models' offsets and what is left with each, over any time in little memory."""
+
+    def __init__(self) -> None:
+        self.curves = {name: Envelope() for name in ("recorded", "other", "left recorded", "left other")}
+        self._rows: list[tuple[float, ...]] = []
+        self.first_s, self.last_s = math.inf, -math.inf
+
+    def add(self, time_ns: int, y: float, recorded: float, other_y: float, other: float) -> None:
+        """Take a sample in: measured deformation and offset of each, µm."""
+        t = time_ns * 1e-9
+        self.first_s, self.last_s = min(self.first_s, t), max(self.last_s, t)
+        self._rows.append((t, recorded, other, y + recorded, other_y + other))
+        if len(self._rows) >= _TOGETHER:
+            self._flush()
+
+    def line(self, name: str, curve: str) -> Line:
+        """Return a curve to draw."""
+        self._flush()
+        return Line(name, *self.curves[curve].points())
+
+    def _flush(self) -> None:
+        if self._rows:
+            t, *values = np.array(self._rows, dtype=np.float64).T
+            for curve, y in zip(self.curves.values(), values, strict=True):
+                curve.add(t, y)
+            self._rows = []
+
+
+def comparison_page(found: Comparison, curves: Curves) -> Page:
+    """Make the page of another model beside the recorded one.
+
+    Parameters
+    ----------
+    found : Comparison
+        The figures.
+    curves : Curves
+        Both offsets.
+    """
+    recorded, other = f"{found.recorded} (recorded)", found.other
+    ends = (curves.first_s, curves.last_s)
+    offsets = Figure(
+        title="Offset of both models", x_label=_TIME, y_label="Y offset, µm", clock=True, x_limits=ends,
+        lines=(curves.line(recorded, "recorded"), curves.line(other, "other")),
+        note=f"They differ by {_um(found.offsets.rms_um)} µm rms, at most {_um(found.offsets.peak_um)} µm.",
+    )  # fmt: skip
+    blocks: list[Block] = [offsets]
+    if found.left_before.samples:
+        left = (curves.line(recorded, "left recorded"), curves.line(other, "left other"))
+        blocks.append(Figure(title="What is left: measured deformation + offset", x_label=_TIME, y_label="Y, µm",
+                             clock=True, x_limits=ends, lines=left, height=2.8))  # fmt: skip
+    blocks.append(_before_and_after(found))
+    if found.remarks:
+        blocks.append(Words(title="What the figures depend on", lines=found.remarks))
+    words, tone = _better(found)
+    return Page(title=f"{found.other} on what {found.recorded} recorded", verdict=words, blocks=blocks, tone=tone)
+
+
+def _better(found: Comparison) -> tuple[str, Tone]:
+    before, after = found.left_before.rms_um, found.left_after.rms_um
+    if not found.left_before.samples:
+        return (
+            f"Y was not measured, so neither is known to be better: the offset of {found.other} differs by "
+            f"{_um(found.offsets.rms_um)} µm rms, at most {_um(found.offsets.peak_um)} µm.",
+            "warn",
+        )
+    words = (
+        f"With {found.other}, {_um(after)} µm rms would have been left in Y instead of {_um(before)} with the recorded "
+        f"{found.recorded}."
+    )
+    return words, "good" if after < before else "bad" if after > before else "warn"
+
+
+def _before_and_after(found: Comparison) -> Table:
+    def row(name: str, spread: Spread) -> list[Cell]:
+        there = spread.samples > 0
+        return [name, _um(spread.rms_um), _um(spread.peak_um if there else math.nan), str(spread.samples),
+                utc(spread.worst_ns) if there else "–"]  # fmt: skip
+
+    return Table(
+        title="Before and after", head=["", "rms µm", "largest µm", "samples", "largest at"],
+        rows=[
+            row(f"residual, {found.recorded} (recorded)", found.residual_before),
+            row(f"residual, {found.other}", found.residual_after),
+            row(f"left with the offset, {found.recorded} (recorded)", found.left_before),
+            row(f"left with the offset, {found.other}", found.left_after),
+            row(f"offset of {found.other} − recorded offset", found.offsets),
+        ],
+        note="Residual: measured − predicted. Every recorded sample went through the service's own compensation with "
+        "the other model, limits and losses included.",
+    )  # fmt: skip
+
+
+def _um(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.2f}"

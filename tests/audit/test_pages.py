@@ -1,0 +1,118 @@
+"""`replay --page`: the auditor's page says what was proven and what was not, and shows both offsets of two models."""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensator.audit.comparison import Comparison, Spread
+from compensator.audit.pages import Curves, comparison_page
+from compensator.cli import main
+from compensator.recording import recordings
+from tests.audit.made import MACHINE, Service, other_model
+from tests.audit.test_command import tampered
+
+
+@pytest.fixture
+def rec(tmp_path: Path) -> Path:
+    service = Service(tmp_path / "rec").run(90)
+    service.recorder.start_new()
+    service.run(30).stop()
+    return tmp_path / "rec"
+
+
+def page(capsys: pytest.CaptureFixture[str], code: int, *arguments: str | Path) -> str:
+    out = Path(str(arguments[0])).parent / "page.html"
+    assert main(["replay", *map(str, arguments), "--page", str(out)]) == code
+    assert f"page: {out}" in capsys.readouterr().out
+    return html.unescape(out.read_text(encoding="utf-8"))
+
+
+def outcomes(text: str) -> dict[str, str]:
+    table = text[text.index("What was proven, and what was not") :]
+    return dict(re.findall(r'<th scope="row">([^<]+)</th><td>(\S) ', table[: table.index("</table>")]))
+
+
+def test_what_was_proven_and_what_no_recording_can_prove(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = page(capsys, 0, rec)
+    assert '<p class="verdict good">' in text and "Proven: 120 samples in 2 recording(s)" in text
+    assert "no signature was checked" in text
+    assert list(outcomes(text).values()) == ["✓", "✓", "✓", "–", "✓", "–", "–"]
+    for path in recordings(rec, MACHINE):
+        assert text.count(path.name) >= 2
+    assert 'href="#word-finished"' in text and "first sample that comes out differently" not in text
+
+
+def test_a_change_is_shown_field_by_field(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tampered(recordings(rec, MACHINE)[0])
+    text = page(capsys, 3, rec)
+    assert '<p class="verdict bad">' in text
+    assert "Not proven: 1 finding(s) and 1 sample(s) that come out differently in 2 recording(s)" in text
+    assert '<tr><th scope="row">valid_for_s</th><td>950.0</td><td>150.0</td></tr>' in text
+    assert [*outcomes(text).values()][:3] == ["✗", "✗", "✓"]
+    assert 'href="#word-altered"' in text
+
+
+def test_a_file_that_is_missing_is_not_proven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    service = Service(tmp_path / "rec")
+    for _ in range(3):
+        service.run(10)
+        service.recorder.start_new()
+    service.stop()
+    recordings(tmp_path / "rec", MACHINE)[1].unlink()
+    text = page(capsys, 3, tmp_path / "rec")
+    assert [*outcomes(text).values()][:3] == ["✓", "✓", "✗"] and 'href="#word-missing_file"' in text
+
+
+def test_a_file_without_an_end_is_said_to_have_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Service(tmp_path / "rec").run(20).kill()
+    text = page(capsys, 0, tmp_path / "rec")
+    assert [*outcomes(text).values()] == ["✓", "✓", "✓", "–", "✗", "–", "–"]
+    assert 'href="#word-open"' in text
+
+
+def test_both_offsets_of_two_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Service(tmp_path / "rec", model=other_model()).run(200).stop()
+    text = page(capsys, 0, tmp_path / "rec", "--model", "quill")
+    assert "quill on what other recorded" in text and "with the recorded other." in text
+    assert "Offset of both models" in text and "What is left: measured deformation + offset" in text
+    figures = [line for line in re.findall(r"<desc>(.*?)</desc>", text) if "other (recorded): " in line]
+    assert len(figures) == 2
+    assert text.index("<svg") < text.index("Before and after")
+
+
+def test_a_page_of_another_format_is_refused_before_the_work(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(rec), "--page", "page.doc"]) == 2
+    assert "--page page.doc: expected a name that ends in .html, .pdf or .png" in capsys.readouterr().err
+    out = rec.parent / "audit.pdf"
+    assert main(["replay", str(rec), "--page", str(out)]) == 0
+    assert out.read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(("after", "tone"), [(1.0, "good"), (3.0, "bad"), (2.0, "warn"), (math.nan, "warn")])
+def test_the_tone_says_which_is_better(after: float, tone: str) -> None:
+    before, then = Spread(), Spread()
+    if not math.isnan(after):
+        before.add(2.0, 1)
+        then.add(after, 1)
+    found = Comparison("a", "b", before, then, before, then, Spread(), 1, [])
+    curves = Curves()
+    curves.add(60 * 10**9, math.nan, 1.0, math.nan, 2.0)
+    made = comparison_page(found, curves)
+    assert made.tone == tone
+    assert ("Y was not measured" in made.verdict) == math.isnan(after)
+
+
+def test_curves_of_many_samples_are_those_of_the_samples() -> None:
+    curves = Curves()
+    for i in range(12_000):
+        curves.add(i * 60 * 10**9, 5.0 if i == 7777 else 0.0, float(i % 10), math.nan, 1.0)
+    assert (curves.first_s, curves.last_s) == (0.0, 11_999 * 60.0)
+    recorded, other = curves.line("", "recorded"), curves.line("", "left other")
+    assert (np.nanmin(recorded.y), np.nanmax(recorded.y)) == (0.0, 9.0)
+    assert np.isnan(other.y).all() and curves.line("", "left recorded").y.max() == 12.0
