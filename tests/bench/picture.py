@@ -1,0 +1,101 @@
+"""The picture of the README: a day of the loop, drawn from the recordings of a `make demo`.
+
+    python -m tests.bench.picture [demo-out] [compensator/report/loop.svg]
+
+Above: the deformation that was measured, and the offset that was published. Below: what is left of it with the model of
+the calibration, and with the one that the diagnosis has extended and the running service adopts after an hour. Left is
+the measured mean of each minute and the offset that stood in it, its rate followed for half of it.
+"""
+
+import json
+import re
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from compensator.recording import read_messages
+from compensator.report.drawing import svg
+from compensator.report.figure import Figure, Line
+
+TOP = Path(__file__).resolve().parents[2]
+WIDTH, GAP = 9.0, 6.0
+UNIT = re.compile(r'width="([\d.]+)pt" height="([\d.]+)pt"')
+
+
+def day(folder):
+    """Return hours since the start, measured deformation, offset, and what was left in each minute, µm."""
+    rows = {}
+    for path in sorted(folder.glob("*.mcap"), key=lambda path: path.name):
+        for record in read_messages(path, ("estimate", "offset")):
+            message = json.loads(record.data)
+            rows.setdefault(message["seq"], {}).update(message)
+    kept = [rows[seq] for seq in sorted(rows)]
+    # null is missing and stays so: a gap in the curve.
+    y, offset, rate = (
+        np.array([row.get(name) for row in kept], dtype=float)
+        for name in ("y_um", "y_offset_um", "y_offset_rate_um_per_min")
+    )
+    hours = np.array([row["time_utc_ns"] for row in kept], dtype=float) / 3.6e12
+    left = np.full(y.size, np.nan)
+    for i, (before, after) in enumerate(pairwise(kept), start=1):
+        if after["seq"] == before["seq"] + 1:
+            left[i] = y[i] + offset[i - 1] + 0.5 * rate[i - 1]
+    return hours - hours[0], y, offset, left
+
+
+def figures(demo):
+    hours, y, offset, extended = day(demo / "second-day-extended" / "recordings")
+    hours_first, _, _, first = day(demo / "second-day-first" / "recordings")
+    judged = hours > 1.5
+    rms = {name: float(np.sqrt(np.nanmean(v[m] ** 2))) for name, v, m in (
+        ("first", first, hours_first > 1.5), ("extended", extended, judged), ("none", y, judged))}  # fmt: skip
+    common = {"x_label": "time, h", "x_limits": (0.0, 24.0)}
+    return (
+        Figure(
+            title="A working day of the simulated conduction machine", y_label="Y, µm",
+            lines=(Line("deformation in Y, measured", hours, y), Line("offset of Y, published", hours, offset)),
+            height=2.9, **common,
+        ),
+        Figure(
+            title="What is left", y_label="left, µm", height=2.9,
+            lines=(
+                Line(f"model of the calibration ({rms['first']:.1f} µm rms)", hours_first, first),
+                Line(f"extended by diagnose, adopted after 1 h ({rms['extended']:.1f} µm rms)", hours, extended),
+            ),
+            **common,
+        ),
+    ), rms  # fmt: skip
+
+
+def stacked(pictures):
+    """Put pictures below each other into one that stands alone, in light and dark."""
+    text = (TOP / "compensator/report/style.css").read_text(encoding="utf-8")
+    light, dark = (" ".join(re.findall(r"--[\w-]+: #[0-9a-f]{6};", block)) for block in text.split("{", 4)[1:4:2])
+    parts, below, width = [], 0.0, 0.0
+    for i, picture in enumerate(pictures):
+        drawn = svg(picture, f"p{i}", WIDTH)
+        width, height = (float(v) for v in UNIT.search(drawn).groups())
+        parts.append(drawn.replace("<svg ", f'<svg x="0" y="{below:g}" ', 1).replace('pt"', '"'))
+        below += height + GAP
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" '
+        f'viewBox="0 0 {width:g} {below:g}" width="{width:g}pt" height="{below:g}pt" role="img">'
+        f"<title>{'; '.join(picture.title for picture in pictures)}</title>"
+        f"<style>:root {{ {light} }} @media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }} "
+        "text { font-family: system-ui, sans-serif; }</style>"
+        '<rect width="100%" height="100%" style="fill: var(--paper)"/>'
+    )
+    return head + "".join(parts) + "</svg>\n"
+
+
+def main(demo="demo-out", out=TOP / "compensator/report/loop.svg"):
+    pictures, rms = figures(Path(demo) / "conduction")
+    Path(out).write_text(stacked(pictures), encoding="utf-8")
+    print(f"{out}: {Path(out).stat().st_size / 1024:.0f} KB; µm rms after 1.5 h: without {rms['none']:.2f}, "
+          f"first model {rms['first']:.2f}, extended {rms['extended']:.2f}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
