@@ -302,7 +302,7 @@ class System:
         units = sorted({*self.running(), *(path.name for path in wanted)}) if self._systemd else []
         if units:
             run(["systemctl", "disable", "--now", *units])
-            say(f"{', '.join(units)}: stopped, recordings finished")
+            say(f"{', '.join(units)}: stopped")
 
     def check_python(self) -> None:
         """Refuse a Python that cannot make the environment, or that the service could not see.

@@ -19,7 +19,7 @@ TEXT = GUIDE.read_text(encoding="utf-8")
 LINES = commands(TEXT)
 #: Guides that are still being written.
 PENDING = {"linuxcnc/README.md"}
-OF_OTHERS = {"systemctl", "journalctl", "rsync", "sh"}
+OF_OTHERS = {"systemctl", "journalctl", "rsync", "sh", "openssl", "chgrp", "chmod"}
 
 
 def refusal(parser: argparse.ArgumentParser, words: list[str]) -> str:
