@@ -21,6 +21,7 @@ from compensator.service.daemon import Daemon
 from compensator.service.finishing import Retention
 from compensator.service.model_store import ModelStore
 from compensator.service.precautions import precautions
+from compensator.service.presence import sole_user
 from compensator.service.publisher import Publisher, Reply, Sender
 from compensator.service.recorder import Recorder
 from compensator.service.restart import resume
@@ -150,38 +151,39 @@ async def run_service(
     config = loaded.config
     folder = loaded.resolve(config.recording.folder)
     keep = Retention(keep_days=config.recording.keep_days, keep_mb=config.recording.keep_mb)
-    attachments = {"config.toml": loaded.data, "model.toml": model_bytes}
-    recorder = Recorder(folder, config.machine.name, attachments, retention=keep, signer=_signer(loaded))
+    with sole_user(folder, config.machine.name):
+        attachments = {"config.toml": loaded.data, "model.toml": model_bytes}
+        recorder = Recorder(folder, config.machine.name, attachments, retention=keep, signer=_signer(loaded))
 
-    def command(name: str, payload: bytes, sender: Sender) -> Reply:
-        return daemon.command(name, payload, sender)
+        def command(name: str, payload: bytes, sender: Sender) -> Reply:
+            return daemon.command(name, payload, sender)
 
-    def publish(name: str, data: bytes) -> None:
-        publisher.publish(name, data)
-        if on_publish is not None:
-            on_publish(name, data)
+        def publish(name: str, data: bytes) -> None:
+            publisher.publish(name, data)
+            if on_publish is not None:
+                on_publish(name, data)
 
-    publisher = Publisher(config.zenoh, command)
-    clock = clock or SystemClock()
-    try:
-        for warning in precautions(loaded):
-            log.warning("%s: warning: %s", path, warning)
-    except ConfigError as error:  # recording goes on, whether anybody can be told or not
-        log.error("%s; the router will refuse the service", error)
-    store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
-    resumed = resume(loaded, model)
-    checks: tuple[str, str, dict[str, Any]] = ("plausibility", resumed.compensation.plausibility.describe(), {})
-    daemon = Daemon(
-        config=config, compensation=resumed.compensation, devices=fleet.devices, recorder=recorder,
-        publish=publish, clock=clock,
-        first_sequence=first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s),
-        adoption=Adoption(config, folder, store), notes=(*resumed.notes, checks),
-    )  # fmt: skip
-    try:
-        with publisher:
-            if on_ready is not None:
-                on_ready(daemon)
-            await daemon.run(samples=samples, on_sample=on_sample, on_poll=on_poll)
-    finally:
-        await fleet.close()
+        publisher = Publisher(config.zenoh, command)
+        clock = clock or SystemClock()
+        try:
+            for warning in precautions(loaded):
+                log.warning("%s: warning: %s", path, warning)
+        except ConfigError as error:  # recording goes on, whether anybody can be told or not
+            log.error("%s; the router will refuse the service", error)
+        store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
+        resumed = resume(loaded, model)
+        checks: tuple[str, str, dict[str, Any]] = ("plausibility", resumed.compensation.plausibility.describe(), {})
+        daemon = Daemon(
+            config=config, compensation=resumed.compensation, devices=fleet.devices, recorder=recorder,
+            publish=publish, clock=clock,
+            first_sequence=first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s),
+            adoption=Adoption(config, folder, store), notes=(*resumed.notes, checks),
+        )  # fmt: skip
+        try:
+            with publisher:
+                if on_ready is not None:
+                    on_ready(daemon)
+                await daemon.run(samples=samples, on_sample=on_sample, on_poll=on_poll)
+        finally:
+            await fleet.close()
     return daemon

@@ -16,6 +16,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
+from compensator.service.presence import declare_alive
 from compensator.service.session import in_words, session_config, tell_links
 
 #: Commands that the service takes, each a query on `thermal/command/<name>/<who sends it>` or `thermal/command/<name>`.
@@ -73,7 +74,7 @@ class Publisher:
     Raises
     ------
     ServiceError
-        From `open`, when an endpoint cannot be listened on or a client finds no router.
+        From `open`, when an endpoint cannot be listened on, a client finds no router, or the machine has its service.
     """
 
     def __init__(self, settings: Zenoh, on_command: CommandHandler) -> None:
@@ -96,6 +97,13 @@ class Publisher:
             endpoints = ", ".join(self._settings.listen + self._settings.connect) or "no endpoints"
             raise ServiceError(f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})") from error
         session = self._session
+        try:
+            # First of all: nothing may be said or answered in the name of a machine that has its service.
+            token = declare_alive(session, self._settings.prefix, reaches_others=bool(self._settings.connect))
+        except ServiceError:
+            self.close()
+            raise
+        self._declared.append(token)
         for name in _KEYS:
             self._publishers[name] = session.declare_publisher(
                 self.key(name),
@@ -109,8 +117,6 @@ class Publisher:
         for name in COMMANDS:
             for key in (self.key(name), f"{self.key(name)}/*"):
                 self._declared.append(session.declare_queryable(key, self._answer_command(name)))
-        token = f"{self._settings.prefix}/thermal/alive"
-        self._declared.append(session.liveliness().declare_token(token))
         tell_links(session, self._settings.connect)
 
     def publish(self, name: str, data: bytes) -> None:

@@ -44,6 +44,9 @@ def machine_rules(machine: dict[str, Any]) -> list[dict[str, Any]]:
     name, own = machine["name"], [f"{machine['prefix']}/thermal/**"]
     return [
         rule(f"{name} publishes", "ingress", ["put", "reply", "declare_queryable", "liveliness_token"], own),
+        # It asks whether the machine has its service already.
+        rule(f"{name} asks", "ingress", ["liveliness_query"], own),
+        rule(f"{name} is told", "egress", ["liveliness_token"], own),
         rule(f"{name} hears", "egress", ["declare_subscriber", "query"], ["**"]),
     ]
 

@@ -1,0 +1,115 @@
+"""One service for one machine: a second one, started by mistake here or elsewhere, is refused and harms nothing.
+
+On one computer a lock on a file in the folder of the recordings tells; the kernel lets go of it however the service
+ends. Elsewhere the liveliness token tells. Two that start at the same moment show themselves by a token each before
+they count as alive: one at most goes on.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from compensator.errors import ServiceError
+
+log = logging.getLogger("compensator")
+
+#: So long the token of a service that is gone without a sign may stand (the lease, and some more), s.
+STALE_S = 6.0
+#: So long one that starts waits for others that do, s.
+SHOWN_S = 0.4
+#: So long a question for tokens may take, s.
+ANSWER_S = 2.0
+
+
+@contextmanager
+def sole_user(folder: Path, machine: str) -> Iterator[None]:
+    """Hold the folder of the recordings for one machine.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Made when it is not there. Where the disk does not take the lock the service goes on without it: compensation
+        must not wait for a disk.
+    machine : str
+        Name of the machine.
+
+    Raises
+    ------
+    ServiceError
+        If another service holds it.
+    """
+    path = folder / f"{machine}.lock"
+    with ExitStack() as held:
+        try:
+            descriptor = _opened(path)
+            held.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ServiceError(f"{path}: held by another service of {machine}, which goes on; this one ends") from error
+        except OSError as error:
+            log.warning("%s: cannot be locked, so a second service is not noticed here: %s", path, error)
+        yield
+
+
+def _opened(path: Path) -> int:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError:
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)  # on a disk that is read-only by now
+
+
+def declare_alive(session: Any, prefix: str, *, reaches_others: bool) -> Any:
+    """Declare the liveliness token of a service, or refuse where another one is alive.
+
+    Parameters
+    ----------
+    session : zenoh.Session
+        Open.
+    prefix : str
+        Of the machine.
+    reaches_others : bool
+        Whether the session connects to anybody; a service that only listens cannot ask.
+
+    Returns
+    -------
+    zenoh.LivelinessToken
+        `thermal/alive`.
+
+    Raises
+    ------
+    ServiceError
+        If another service of this prefix is alive, or starts at the same moment and was first.
+    """
+    key = f"{prefix}/thermal/alive"
+    if not reaches_others:
+        return session.liveliness().declare_token(key)
+    end = time.monotonic() + STALE_S
+    while _tokens(session, key):
+        if time.monotonic() > end:
+            raise ServiceError(f"{key}: another service is alive there and goes on; this one ends")
+        time.sleep(0.5)
+    others = f"{prefix}/thermal/starting"
+    own = f"{others}/{time.time_ns():020d}-{secrets.token_hex(8)}"
+    candidate = session.liveliness().declare_token(own)
+    try:
+        time.sleep(SHOWN_S)
+        first = min([own, *_tokens(session, f"{others}/*")])
+        if first != own or _tokens(session, key):
+            raise ServiceError(f"{key}: another service started at the same moment and goes on; this one ends")
+        return session.liveliness().declare_token(key)
+    finally:
+        candidate.undeclare()
+
+
+def _tokens(session: Any, key: str) -> list[str]:
+    replies = session.liveliness().get(key, timeout=ANSWER_S)
+    return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
