@@ -2,7 +2,7 @@
 
 On one computer a lock on a file in the folder of the recordings tells; the kernel lets go of it however the service
 ends. Elsewhere the liveliness token tells. Two that start at the same moment show themselves by a token each before
-they count as alive: one at most goes on.
+they count as alive: one at most goes on. Two that begin while nobody is reached are not noticed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import zenoh
+
+from compensator.config import Zenoh
 from compensator.errors import ServiceError
+from compensator.service.session import put, session_config
 
 log = logging.getLogger("compensator")
 
@@ -67,31 +72,44 @@ def _opened(path: Path) -> int:
         return os.open(path, os.O_RDONLY | os.O_CLOEXEC)  # on a disk that is read-only by now
 
 
-def declare_alive(session: Any, prefix: str, *, reaches_others: bool) -> Any:
-    """Declare the liveliness token of a service, or refuse where another one is alive.
+@contextmanager
+def sole_voice(settings: Zenoh) -> Iterator[None]:
+    """See that no service of this prefix is alive; the block declares the own token.
+
+    A session of its own asks, a client: a router does not tell peers of each other. Where it reaches nobody nothing is
+    known of others, and compensation begins all the same.
 
     Parameters
     ----------
-    session : zenoh.Session
-        Open.
-    prefix : str
-        Of the machine.
-    reaches_others : bool
-        Whether the session connects to anybody; a service that only listens cannot ask.
-
-    Returns
-    -------
-    zenoh.LivelinessToken
-        `thermal/alive`.
+    settings : Zenoh
+        Of the service.
 
     Raises
     ------
     ServiceError
         If another service of this prefix is alive, or starts at the same moment and was first.
     """
+    with ExitStack() as held:
+        if settings.connect:
+            try:
+                session = held.enter_context(zenoh.open(_asking(settings)))
+            except zenoh.ZError:
+                log.warning("zenoh: nobody is reached, so whether another service is alive elsewhere is not known")
+            else:
+                held.callback(_claim(session, settings.prefix).undeclare)
+        yield
+
+
+def _asking(settings: Zenoh) -> zenoh.Config:
+    config = session_config(msgspec.structs.replace(settings, mode="client", listen=[]))
+    put(config, "connect/timeout_ms", 0)  # one attempt
+    put(config, "connect/exit_on_failure", True)
+    return config
+
+
+def _claim(session: Any, prefix: str) -> Any:
+    """Return the token of a service that starts, where none is alive and no other was first."""
     key = f"{prefix}/thermal/alive"
-    if not reaches_others:
-        return session.liveliness().declare_token(key)
     end = time.monotonic() + STALE_S
     while _tokens(session, key):
         if time.monotonic() > end:
@@ -100,14 +118,12 @@ def declare_alive(session: Any, prefix: str, *, reaches_others: bool) -> Any:
     others = f"{prefix}/thermal/starting"
     own = f"{others}/{time.time_ns():020d}-{secrets.token_hex(8)}"
     candidate = session.liveliness().declare_token(own)
-    try:
-        time.sleep(SHOWN_S)
-        first = min([own, *_tokens(session, f"{others}/*")])
-        if first != own or _tokens(session, key):
-            raise ServiceError(f"{key}: another service started at the same moment and goes on; this one ends")
-        return session.liveliness().declare_token(key)
-    finally:
+    time.sleep(SHOWN_S)
+    first = min([own, *_tokens(session, f"{others}/*")])
+    if first != own or _tokens(session, key):
         candidate.undeclare()
+        raise ServiceError(f"{key}: another service started at the same moment and goes on; this one ends")
+    return candidate
 
 
 def _tokens(session: Any, key: str) -> list[str]:

@@ -16,7 +16,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
-from compensator.service.presence import declare_alive
+from compensator.service.presence import sole_voice
 from compensator.service.session import in_words, session_config, tell_links
 
 #: Commands that the service takes, each a query on `thermal/command/<name>/<who sends it>` or `thermal/command/<name>`.
@@ -91,19 +91,16 @@ class Publisher:
 
     def open(self) -> None:
         """Open the session and declare everything."""
-        try:
-            self._session = zenoh.open(session_config(self._settings))
-        except zenoh.ZError as error:
-            endpoints = ", ".join(self._settings.listen + self._settings.connect) or "no endpoints"
-            raise ServiceError(f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})") from error
-        session = self._session
-        try:
-            # First of all: nothing may be said or answered in the name of a machine that has its service.
-            token = declare_alive(session, self._settings.prefix, reaches_others=bool(self._settings.connect))
-        except ServiceError:
-            self.close()
-            raise
-        self._declared.append(token)
+        # First of all: nothing may be said or answered in the name of a machine that has its service.
+        with sole_voice(self._settings):
+            try:
+                self._session = zenoh.open(session_config(self._settings))
+            except zenoh.ZError as error:
+                endpoints = ", ".join(self._settings.listen + self._settings.connect) or "no endpoints"
+                raise ServiceError(f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})") from error
+            session = self._session
+            token = f"{self._settings.prefix}/thermal/alive"
+            self._declared.append(session.liveliness().declare_token(token))
         for name in _KEYS:
             self._publishers[name] = session.declare_publisher(
                 self.key(name),

@@ -191,7 +191,9 @@ class _Machine:
         self._later(minutes, lambda: [self.device.replaced.pop(place, None) for place in places])  # type: ignore[func-returns-value]
 
     def _device(self) -> None:
-        self.device.error = self.random.choice([DeviceTimeout("module: no answer"), DeviceDisconnected("module: gone")])
+        self.device.error = self.random.choice(
+            [DeviceTimeout("module", "no answer"), DeviceDisconnected("module", "gone")]
+        )
         self._later(self.random.choice([1, 10, 60]), lambda: setattr(self.device, "error", None))
 
     def _full(self) -> None:
