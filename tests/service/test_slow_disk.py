@@ -77,7 +77,7 @@ def events(bench: Bench, kind: str = "recording") -> list[Event]:
 
 
 def look(folder: Path) -> Audit:
-    return audit(recordings(folder, MACHINE), workers=1)
+    return audit(recordings(folder, MACHINE))
 
 
 def at(bench: Bench, actions: dict[int, Callable[[], Any]]) -> None:
