@@ -79,6 +79,8 @@ COMMANDS = (
             arguments.watch, "compensator.commands.watch:run"),
     Command("export", "a recording as a table", "export day.mcap --out day.csv",
             arguments.export, "compensator.commands.export:run"),
+    Command("bridge", "the offset to a control that speaks OPC UA", "bridge opcua --config bridge.toml",
+            arguments.bridge, "compensator.commands.bridge:run"),
     Command("explain", "a state or reason in words", "explain degraded",
             arguments.explain, "compensator.commands.explain:run"),
 )  # fmt: skip

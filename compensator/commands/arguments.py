@@ -42,6 +42,13 @@ def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="CSV")
 
 
+def bridge(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `bridge`."""
+    parser.add_argument("protocol", choices=("opcua",), help="what the control speaks")
+    parser.add_argument("--config", required=True, metavar="FILE", help="TOML with [receiver] and [opcua]")
+    parser.add_argument("--check", action="store_true", help="look at the file, open nothing")
+
+
 def explain(parser: argparse.ArgumentParser) -> None:
     """Describe the argument of `explain`."""
     parser.add_argument("code", metavar="CODE", help="such as degraded, or t_q_missing")

@@ -1,0 +1,160 @@
+"""From the offset to a PLC's data block over OPC UA: the thin layer of asyncua around `Register` and `Receiver`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from asyncua import Client, ua
+from asyncua.crypto import security_policies
+
+from compensator.bridge.register import Register
+from compensator.bridge.settings import OpcUa
+from compensator.errors import ConfigError
+from compensator.receiver import Applied, Receiver
+from compensator.receiver.subscriber import monotonic_s
+
+log = logging.getLogger("compensator")
+
+#: What `state_node` gets: the follower's states, and 4 where nothing may be written.
+STATES = ("starting", "following", "holding", "fading", "trouble")
+#: The counter of `heartbeat_node` fits into every integer of a PLC.
+HEARTBEAT_MODULUS = 2**15
+_REALS = (ua.VariantType.Float, ua.VariantType.Double)
+_INTEGERS = (
+    ua.VariantType.Byte, ua.VariantType.Int16, ua.VariantType.UInt16, ua.VariantType.Int32, ua.VariantType.UInt32,
+    ua.VariantType.Int64, ua.VariantType.UInt64,
+)  # fmt: skip
+#: What a connection that is lost, refused or silent raises.
+_GONE = (OSError, ua.UaError, asyncio.TimeoutError, ConnectionError)
+
+
+class Bridge:
+    """Writes the offset to a PLC.
+
+    Parameters
+    ----------
+    settings : OpcUa
+        Where, in which unit and with which sign.
+    receiver : Receiver
+        Entered by the caller; its `step_max_s` should be two cycles.
+    say : callable, optional
+        Takes a line whenever state or reasons change; the log where none is given.
+    """
+
+    def __init__(self, settings: OpcUa, receiver: Receiver, say: Callable[[str], None] = log.info) -> None:
+        self._settings = settings
+        self._receiver = receiver
+        self._say = say
+        self._said = ""
+        self._beat = 0
+        self.register = Register(
+            receiver.follower, sign=settings.sign, unit_um=settings.unit_um,
+            tolerance_um=settings.readback_tolerance_um, resume_after_s=settings.resume_after_s,
+        )  # fmt: skip
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Run until `stop` is set; what the PLC holds then stands.
+
+        Raises
+        ------
+        ConfigError
+            Where a node is of a type that cannot hold what is meant for it.
+        """
+        while not stop.is_set():
+            try:
+                async with await self._client() as client:
+                    await self._connected(client, stop)
+            except _GONE as error:
+                self.register.lost(f"{self._settings.endpoint}: {type(error).__name__} {error}".rstrip())
+            await self._apart(stop)
+
+    async def _client(self) -> Client:
+        settings = self._settings
+        client = Client(settings.endpoint, timeout=settings.timeout_s)
+        if settings.user:
+            client.set_user(settings.user)
+            client.set_password(Path(settings.password_file).read_text(encoding="utf-8").strip())
+        if settings.security_policy:
+            await client.set_security(
+                getattr(security_policies, f"SecurityPolicy{settings.security_policy}"), settings.certificate,
+                settings.private_key, server_certificate=settings.server_certificate,
+                mode=ua.MessageSecurityMode.SignAndEncrypt,
+            )  # fmt: skip
+        return client
+
+    async def _connected(self, client: Client, stop: asyncio.Event) -> None:
+        nodes = await self._nodes(client)
+        self.register.lost("")
+        while not stop.is_set():
+            await self._cycle(nodes)
+            await _pause(stop, self._settings.cycle_s)
+
+    async def _nodes(self, client: Client) -> dict[str, tuple[Any, ua.VariantType]]:
+        nodes = {}
+        wanted = {"offset_node": _REALS, "heartbeat_node": _INTEGERS, "state_node": _INTEGERS,
+                  "enable_node": (ua.VariantType.Boolean,)}  # fmt: skip
+        for key, kinds in wanted.items():
+            name = getattr(self._settings, key)
+            if not name:
+                continue
+            node = client.get_node(name)
+            kind = await node.read_data_type_as_variant_type()
+            if kind not in kinds:
+                expected = ", ".join(one.name for one in kinds)
+                raise ConfigError(f"opcua.{key} = {name!r}: is a {kind.name}, expected one of {expected}")
+            nodes[key] = (node, kind)
+        self.register.single = nodes["offset_node"][1] is ua.VariantType.Float
+        return nodes
+
+    async def _cycle(self, nodes: dict[str, tuple[Any, ua.VariantType]]) -> None:
+        node, kind = nodes["offset_node"]
+        may_move = self.register.seen(monotonic_s(), float(await node.read_value()))
+        enabled = "enable_node" not in nodes or bool(await nodes["enable_node"][0].read_value())
+        if may_move and enabled:
+            self._receiver.follower.follow()
+        else:
+            self._receiver.follower.hold()
+        applied = self._receiver.poll()
+        if may_move:
+            value = self.register.value(applied.offset_um)
+            if value is not None:
+                await _write(node, value, kind)
+                self.register.wrote(value)
+        self._beat = (self._beat + 1) % HEARTBEAT_MODULUS
+        state = STATES.index("trouble" if self.register.trouble else applied.state)
+        for key, number in (("state_node", state), ("heartbeat_node", self._beat)):
+            if key in nodes:
+                await _write(nodes[key][0], number, nodes[key][1])
+        self._tell(applied)
+
+    async def _apart(self, stop: asyncio.Event) -> None:
+        """Without the PLC: go on hearing what is published, until the next try."""
+        self._receiver.follower.hold()
+        end_s = monotonic_s() + self._settings.retry_s
+        while not stop.is_set() and monotonic_s() < end_s:
+            self._tell(self._receiver.poll())
+            await _pause(stop, min(self._settings.cycle_s, self._settings.retry_s))
+
+    def _tell(self, applied: Applied) -> None:
+        codes = "; ".join(r.code if r.code in ("catching_up", "expired") else r.text for r in applied.reasons)
+        news = (
+            f"trouble: {self.register.trouble}" if self.register.trouble else f"{applied.state}: {codes}".rstrip(": ")
+        )
+        if news != self._said:
+            self._said = news
+            self._say(news)
+
+
+async def _write(node: Any, value: float, kind: ua.VariantType) -> None:
+    # Without time and status: PLCs refuse to be told those.
+    await node.write_value(ua.DataValue(ua.Variant(value, kind)))
+
+
+async def _pause(stop: asyncio.Event, seconds: float) -> None:
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(stop.wait(), seconds)

@@ -1,0 +1,138 @@
+"""Settings of the OPC UA bridge: a TOML file with `[receiver]` and `[opcua]`; an unknown key is an error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from compensator.errors import ConfigError
+from compensator.receiver import ReceiverError, Settings, load_settings
+from compensator.receiver.settings import read_table
+
+#: µm for each unit that the PLC may count in.
+UNITS_UM = {"mm": 1000.0, "um": 1.0}
+#: Security policies of OPC UA that are fit for use.
+POLICIES = ("Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss")
+_FILES = ("password_file", "certificate", "private_key", "server_certificate")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpcUa:
+    """`[opcua]`.
+
+    Parameters
+    ----------
+    endpoint : str
+        Such as `opc.tcp://192.168.214.241:4840`.
+    offset_node : str
+        A REAL or LREAL, such as `ns=2;s=/Plc/DB100.DBD0:REAL`.
+    unit : str
+        `mm` or `um`: what it counts in.
+    sign : int
+        1 or −1: whether the control adds or subtracts it. There is no default: it is found on the machine.
+    sign_checked : str
+        Who found it when and how, in words.
+    cycle_s : float
+        How often it is read and written, s.
+    readback_tolerance_um : float
+        How far what is read back may be from what was written, µm.
+    resume_after_s : float
+        After a difference, how long the PLC's value must stand before the offset goes on from it, s.
+    retry_s, timeout_s : float
+        Pause before the next try to connect, and how long an answer may take, s.
+    heartbeat_node, state_node, enable_node : str
+        Optional: an integer that counts up each cycle; one for the state; a BOOL of the PLC, false holds the offset.
+    user, password_file : str
+        Login; the password stands alone in a file.
+    security_policy, certificate, private_key, server_certificate : str
+        Signed and encrypted: one of the policies and the files for it. Without, the line is open.
+    """
+
+    endpoint: str
+    offset_node: str
+    unit: str
+    sign: int
+    sign_checked: str
+    cycle_s: float = 1.0
+    readback_tolerance_um: float = 0.1
+    resume_after_s: float = 10.0
+    retry_s: float = 5.0
+    timeout_s: float = 4.0
+    heartbeat_node: str = ""
+    state_node: str = ""
+    enable_node: str = ""
+    user: str = ""
+    password_file: str = ""
+    security_policy: str = ""
+    certificate: str = ""
+    private_key: str = ""
+    server_certificate: str = ""
+
+    @property
+    def unit_um(self) -> float:
+        """Return µm for each unit of the PLC."""
+        return UNITS_UM[self.unit]
+
+
+def load_bridge(path: str | Path) -> tuple[Settings, OpcUa]:
+    """Read and check a bridge's file; nothing is opened.
+
+    Raises
+    ------
+    ConfigError
+        One line that names file, key, value and what was expected.
+    """
+    try:
+        receiver, tables = load_settings(path)
+        table = tables.pop("opcua", None)
+        if not isinstance(table, dict):
+            raise ReceiverError(f"{path}: opcua: missing, expected a table [opcua]")
+        if tables:
+            raise ReceiverError(f"{path}: {next(iter(tables))}: unknown table, expected receiver, opcua")
+        for key in ("sign", "sign_checked"):
+            if key not in table:
+                raise ReceiverError(
+                    f"{path}: opcua.{key}: missing; the sign is found on this machine with a dial gauge, and who found "
+                    f'it when and how is written down (sign = 1 or -1, sign_checked = "…")'
+                )
+        opcua = read_table(OpcUa, table, source=str(path), name="opcua")
+        _check(opcua, str(path))
+    except ReceiverError as error:
+        raise ConfigError(str(error)) from error
+    folder = Path(path).parent
+    values = {field.name: getattr(opcua, field.name) for field in fields(opcua)}
+    files = {key: str((folder / values[key]).resolve()) for key in _FILES if values[key]}
+    for key, file in files.items():
+        if not Path(file).is_file():
+            raise ConfigError(f"{path}: opcua.{key} = {values[key]!r}: no such file")
+    return receiver, OpcUa(**{**values, **files})
+
+
+def _check(opcua: OpcUa, path: str) -> None:
+    def wrong(key: str, expected: str) -> ReceiverError:
+        return ReceiverError(f"{path}: opcua.{key} = {getattr(opcua, key)!r}: expected {expected}")
+
+    if opcua.sign not in (1, -1):
+        raise wrong("sign", "1 or -1, found on this machine with a dial gauge")
+    if not opcua.sign_checked.strip():
+        raise wrong("sign_checked", "who found the sign, when and how")
+    if opcua.unit not in UNITS_UM:
+        raise wrong("unit", f"one of {', '.join(UNITS_UM)}")
+    if not opcua.endpoint.startswith("opc.tcp://"):
+        raise wrong("endpoint", "opc.tcp://HOST:PORT")
+    if not opcua.offset_node:
+        raise wrong("offset_node", "a node such as ns=2;s=/Plc/DB100.DBD0:REAL")
+    bounds = {"cycle_s": (0.05, 10.0), "readback_tolerance_um": (1e-4, 10.0), "resume_after_s": (1.0, 3600.0),
+              "retry_s": (0.1, 300.0), "timeout_s": (0.1, 60.0)}  # fmt: skip
+    for key, (least, most) in bounds.items():
+        if not least <= getattr(opcua, key) <= most:
+            raise wrong(key, f"{least:g} to {most:g}")
+    if opcua.resume_after_s < 2.0 * opcua.cycle_s:
+        raise wrong("resume_after_s", "at least two cycles")
+    if bool(opcua.user) != bool(opcua.password_file):
+        raise wrong("user", "user and password_file together")
+    files = (opcua.certificate, opcua.private_key, opcua.server_certificate)
+    if opcua.security_policy and opcua.security_policy not in POLICIES:
+        raise wrong("security_policy", f"one of {', '.join(POLICIES)}")
+    if bool(opcua.security_policy) != any(files) or (any(files) and not all(files)):
+        raise wrong("security_policy", "security_policy, certificate, private_key and server_certificate together")

@@ -1,0 +1,54 @@
+"""`compensator bridge`: the offset to a control that speaks OPC UA, until SIGTERM or SIGINT."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import signal
+
+from compensator.bridge.settings import OpcUa, load_bridge
+from compensator.commands import Answer
+from compensator.errors import ConfigError, UsageError
+from compensator.receiver import Receiver, ReceiverError, Settings
+
+log = logging.getLogger("compensator")
+
+
+def run(arguments: argparse.Namespace) -> Answer | None:
+    """Run the command.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be used, or says no sign that was found on the machine.
+    UsageError
+        If asyncua is not installed.
+    """
+    settings, opcua = load_bridge(arguments.config)
+    if arguments.check:
+        text = (
+            f"{arguments.config}: good. {settings.machine} to {opcua.endpoint}, {opcua.offset_node} in {opcua.unit}, "
+            f"sign {opcua.sign:+d} ({opcua.sign_checked}). Nothing was opened."
+        )
+        return Answer({"ok": True, "machine": settings.machine, "endpoint": opcua.endpoint, "sign": opcua.sign}, text)
+    try:
+        asyncio.run(_serve(settings, opcua))
+    except ReceiverError as error:
+        raise ConfigError(f"{arguments.config}: {error}") from error
+    log.info("compensator bridge: stopped; what the PLC holds stands")
+    return None
+
+
+async def _serve(settings: Settings, opcua: OpcUa) -> None:
+    try:
+        from compensator.bridge.opcua import Bridge
+    except ModuleNotFoundError as error:
+        raise UsageError(f"OPC UA needs {error.name}: pip install quill-compensator[opcua]") from error
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    # asyncua tells every lost connection with a traceback; the bridge says it in one line.
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+    with Receiver(settings, step_max_s=2.0 * opcua.cycle_s) as receiver:
+        await Bridge(opcua, receiver).run(stop)

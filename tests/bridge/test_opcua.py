@@ -1,0 +1,202 @@
+"""The bridge against a PLC's OPC UA server on loopback: values, checks, losses, and what it refuses to start with."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from asyncua import ua
+
+from compensator.bridge.opcua import Bridge
+from compensator.bridge.settings import load_bridge
+from compensator.cli import main
+from compensator.errors import ConfigError
+from compensator.receiver import Receiver
+from tests.bridge.plc import Plc
+from tests.receiver.wire import ScriptedService, free_port, router
+
+CYCLE_S, RATE_UM_PER_S = 0.05, 100.0
+#: Largest step of the value: what the rate allows in two cycles.
+STEP_UM = 2 * CYCLE_S * RATE_UM_PER_S + 0.01
+FILE = """
+[receiver]
+machine = "vmc-07"
+prefix = "shop/vmc-07"
+connect = ["tcp/127.0.0.1:{zenoh}"]
+offset_max_um = 100.0
+offset_rate_max_um_per_min = 6000.0
+
+[opcua]
+endpoint = "{endpoint}"
+offset_node = "ns=2;s=/Plc/DB100.DBD0:REAL"
+unit = "mm"
+sign = -1
+sign_checked = "2026-03-02, dial gauge, J. Novak"
+cycle_s = 0.05
+resume_after_s = 1.0
+retry_s = 0.2
+timeout_s = 5.0
+heartbeat_node = "ns=2;s=/Plc/DB100.DBW4"
+state_node = "ns=2;s=/Plc/DB100.DBW6"
+enable_node = "ns=2;s=/Plc/DB100.DBX8.0"
+"""
+
+
+def written(folder: Path, endpoint: str = "opc.tcp://127.0.0.1:4840", zenoh: int = 7447, **changes: str) -> Path:
+    text = FILE.format(endpoint=endpoint, zenoh=zenoh)
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "bridge.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+async def until(condition: Callable[[], Awaitable[Any]], what: str, timeout_s: float = 30.0) -> None:
+    end = time.monotonic() + timeout_s
+    while not await condition():
+        assert time.monotonic() < end, f"not within {timeout_s} s: {what}"
+        await asyncio.sleep(0.02)
+
+
+@asynccontextmanager
+async def bridging(path: Path, said: list[str]) -> AsyncIterator[Bridge]:
+    settings, opcua = load_bridge(path)
+    stop = asyncio.Event()
+    with Receiver(settings, step_max_s=2.0 * opcua.cycle_s) as receiver:
+        bridge = Bridge(opcua, receiver, said.append)
+        task = asyncio.create_task(bridge.run(stop))
+        try:
+            yield bridge
+        finally:
+            stop.set()
+            await task
+
+
+def check(values: list[float]) -> None:
+    steps = [abs(b - a) * 1000.0 for a, b in itertools.pairwise(values)]
+    assert len(values) > 1 and max(steps) <= STEP_UM, max(steps)
+
+
+async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> None:
+    zenoh, plc, said = free_port(), Plc(free_port(), value=0.002), []  # type: tuple[int, Plc, list[str]]
+    path = written(tmp_path, plc.endpoint, zenoh)
+
+    async def at(um: float) -> bool:
+        return abs(await plc.um() - um) < 0.05
+
+    with router(zenoh), ScriptedService(zenoh) as service:
+        async with bridging(path, said) as bridge:
+            await until(lambda: asyncio.sleep(0, any("trouble" in line for line in said)), "no PLC yet")
+            async with plc:
+                await until(lambda: asyncio.sleep(0, bridge._beat > 3), "connected")
+                assert await at(2.0)  # what it held stands until there is an offset
+                service.put(1, -12.0)
+                await until(lambda: at(12.0), "minus the offset, in mm")
+                check(plc.values)
+                await until(lambda: asyncio.sleep(0, said[-1] == "following"), "following is said")
+                assert await plc.state.read_value() == 1
+                beat = await plc.heartbeat.read_value()
+                await until(lambda: _changed(plc, beat), "the heartbeat")
+                await plc.enable.write_value(False)  # the PLC's own interlock
+                await until(lambda: _is(plc.state, 2), "it holds")
+                service.put(2, -20.0)
+                assert await at(12.0)
+                await plc.enable.write_value(True)
+                await until(lambda: at(20.0), "it goes on")
+                # Somebody else writes: it stands, says so, and goes on from there once that stands.
+                await plc.put(-30.0)
+                await until(lambda: _is(plc.state, 4), "the difference is noticed")
+                assert await at(-30.0) and "somebody else" in said[-1]
+                count = len(plc.values)
+                await until(lambda: at(20.0), "it goes on")
+                check(plc.values[count - 1 :])
+                # A write that is refused moves nothing and is tried again.
+                await plc.offset.set_writable(False)
+                service.put(3, -25.0)
+                await until(lambda: asyncio.sleep(0, "NotWritable" in said[-1] or "Denied" in said[-1]), "refused")
+                assert await at(20.0)
+                await plc.offset.set_writable(True)
+                await until(lambda: at(25.0), "it goes on")
+                # What the PLC holds is no offset: nothing is written over it.
+                await plc.put(5_000.0)
+                await until(lambda: asyncio.sleep(0, "put it right" in said[-1]), "it is said")
+                assert await at(5_000.0)
+                await plc.put(0.0)
+                count = len(plc.values)
+                await until(lambda: at(25.0), "it goes on")
+                check(plc.values[count:])
+            await until(lambda: asyncio.sleep(0, said[-1].startswith("trouble: opc.tcp")), "the server is gone")
+            service.put(4, -10.0)
+            again = Plc(plc.port, value=0.04)
+            async with again:  # restarted, holding something else
+                await until(lambda: _near(again, 10.0), "it goes on from what the PLC holds")
+                assert again.values[0] == pytest.approx(0.04)
+                check(again.values)
+                service.put(5, None, state="fault")
+                await until(lambda: _is(again.state, 2), "it holds")
+                await until(lambda: asyncio.sleep(0, "no offset to rely on" in said[-1]), "it is said")
+                assert await _near(again, 10.0)
+
+
+async def _changed(plc: Plc, beat: int) -> bool:
+    return bool(await plc.heartbeat.read_value() != beat)
+
+
+async def _is(node: Any, value: int) -> bool:
+    return bool(await node.read_value() == value)
+
+
+async def _near(plc: Plc, um: float) -> bool:
+    return abs(await plc.um() - um) < 0.05
+
+
+async def test_a_node_of_another_type_ends_it(tmp_path: Path) -> None:
+    plc = Plc(free_port(), value=0, kind=ua.VariantType.Int32)
+    async with plc:
+        settings, opcua = load_bridge(written(tmp_path, plc.endpoint))
+        with Receiver(settings) as receiver, pytest.raises(ConfigError, match="is a Int32, expected one of Float"):
+            await asyncio.wait_for(Bridge(opcua, receiver, lambda line: None).run(asyncio.Event()), 30.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("sign = -1\n", "", "opcua.sign: missing; the sign is found on this machine"),
+        ("sign = -1\n", "sign = 0\n", "opcua.sign = 0: expected 1 or -1"),
+        ("sign = -1\n", "sign = -1.0\n", "opcua.sign = -1.0: expected a whole number"),
+        ('sign_checked = "2026-03-02, dial gauge, J. Novak"\n', "", "opcua.sign_checked: missing"),
+        ('"2026-03-02, dial gauge, J. Novak"', '" "', "opcua.sign_checked = ' ': expected who"),
+        ('unit = "mm"', 'unit = "inch"', "opcua.unit = 'inch': expected one of mm, um"),
+        ('unit = "mm"', "", "opcua.unit: missing"),
+        ("cycle_s", "cycles_s", "opcua.cycles_s: unknown key"),
+        ("cycle_s = 0.05", "cycle_s = 0.0", "opcua.cycle_s = 0.0: expected 0.05 to 10"),
+        ('"opc.tcp:', '"http:', "expected opc.tcp://HOST:PORT"),
+        ("retry_s", 'user = "x"\nretry_s', "user and password_file together"),
+        ("retry_s", 'security_policy = "None"\nretry_s', "opcua.security_policy = 'None': expected one of"),
+        ("retry_s", 'certificate = "c.der"\nretry_s', "private_key and server_certificate together"),
+        ("retry_s", 'user = "x"\npassword_file = "p"\nretry_s', "opcua.password_file = 'p': no such file"),
+        ("[opcua]", "[opc-ua]", "opcua: missing"),
+        ("[opcua]", "[other]\nx = 1\n[opcua]", "other: unknown table"),
+        ("offset_max_um", "offset_maximum_um", "receiver.offset_maximum_um: unknown key"),
+    ],
+)  # fmt: skip
+def test_it_does_not_start_like_this(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, expected: str
+) -> None:
+    path = written(tmp_path, **{old: new})
+    assert main(["bridge", "opcua", "--config", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert expected in error and str(path) in error and error.count("\n") == 1
+
+
+def test_check_opens_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bridge", "opcua", "--config", str(written(tmp_path)), "--check", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sign"] == -1
