@@ -73,22 +73,10 @@ class Register:
         if self._stands is None or not self._same(value, self._stands[0]):
             self._stands = (value, now_s)
         found_um, left_um = value / self._per_um, self._written / self._per_um
-        self.trouble = f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: somebody else writes there; the offset stands"
-        if now_s - self._stands[1] < self._resume_after_s:
-            return False
-        return self._go_on_from(value)
-
-    def _same(self, a: float, b: float) -> bool:
-        return abs(a - b) <= self._tolerance_um * abs(self._per_um)  # false for NaN
-
-    def _go_on_from(self, value: float) -> bool:
-        offset_um = value / self._per_um
-        largest = self._follower.limits.offset_max_um
-        if not (math.isfinite(offset_um) and abs(offset_um) <= largest):
-            self.trouble = (
-                f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: somebody else writes there; "
-                f"the offset stands"
-            )
+        self.trouble = (
+            f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: somebody else writes there; "
+            f"the offset stands"
+        )
         if now_s - self._stands[1] < self._resume_after_s:
             return False
         return self._go_on_from(value)
