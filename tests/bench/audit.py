@@ -8,10 +8,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import resource
+import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from unittest import mock
@@ -25,6 +26,7 @@ from compensator.container import PAYLOAD, Container
 from compensator.messages import MESSAGES
 from compensator.recording import recordings
 from tests.audit.made import MACHINE, Service
+from tests.bench.figures import Figure, spread, told
 
 SAMPLES = 525_600
 DECODERS = {topic: msgspec.json.Decoder(kind) for topic, kind in MESSAGES.items()}
@@ -66,32 +68,35 @@ def over_all(read: Callable[[Path], int], paths: Sequence[Path], workers: int) -
     return time.perf_counter() - began, count
 
 
-def measure(folder: Path) -> None:
+def measure(folder: Path) -> Iterator[Figure]:
     paths = recordings(folder, MACHINE)
     size = sum(path.stat().st_size for path in paths)
     count = os.cpu_count() or 1
-    print(f"\na year audited: {len(paths)} files, {size / 1e6:.0f} MB, {count} processes")
+    audits, libraries, owns = [], [], []
     for _ in range(3):
-        library, messages = over_all(read_with_library, paths, count)
-        own, _ = over_all(read_by_ourselves, paths, count)
+        libraries.append(over_all(read_with_library, paths, count)[0])
+        owns.append(over_all(read_by_ourselves, paths, count)[0])
         began = time.perf_counter()
         with workers(len(paths), None) as executor:
             found = audit(paths, executor=executor)
-        seconds = time.perf_counter() - began
-        print(
-            f"{found.samples} samples, {messages} messages, clean: {found.clean}; audit {seconds:.1f} s; reading and "
-            f"decoding with the library {library:.1f} s (audit / that = {seconds / library:.2f}), with our reader "
-            f"{own:.1f} s ({seconds / own:.2f})"
-        )
+        audits.append(time.perf_counter() - began)
+        assert found.clean and found.samples == SAMPLES
+    library, own = (statistics.median(a / b for a, b in zip(audits, one, strict=True)) for one in (libraries, owns))
+    beside = (
+        f"{library:.2f} × reading and decoding with the mcap library, {own:.2f} × with our own faster reader "
+        f"({count} processes each)"
+    )
+    what = f"a year audited ({SAMPLES:,} samples, {len(paths)} files, {size / 1e6:.0f} MB)"
+    yield spread(what, audits, "s", wanted="under 30 s; 2.5 ×", beside=beside)
     largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    print(f"largest process: {largest / 1024:.0f} MB")
+    yield told(Figure(what="the same: largest process", found=f"{largest / 1024:.0f} MB", wanted="bounded"))
 
 
-def measurements() -> None:
+def report() -> Iterator[Figure]:
     """Make and audit a year in a folder that is removed afterwards."""
     with tempfile.TemporaryDirectory() as folder:
         make(Path(folder))
-        measure(Path(folder))
+        yield from measure(Path(folder))
 
 
 if __name__ == "__main__":
@@ -99,6 +104,6 @@ if __name__ == "__main__":
         kept = Path(sys.argv[1])
         if not recordings(kept, MACHINE):
             make(kept)
-        measure(kept)
+        list(measure(kept))
     else:
-        measurements()
+        list(report())

@@ -13,6 +13,7 @@ from compensator.messages import number
 from compensator.model.model_file import load_model
 from compensator.service.compensation import Compensation
 from sim_hardware.physics import Duty, PublishedQuill, QuillMachine, World, usual_sensors
+from tests.bench.figures import Figure, told
 from tests.bench.machines import calibrated
 from tests.service.device_faults import HOUR, alone, pairs
 from tests.service.records import sample
@@ -48,21 +49,18 @@ def run(compensation, rows, change=lambda i, values: None):
 
 
 def healthy(name, plant, model, days, seeds, **more):
-    """Count what healthy machines raise."""
+    """Yield what healthy machines raise."""
     raised, total = [], 0
     for seed in seeds:
         for i, outcome in run(Compensation(settings(**more), model), recorded(plant(), seed, days)):
             raised += [(seed, i, text) for kind, text in outcome.notes if kind == "plausibility"]
             total += 1
-    print(f"healthy, {name}: {total / 1440:.0f} days, raised {len(raised)} times {raised[:3]}", flush=True)
-    return raised
+    found = f"raised {len(raised)} times in {total / 1440:.0f} days" + (f": {raised[:3]}" if raised else "")
+    yield told(Figure(what=f"plausibility, healthy machine ({name})", found=found, wanted="never"))
 
 
 def drifts(name, plant, model, **more):
-    """Print after how long a drift is raised, who is suspected, and the error by then."""
-    print(
-        f"drifts, {name}: raised after min (error of the offset then, µm); named: the right one, and it alone after 2 h"
-    )
+    """Yield after how long a drift is raised, who is suspected, and the error by then."""
     for channel, rates in (("t_q_degc", (0.1, 0.5, 1.0, 2.0)), ("at_degc", (0.1, 0.5, 1.0, 2.0)), ("y_um", (1.0, 5.0))):
         for rate in rates:
             delays, errors, right, alone_right = [], [], 0, 0
@@ -84,9 +82,13 @@ def drifts(name, plant, model, **more):
                         if first is not None and i == first + 120:
                             alone_right += named == [f"implausible:{channel}"]
             n = len(delays)
-            print(f"  {channel:<9} {rate:>4} /h: {np.median(delays):4.0f} (most {max(delays)}), "
-                  f"{np.median(errors):.1f} µm; {right} of {n}, alone {alone_right}; raised {n} of {2 * len(BEGINS_H)}",
-                  flush=True)  # fmt: skip
+            unit = "µm" if channel == "y_um" else "K"
+            yield told(Figure(
+                what=f"plausibility, {name}: {channel} drifts by {rate} {unit} an hour; raised after (most), error by "
+                "then; suspected, alone after 2 h",
+                found=f"{np.median(delays):.0f} ({max(delays)}) min, {np.median(errors):.1f} µm; {right} of {n}, "
+                f"alone {alone_right}; raised {n} of {2 * len(BEGINS_H)}",
+            ))  # fmt: skip
 
 
 def episodes(title, courses):
@@ -94,24 +96,28 @@ def episodes(title, courses):
         found = asyncio.run(run_all(Path(folder), courses))
     far = [seen.distance_um for seen in found]
     held = sum("hold" in seen.states for seen in found)
-    print(f"{title}: {len(found)} episodes, {held} held; distance to a run without the fault afterwards: median "
-          f"{np.median(far):.2f}, 95 % {np.quantile(far, 0.95):.2f}, most {max(far):.2f} µm; largest stated std in a "
-          f"fault {max(seen.std_most_um for seen in found):.0f} µm", flush=True)  # fmt: skip
+    yield told(Figure(
+        what=f"{title}: distance to a run without the fault afterwards",
+        found=f"median {np.median(far):.2f}, 95 % {np.quantile(far, 0.95):.2f}, most {max(far):.2f} µm "
+        f"({len(found)} episodes, {held} held)",
+        beside=f"largest stated standard deviation in the fault {max(seen.std_most_um for seen in found):.0f} µm",
+    ))  # fmt: skip
 
 
 def report():
-    """Print everything."""
-    print("\nfaults and plausibility")
+    """Yield everything."""
     model, quill = calibrated()[0], load_model("quill")
-    healthy("conduction machine, calibrated", QuillMachine, model, 30.0, (101, 102))
-    healthy("published machine, residual_std_um = 0.3", PublishedQuill, quill, 30.0, (103,), residual_std_um=0.3)
-    drifts("conduction machine, calibrated", QuillMachine, model)
-    drifts("published machine, residual_std_um = 0.3", PublishedQuill, quill, residual_std_um=0.3)
-    episodes("device faults alone, one sample", alone(1))
-    episodes("device faults alone, an hour", alone(HOUR))
-    episodes("pairs of device faults, one sample", pairs(1, 5))
-    episodes("pairs of device faults, an hour", pairs(HOUR, 5))
+    yield from healthy("conduction machine, calibrated", QuillMachine, model, 30.0, (101, 102))
+    yield from healthy(
+        "published machine, residual_std_um = 0.3", PublishedQuill, quill, 30.0, (103,), residual_std_um=0.3
+    )
+    yield from drifts("conduction machine, calibrated", QuillMachine, model)
+    yield from drifts("published machine, residual_std_um = 0.3", PublishedQuill, quill, residual_std_um=0.3)
+    yield from episodes("device faults alone, one sample", alone(1))
+    yield from episodes("device faults alone, an hour", alone(HOUR))
+    yield from episodes("pairs of device faults, one sample", pairs(1, 5))
+    yield from episodes("pairs of device faults, an hour", pairs(HOUR, 5))
 
 
 if __name__ == "__main__":
-    report()
+    list(report())

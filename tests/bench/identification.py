@@ -19,6 +19,7 @@ from compensator.identify.runs import runs_of
 from compensator.identify.settings import Settings
 from compensator.tables import load_data
 from sim_hardware.physics import Duty, QuillMachine
+from tests.bench.figures import Figure, rows, told
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W, fit_pct, published, simulated
 
 SEEDS = 20
@@ -189,3 +190,26 @@ def spindle():
         [part.role, f"{part.model.rms_um:.1f}", f"{part.nothing.rms_um:.1f}", f"{part.persistence.rms_um:.1f}"]
         for part in result.parts
     ]
+
+
+def report():
+    """Yield the figures; the tables behind them are printed."""
+    found = table()
+    rows("calibration, published case: fit %, median (worst) of 20 seeds",
+         ["path", "by", "fit %", "below the true model", "ms a fit", "of ours"], found)  # fmt: skip
+    for case, wanted in (("TTF", "0.02 points"), ("DTF+TDTF", "0.2 points")):
+        own = [row for row in found if row[0] == case and row[1].startswith("this project")]
+        others = [row for row in found if row[0] == case and row[3] and not row[1].startswith("this project")]
+        best = min(others, key=lambda row: float(row[3]), default=None)
+        beside = f"{best[1]}: {best[3]} points, {best[4]} ms" if best else "no other tool is installed"
+        for row in own:
+            what = f"calibration, published {case}, {row[1].partition(', ')[2]}: below the true model"
+            yield told(Figure(what=what, found=f"{row[3]} points; {row[4]} ms a fit", wanted=f"{wanted}, 50 ms",
+                              beside=beside))  # fmt: skip
+    for kind, name, share, rms in physics():
+        what = f"calibration of simulated conduction physics ({kind}), free run on {name}"
+        yield told(Figure(what=what, found=f"{share} %, {rms} µm rms", wanted="99 %"))
+    for part, model, nothing, persistence in (row for row in spindle() if row[1]):
+        yield told(Figure(what=f"measured spindle ch3, two inputs, first 20 of 32 h fitted: {part}",
+                          found=f"{model} µm rms",
+                          beside=f"no compensation {nothing}, persistence {persistence}"))  # fmt: skip

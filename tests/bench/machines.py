@@ -16,6 +16,7 @@ from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
 from compensator.model.thermal_model import EffectTable
 from sim_hardware.physics import Duty, QuillMachine, World, draw_effect, usual_sensors
+from tests.bench.figures import Figure, told
 from tests.identify.quill_runs import runs_from
 
 #: About how much the effects move Y, µm standard deviation.
@@ -66,21 +67,26 @@ def one(model, own_um, seed, size_um):
     return place, named, (error(dataclasses.replace(model, effects=tuple(tables))) - own_um**2) / before, seconds
 
 
-def report(first, count):
-    """Print a row for each size, and one without an effect."""
+def report(first=1000, count=26):
+    """Yield a figure for each size, and one without an effect."""
     model, own_um = calibrated()
-    print(f"\nconduction machine, effects drawn by seeds {first} to {first + count - 1}:")
-    print(f"{'size µm':<10}{'named':>12}{'alone':>12}{'excess left %':>28}{'s':>14}")
     for size in (*SIZES_UM, 0.0):
         results = [one(model, own_um, seed, size) for seed in range(first, first + count)]
-        named = sum((r[0] in r[1]) if r[0] else not r[1] for r in results)
-        alone = sum((r[1] == [r[0]]) if r[0] else not r[1] for r in results)
-        left = [100.0 * r[2] for r in results if np.isfinite(r[2])]
-        share = f"{np.median(left):.0f} (90 %: {np.quantile(left, 0.9):.0f})" if left else ""
         seconds = [r[3] for r in results]
-        print(f"{size or 'none':<10}{f'{named} of {count}':>12}{f'{alone}':>12}{share:>28}"
-              f"{f'{np.median(seconds):.1f} ({max(seconds):.1f})':>14}", flush=True)  # fmt: skip
+        took = f"{np.median(seconds):.1f} ({max(seconds):.1f}) s a search"
+        if not size:
+            none = sum(not r[1] for r in results)
+            yield told(Figure(what="diagnosis, conduction machine, no effect", wanted="nothing",
+                              found=f"nothing found in {none} of {count}; {took}"))  # fmt: skip
+            continue
+        named, alone = sum(r[0] in r[1] for r in results), sum(r[1] == [r[0]] for r in results)
+        left = [100.0 * r[2] for r in results if np.isfinite(r[2])]
+        yield told(Figure(
+            what=f"diagnosis, conduction machine, effects about {size} µm: named (alone); excess left, median (90 %)",
+            found=f"{named} ({alone}) of {count}; {np.median(left):.0f} ({np.quantile(left, 0.9):.0f}) %; {took}",
+            wanted="90 %; 10 (30) %",
+        ))  # fmt: skip
 
 
 if __name__ == "__main__":
-    report(1000, 39)
+    list(report(1000, 39))

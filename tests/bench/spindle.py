@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from compensator.cli import main
+from tests.bench.figures import Figure, rows, told
 
 FILE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
 #: Hours of the fit, hours that judge.
@@ -108,19 +109,25 @@ def one(probe, fit_h, judge_h, *, beside=True):
 
 
 def report():
-    """Print a row for each probe and split."""
+    """Yield a figure for each probe, fitted on 20 h; every split is printed."""
     if not FILE.exists():
-        print("measured spindle: the data is not here")
+        yield told(Figure(what="measured spindle", found="the data is not here"))
         return
     names = ("none", "persistence", "two inputs", "ridge, all", "extended")
-    print("\nmeasured spindle, free run on hours that nothing saw, µm rms (mean absolute):")
-    print(f"{'':<8}{'fit, h':>8}{'judged, h':>11}" + "".join(f"{name:>15}" for name in names) + "   found")
+    body, figures = [], []
     for probe in range(1, 6):
         for fit_h, judge_h in SPLITS:
             errors, found = one(probe, fit_h, judge_h)
-            cells = "".join(f"{errors[name][0]:>8.1f} ({errors[name][1]:4.1f})" for name in names)
-            print(f"ch{probe:<6}{fit_h[0]:>4}-{fit_h[1]:<4}{judge_h[0]:>6}-{judge_h[1]:<4}{cells}   {found}")
+            cells = [f"{errors[name][0]:.1f} ({errors[name][1]:.1f})" for name in names]
+            body.append([f"ch{probe}", f"{fit_h[0]}-{fit_h[1]}", f"{judge_h[0]}-{judge_h[1]}", *cells, found])
+            if fit_h == (0, 20):
+                beside = ", ".join(f"{name} {errors[name][0]:.1f}" for name in names[:-1])
+                what = f"measured spindle ch{probe}, fitted on 20 h, run on the 12 after them: {found}"
+                figures.append(Figure(what=what, found=f"{errors['extended'][0]:.1f} µm rms", beside=beside))
+    rows("measured spindle, free run on hours that nothing saw, µm rms (mean absolute)",
+         ["probe", "fit, h", "judged, h", *names, "found"], body)  # fmt: skip
+    yield from map(told, figures)
 
 
 if __name__ == "__main__":
-    report()
+    list(report())

@@ -49,7 +49,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    columns, _, _ = record([draw("input", 4)], 79, 24.0)
+    columns, _, _ = record([draw("input", 4)], 79, 10.0)
     path = tmp_path_factory.mktemp("data") / "run.csv"
     write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
     return path
