@@ -17,8 +17,6 @@ from tests.deploy.test_install import load
 
 TEXT = GUIDE.read_text(encoding="utf-8")
 LINES = commands(TEXT)
-#: Guides that are still being written.
-PENDING = {"linuxcnc/README.md"}
 OF_OTHERS = {"systemctl", "journalctl", "rsync", "sh", "openssl", "chgrp", "chmod"}
 
 
@@ -82,7 +80,7 @@ def test_keys_of_the_limits_are_keys_of_the_configuration() -> None:
 
 def test_links_lead_somewhere() -> None:
     for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", TEXT):
-        assert (GUIDE.parent / link).exists() or link in PENDING, link
+        assert (GUIDE.parent / link).exists(), link
     headings = {re.sub(r"[^\w -]", "", line.lstrip("# ").lower()).replace(" ", "-")
                 for line in TEXT.splitlines() if line.startswith("#")}  # fmt: skip
     for anchor in re.findall(r"\]\(#([^)]+)\)", TEXT):
