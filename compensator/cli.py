@@ -81,7 +81,7 @@ COMMANDS = (
             arguments.export, "compensator.commands.export:run"),
     Command("bridge", "the offset to a control that speaks OPC UA", "bridge opcua --config bridge.toml",
             arguments.bridge, "compensator.commands.bridge:run"),
-    Command("explain", "a state or reason in words", "explain degraded",
+    Command("explain", "a state, reason or warning in words", "explain degraded",
             arguments.explain, "compensator.commands.explain:run"),
 )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""States and reasons in words: what each means, and what to do."""
+"""States, reasons and warnings in words: what each means, and what to do."""
 
 from __future__ import annotations
 
@@ -95,6 +95,79 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "too_fast": ("The value changed faster than the sensor's place can.", "Check for a loose sensor or a noisy line."),
     "stuck": ("The value has not moved at all for longer than it may.", "Check that sensor and module still measure."),
     "t_q_below_at": ("T_Q lies below AT although the machine is heated.", "Check for exchanged or fallen-off sensors."),
+    # Warnings of identify and diagnose.
+    "worse_than_nothing": (
+        "On a run that took no part in the fit the model is worse than none.",
+        "Do not use it there; see how that run differs from the fitted ones, and fit both together.",
+    ),
+    "quiet_ambient": (
+        "The ambient hardly changed, so the TDTF's gain should not be trusted beyond what was seen.",
+        "Add a record with a larger ambient change (an ETVE over a day).",
+    ),
+    "undetermined_ambient": (
+        "The ambient's part is hardly determined, although the ambient moved.",
+        "Add a record in which the ambient moves while the heat is steady.",
+    ),
+    "short_record": (
+        "The record is short beside the slowest time constant: what it settles to is extrapolated.",
+        "Record at least three times the slowest time constant.",
+    ),
+    "drifting_mode": (
+        "The slowest mode is slower than the record: something drifts that the inputs do not explain.",
+        "Record longer, and let compensator diagnose look for what drifts.",
+    ),
+    "common_cause": (
+        "Drive and ambient moved together: how the deformation divides between DTF and TDTF is ambiguous.",
+        "Heat at another time of the day.",
+    ),
+    "undetermined_gain": (
+        "The gain of a path at rest is hardly determined.",
+        "Record a longer step of its input, until the deformation has settled.",
+    ),
+    "zero_outside": (
+        "A path has a zero outside the unit circle: its response starts the wrong way.",
+        "Look at its step response; where the machine does not start the wrong way, try a lower --order.",
+    ),
+    "turning_response": (
+        "The step response of a path turns round before it settles.",
+        "Ask whether the machine does that; where it does not, try a lower --order.",
+    ),
+    "twin_modes": (
+        "Two time constants of a path coincide: their standard errors say nothing.",
+        "Try one mode less with --order.",
+    ),
+    "inverse_noise": (
+        "The thermocouples' noise becomes much noise in the heat.",
+        "Average more readings, or place T_Q closer to the source.",
+    ),
+    "coloured_residual": (
+        "What the model leaves is not noise alone: the model lacks something.",
+        "Let compensator diagnose look for what it is.",
+    ),
+    "validity_range": (
+        "The model is valid for the temperatures that were seen, and a third more; outside, the service holds.",
+        "Calibrate over the whole range in which the machine works, where that is wider.",
+    ),
+    "made_worse": (
+        "On held-out data the effects that were found make it worse, so the model was left as it was.",
+        "Record longer, with more change in the inputs.",
+    ),
+    "hardly_determined": (
+        "The standard error of a parameter is larger than the parameter.",
+        "Record more change of what the effect follows before relying on it.",
+    ),
+    "nearly_as_good": (
+        "Another explanation leaves hardly more error.",
+        "Make the experiment that is named with it: it tells them apart.",
+    ),
+    "rounded_off": (
+        "Something without a name of its own is deployed beside the effect that was found.",
+        "Judge the extended model on another day before relying on it.",
+    ),
+    "fitted_anew": (
+        "The first model was calibrated while the effect acted, so its paths were fitted anew beside it.",
+        "Judge the extended model on another day before relying on it.",
+    ),
     # Ends of a recording, and what an audit can find.
     "finished": ("The recording has its end: sealed, with checksums and index.", "Nothing."),
     "recovered": (
@@ -134,6 +207,33 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "unreadable": (
         "A record is intact and yet not what its schema says.", "Audit with the version that wrote it."),
 }  # fmt: skip
+
+
+class Caution(str):
+    """A warning: what is the matter, with its figures, and what to do; it knows its code.
+
+    Parameters
+    ----------
+    code : str
+        What `compensator explain` knows it by.
+    figures : str
+        What is the matter here; what to do is added.
+
+    Examples
+    --------
+    >>> said = Caution("twin_modes", "Two time constants of the DTF coincide at 20 min.")
+    >>> said, said.code
+    ('Two time constants of the DTF coincide at 20 min. Try one mode less with --order.', 'twin_modes')
+    """
+
+    __slots__ = ("code",)
+    code: str
+
+    def __new__(cls, code: str, figures: str) -> Caution:
+        """Put the sentences together."""
+        words = super().__new__(cls, f"{figures} {WORDS[code][1]}")
+        words.code = code
+        return words
 
 
 def explain(code: str) -> tuple[str, str] | None:

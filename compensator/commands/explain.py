@@ -1,4 +1,4 @@
-"""`compensator explain`: a state or reason in words."""
+"""`compensator explain`: a state, reason or warning in words."""
 
 from __future__ import annotations
 

@@ -30,6 +30,7 @@ from compensator.diagnose.outcome import (
 )  # fmt: skip
 from compensator.diagnose.refit import Refit, Tried, refit
 from compensator.model.thermal_model import Path, ThermalModel
+from compensator.reasons import Caution
 from compensator.simulation import scores
 
 Vector = npt.NDArray[np.float64]
@@ -136,7 +137,7 @@ def _extended(model: ThermalModel, whole: Refit, effects: tuple[Effect, ...]) ->
     )  # fmt: skip
 
 
-def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[str, ...]:
+def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, ...]:
     if not helps:
         return ()
     paths = [("DTF", model.dtf, whole.dtf)]
@@ -147,6 +148,9 @@ def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[str, ...]:
         for name, old, new in paths
     )
     return (
-        "The first model was calibrated while this acted and misses much of its own data, so its paths were fitted "
-        f"anew beside it; gains went: {gains}.",
+        Caution(
+            "fitted_anew",
+            "The first model was calibrated while this acted and misses much of its own data, so its paths were fitted "
+            f"anew beside it; gains went: {gains}.",
+        ),
     )

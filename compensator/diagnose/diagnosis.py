@@ -36,6 +36,7 @@ from compensator.diagnose.search import Found, Search, Tried
 from compensator.identify.runs import Run
 from compensator.model.effects.unobserved import Unobserved
 from compensator.model.thermal_model import ThermalModel
+from compensator.reasons import Caution
 from compensator.simulation import scores
 
 Vector = npt.NDArray[np.float64]
@@ -167,11 +168,14 @@ def _effects(evidence: Evidence, found: Found) -> tuple[Effect, ...]:
     return tuple(sorted(effects, key=lambda e: -e.rms_before_um))
 
 
-def _rounded(everything: Sequence[Effect]) -> tuple[str, ...]:
+def _rounded(everything: Sequence[Effect]) -> tuple[Caution, ...]:
     """Say that something unnamed is deployed beside what is named."""
     return tuple(
-        "What the effect leaves is rounded off by a row of lags on heat and ambient "
-        f"({float(np.std(e.wave)):.2g} µm rms), an effect of the kind dynamics in model.toml."
+        Caution(
+            "rounded_off",
+            "What the effect leaves is rounded off by a row of lags on heat and ambient "
+            f"({float(np.std(e.wave)):.2g} µm rms), an effect of the kind dynamics in model.toml.",
+        )
         for e in everything
         if e.part.companion
     )

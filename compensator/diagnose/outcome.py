@@ -12,6 +12,7 @@ import numpy.typing as npt
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.joint import Part
 from compensator.model.thermal_model import EffectTable, ThermalModel
+from compensator.reasons import Caution
 from compensator.simulation import Scores
 
 Vector = npt.NDArray[np.float64]
@@ -100,7 +101,7 @@ class Diagnosis:
         The same, each block by a search without it.
     tried : tuple of (str, float)
         Explanations of the largest effect and the rms that each leaves, µm, best first.
-    warnings : tuple of str
+    warnings : tuple of Caution
         In words.
     """
 
@@ -117,7 +118,7 @@ class Diagnosis:
     held_out_before: Vector
     held_out_after: Vector
     tried: tuple[tuple[str, float], ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Caution, ...]
 
 
 def rms_of(values: Vector) -> float:
@@ -146,22 +147,26 @@ def how_to_tell_apart(first: Part, second: Part) -> str:
     return f"{one.capitalize()}, then {two}; watch Y for {hours:.0f} h each: only one of the two moves it."
 
 
-def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[str, ...]:
+def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[Caution, ...]:
     """Say what to mind of the effects that were found."""
     words = []
     rms_before, rms_after = rms_of(before), rms_of(after)
     if effects and rms_after > rms_before:
         words.append(
-            f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so the "
-            "model was left as it is: record longer, with more change in the inputs."
+            Caution(
+                "made_worse",
+                f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so "
+                "the model was left as it is.",
+            )
         )
     for effect in effects:
         loose = [name for name, std in effect.std.items() if std > abs(effect.part.named[name]) > 0.0]
         if loose:
-            words.append(f"{effect.part.hypothesis.kind}: {', '.join(loose)} is hardly determined.")
+            said = f"{effect.part.hypothesis.kind}: {', '.join(loose)} is hardly determined."
+            words.append(Caution("hardly_determined", said))
         if effect.rivals:
             names = ", ".join(" ".join(filter(None, rival.part.hypothesis.place)) for rival in effect.rivals)
-            words.append(f"{effect.part.hypothesis.kind}: nearly as good would be {names}.")
+            words.append(Caution("nearly_as_good", f"{effect.part.hypothesis.kind}: nearly as good would be {names}."))
     return tuple(words)
 
 

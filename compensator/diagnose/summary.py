@@ -38,7 +38,8 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
             for rival in effect.rivals
         ],
         "before": _scores(diagnosis.before), "after": _scores(diagnosis.after), "held_out": diagnosis.held_out,
-        "noise_floor_um": diagnosis.noise_floor_um, "warnings": list(diagnosis.warnings),
+        "noise_floor_um": diagnosis.noise_floor_um, "warnings": list(map(str, diagnosis.warnings)),
+        "warning_codes": [warning.code for warning in diagnosis.warnings],
     }  # fmt: skip
 
 
@@ -85,5 +86,5 @@ def text(diagnosis: Diagnosis) -> str:
             for r in effect.rivals
         ]
     if diagnosis.warnings:
-        lines += ["", "warnings:", *(f"- {word}" for word in diagnosis.warnings)]
+        lines += ["", "warnings:", *(f"- {word} [{word.code}]" for word in diagnosis.warnings)]
     return "\n".join(lines)

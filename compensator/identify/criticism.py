@@ -13,6 +13,7 @@ from scipy.special import gammaincc
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
 from compensator.identify.runs import Run, noise_std
+from compensator.reasons import Caution
 
 Vector = npt.NDArray[np.float64]
 
@@ -177,13 +178,13 @@ class Criticism:
         TTF (where there is one), DTF, TDTF.
     residuals : tuple of ResidualView
         Of the TTF's and the DTF's fit.
-    warnings : tuple of str
+    warnings : tuple of Caution
         In words, the gravest first.
     """
 
     paths: tuple[PathView, ...]
     residuals: tuple[ResidualView, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Caution, ...]
 
 
 def criticise(calibration: Calibration) -> Criticism:
@@ -212,151 +213,174 @@ def criticise(calibration: Calibration) -> Criticism:
 
 
 class _Warnings:
-    """Every warning is one method that returns a sentence or nothing."""
+    """Every warning is one method that returns it, or nothing."""
 
     def __init__(self, calibration: Calibration, paths: Sequence[PathView], residuals: Sequence[ResidualView]) -> None:
         self.calibration, self.residuals = calibration, residuals
         self.paths = {path.name: path for path in paths}
         self.hours = [float(np.sum(mask)) * calibration.model.period_s / 3600.0 for mask in calibration.used]
 
-    def all(self) -> tuple[str, ...]:
+    def all(self) -> tuple[Caution, ...]:
         found = [
             self.worse_than_nothing(), self.quiet_ambient(), self.short_record(), self.ramp(), self.common_cause(),
             *self.undetermined_gain(), *self.odd_zero(), *self.wrong_way(), *self.twin_modes(), self.inverse_noise(),
             self.coloured(), self.narrow_range(),
         ]  # fmt: skip
-        return tuple(words for words in found if words)
+        return tuple(words for words in found if words is not None)
 
-    def worse_than_nothing(self) -> str:
+    def worse_than_nothing(self) -> Caution | None:
         for part in self.calibration.parts:
             if part.role == "held out" and part.model.rms_um > part.nothing.rms_um:
-                return (
+                return Caution(
+                    "worse_than_nothing",
                     f"On {part.name} (held out) the model is worse than none: {part.model.rms_um:.1f} "
-                    f"against {part.nothing.rms_um:.1f} µm rms. Do not use it there."
+                    f"against {part.nothing.rms_um:.1f} µm rms.",
                 )
-        return ""
+        return None
 
-    def quiet_ambient(self) -> str:
+    def quiet_ambient(self) -> Caution | None:
         swing = max(float(np.ptp(run.ambient_k[mask])) for run, mask in self._pairs())
         path = self.paths["TDTF"]
         if path.gain_std == 0.0:
-            return ""
+            return None
         gain = f"the TDTF's gain is {path.gain:.2f} ± {path.gain_std:.2f} µm/K"
         if swing < 2.0:
-            return (
-                f"The ambient moved by {swing:.1f} K only; {gain} and should not be trusted beyond that. "
-                "Add a record with a larger ambient change (an ETVE over a day)."
+            return Caution(
+                "quiet_ambient",
+                f"The ambient moved by {swing:.1f} K only; {gain} and should not be trusted beyond that.",
             )
         if path.gain_std > 0.3 * abs(path.gain):
-            return f"The ambient's part is hardly determined, although it moved by {swing:.1f} K: {gain}."
-        return ""
+            return Caution(
+                "undetermined_ambient",
+                f"The ambient's part is hardly determined, although it moved by {swing:.1f} K: {gain}.",
+            )
+        return None
 
-    def short_record(self) -> str:
+    def short_record(self) -> Caution | None:
         slowest = max(path.taus_min[-1] for path in self.paths.values())
         longest = max(self.hours)
         if longest * 60.0 < 3.0 * slowest:
-            return (
+            return Caution(
+                "short_record",
                 f"The longest record has {longest:.1f} h, the slowest time constant is {slowest / 60.0:.1f} h: what it "
-                "settles to is extrapolated. Record at least three times the slowest time constant."
+                "settles to is extrapolated.",
             )
-        return ""
+        return None
 
-    def ramp(self) -> str:
+    def ramp(self) -> Caution | None:
         main = self.calibration.deformation.main
         if main.taus_min[-1] < 0.95 * main.longest_min:
-            return ""
-        return (
+            return None
+        return Caution(
+            "drifting_mode",
             f"The slowest mode is slower than the record ({main.longest_min / 60.0:.0f} h) and was held at its length: "
-            "something drifts there that the inputs do not explain, and free run beyond that is extrapolation."
+            "something drifts there that the inputs do not explain, and free run beyond that is extrapolation.",
         )
 
-    def common_cause(self) -> str:
+    def common_cause(self) -> Caution | None:
         drives = np.concatenate([d[m] for d, m in zip(self.calibration.drives, self.calibration.used, strict=True)])
         ambient = np.concatenate([run.ambient_k[mask] for run, mask in self._pairs()])
         if np.ptp(ambient) == 0.0 or np.ptp(drives) == 0.0:
-            return ""
+            return None
         together = abs(float(np.corrcoef(drives, ambient)[0, 1]))
         if together < 0.8:
-            return ""
-        return (
+            return None
+        return Caution(
+            "common_cause",
             f"Drive and ambient moved together (correlation {together:.2f}): how the deformation divides between DTF "
-            "and TDTF is ambiguous. Heat at another time of the day."
+            "and TDTF is ambiguous.",
         )
 
-    def undetermined_gain(self) -> list[str]:
+    def undetermined_gain(self) -> list[Caution]:
         return [
-            f"The gain of the {name} at rest is {path.gain:.3g} ± {path.gain_std:.2g} {_shown(path.unit)}: "
-            "hardly determined."
+            Caution(
+                "undetermined_gain",
+                f"The gain of the {name} at rest is {path.gain:.3g} ± {path.gain_std:.2g} {_shown(path.unit)}: "
+                "hardly determined.",
+            )
             for name, path in self.paths.items()
             if name != "TDTF" and path.gain_std > 0.3 * abs(path.gain)
         ]
 
-    def odd_zero(self) -> list[str]:
+    def odd_zero(self) -> list[Caution]:
         words = []
         for name, path in self.paths.items():
             outside = [z for z in path.zeros if abs(z) > 1.0]
             if outside:
                 worst = max(outside, key=abs)
                 words.append(
-                    f"The {name} has a zero outside the unit circle (z = {worst.real:.3g}): its response starts the "
-                    "wrong way. Nothing inverts it, so nothing becomes unstable."
+                    Caution(
+                        "zero_outside",
+                        f"The {name} has a zero outside the unit circle (z = {worst.real:.3g}): its response starts "
+                        "the wrong way. Nothing inverts it, so nothing becomes unstable.",
+                    )
                 )
         return words
 
-    def wrong_way(self) -> list[str]:
+    def wrong_way(self) -> list[Caution]:
         words = []
         for name, path in self.paths.items():
             if path.gain * path.step[np.argmax(np.abs(path.step))] < 0:
                 words.append(
-                    f"The {name}'s step response turns round: it peaks at {_peak(path):.3g} and settles at "
-                    f"{path.gain:.3g} {_shown(path.unit)}. Ask whether the machine does that."
+                    Caution(
+                        "turning_response",
+                        f"The {name}'s step response turns round: it peaks at {_peak(path):.3g} and settles at "
+                        f"{path.gain:.3g} {_shown(path.unit)}.",
+                    )
                 )
         return words
 
-    def twin_modes(self) -> list[str]:
+    def twin_modes(self) -> list[Caution]:
         words = []
         for name, path in self.paths.items():
             twins = [t for t, u in zip(path.taus_min, path.taus_min[1:], strict=False) if u < 1.05 * t]
             if twins and name != "TDTF":
-                words.append(f"Two time constants of the {name} coincide at {twins[0]:.3g} min: their standard errors "
-                             "say nothing, and one mode less may do.")  # fmt: skip
+                words.append(
+                    Caution(
+                        "twin_modes",
+                        f"Two time constants of the {name} coincide at {twins[0]:.3g} min: their standard errors say "
+                        "nothing, and one mode less may do.",
+                    )
+                )
         return words
 
-    def inverse_noise(self) -> str:
+    def inverse_noise(self) -> Caution | None:
         temperature = self.calibration.temperature
         if temperature is None:
-            return ""
+            return None
         noise = self.calibration.noise
         watts = temperature.noise_gain_w_per_k * float(np.hypot(noise["t_q_degc"], noise["at_degc"]))
         known = [run.heat_w for run in self.calibration.runs if run.heat_w is not None]
         span = max(float(np.ptp(heat)) for heat in known)
         if watts < 0.2 * span:
-            return ""
-        return (
-            f"The thermocouples' noise becomes {watts:.0f} W of noise in the heat, of {span:.0f} W in all. "
-            "Average more readings, or place T_Q closer to the source."
+            return None
+        return Caution(
+            "inverse_noise",
+            f"The thermocouples' noise becomes {watts:.0f} W of noise in the heat, of {span:.0f} W in all.",
         )
 
-    def coloured(self) -> str:
+    def coloured(self) -> Caution | None:
         main = self.calibration.deformation.main
         noise = noise_std(np.concatenate([run.y_um for run in self.calibration.runs]))
         still = self.residuals[-1]
         known = {name: float(np.max(np.abs(values))) / limit for name, (values, limit) in still.cross.items()}
         largest = max(known, key=lambda name: known[name])
         if still.white_chance > 0.01 and known[largest] < 1.0:
-            return ""
+            return None
         tail = f" and is correlated with {largest}" if known[largest] > 1.0 else ""
-        return (
+        return Caution(
+            "coloured_residual",
             f"The residual ({main.sigma:.2f} µm rms, sensor noise {noise:.2f}) is not white{tail}: the model lacks "
-            "something. Standard errors count that in; compensator diagnose looks for what it is."
+            "something. Standard errors count that in.",
         )
 
-    def narrow_range(self) -> str:
+    def narrow_range(self) -> Caution | None:
         low, high = self.calibration.model.validity["at_degc"]
         t_low, t_high = self.calibration.model.validity["t_q_degc"]
-        return (
+        return Caution(
+            "validity_range",
             f"Valid for AT from {low:.0f} to {high:.0f} °C and T_Q from {t_low:.0f} to {t_high:.0f} °C (what was seen, "
-            "and a third more); outside, the service holds."
+            "and a third more); outside, the service holds.",
         )
 
     def _pairs(self) -> list[tuple[Run, npt.NDArray[np.bool_]]]:

@@ -45,7 +45,8 @@ def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
         ],
         "folds_rms_um": calibration.folds_rms_um,
         "noise": dict(calibration.noise),
-        "warnings": list(criticism.warnings),
+        "warnings": [str(warning) for warning in criticism.warnings],
+        "warning_codes": [warning.code for warning in criticism.warnings],
         "remarks": list(calibration.remarks),
     }  # fmt: skip
     temperature = calibration.temperature
@@ -95,7 +96,8 @@ def text(calibration: Calibration, criticism: Criticism) -> str:
             f"{calibration.temperature.noise_gain_w_per_k:.0f} W of 1 K of noise"
         )
     lines += ["", *_table(calibration)]
-    for title, words in (("warnings", criticism.warnings), ("remarks", calibration.remarks)):
+    warnings = [f"{warning} [{warning.code}]" for warning in criticism.warnings]
+    for title, words in (("warnings", warnings), ("remarks", calibration.remarks)):
         if words:
             lines += ["", f"{title}:", *(f"- {word}" for word in words)]
     return "\n".join(lines)

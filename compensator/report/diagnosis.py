@@ -12,7 +12,19 @@ from compensator.diagnose.outcome import Diagnosis, Effect
 from compensator.diagnose.summary import name, verdict
 from compensator.identify.summary import with_std
 from compensator.model.thermal_model import ThermalModel
-from compensator.report.page import Block, Details, Figure, Line, Page, Section, Table, Tone, Words, write_page
+from compensator.report.page import (
+    Block,
+    Details,
+    Figure,
+    Line,
+    Page,
+    Section,
+    Table,
+    Tone,
+    Words,
+    warnings_of,
+    write_page,
+)
 
 Vector = npt.NDArray[np.float64]
 
@@ -40,7 +52,7 @@ def write_report(path: Path, diagnosis: Diagnosis, model: ThermalModel, remarks:
     blocks: list[Block] = [_before_and_after(t, diagnosis), _errors(diagnosis)]
     blocks += [_effect(t, effect) for effect in diagnosis.effects]
     if diagnosis.warnings:
-        blocks.append(Words(title="Warnings", lines=diagnosis.warnings, kind="warning"))
+        blocks.append(warnings_of(diagnosis.warnings))
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
     blocks.append(_details(t, diagnosis, model, remarks))

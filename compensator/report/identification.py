@@ -28,6 +28,7 @@ from compensator.report.page import (
     Table,
     Tone,
     Words,
+    warnings_of,
     write_page,
 )
 
@@ -54,7 +55,7 @@ def write_report(
     """
     blocks: list[Block] = [_prediction(calibration), _residuals(calibration), _errors(calibration)]
     if criticism.warnings:
-        blocks.append(Words(title="Warnings", lines=criticism.warnings, kind="warning"))
+        blocks.append(warnings_of(criticism.warnings))
     if comparison:
         blocks.append(_compared(comparison))
     blocks += [*_parameters(calibration, criticism), *(_path_section(view) for view in criticism.paths)]

@@ -16,7 +16,7 @@ from itertools import count
 from pathlib import Path
 from typing import Literal
 
-from compensator.reasons import explain
+from compensator.reasons import Caution, explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 
@@ -106,6 +106,11 @@ class Words:
     title: str
     lines: Sequence[Cell]
     kind: Literal["warning", "plain"] = "plain"
+
+
+def warnings_of(cautions: Iterable[Caution]) -> Words:
+    """Return warnings as a block; each leads to its sentences at the end of the page."""
+    return Words(title="Warnings", lines=[(str(said), " ", Code(said.code)) for said in cautions], kind="warning")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -331,5 +336,6 @@ __all__ = [
     "columns_of_words",
     "html_of",
     "text_of",
+    "warnings_of",
     "write_page",
 ]

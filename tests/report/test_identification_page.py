@@ -45,7 +45,8 @@ def test_hashes_warnings_and_remarks_are_there(page, calibration):
     assert "ab" * 32 in page and "cd" * 32 in page
     assert "gap of 3 sample(s)" in page
     for warning in criticise(calibration).warnings:
-        assert f"<li>{html.escape(warning)}</li>" in page
+        assert f'<li>{html.escape(warning)} <a href="#word-{warning.code}">' in page
+        assert f'<div id="word-{warning.code}">' in page
 
 
 def test_identifiers_are_unique_over_all_pictures(page):
