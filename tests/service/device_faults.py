@@ -253,9 +253,9 @@ def _true(message: Sample, role: str, truth: Sequence[dict[str, float]], begin: 
 
     A device that was slow gives its value to the next poll: it is one poll old at most, here a minute. The controller's
     mean is that of the blocks since the last read, of 10 s at most; where simulated minutes take milliseconds it may
-    reach back over those in which nothing could be read.
+    reach back over several of them.
     """
-    first, zero = (begin - 1, 250.0) if role == "y_um" else (i - 1, 0.0)
+    first, zero = (begin - 12, 250.0) if role == "y_um" else (i - 1, 0.0)
     recent = [one[role] + zero for one in truth[first : i + 1]]
     mean = number(message.channels[role].mean)
     return mean if min(recent) <= mean <= max(recent) else recent[-1]
