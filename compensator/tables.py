@@ -23,6 +23,12 @@ ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 SHORT_GAP_SAMPLES = 60
 
 
+#: Larger numbers are no measurements, and their powers overflow.
+LARGEST = 1e30
+#: Longest table, in samples of the model: eleven years of minutes.
+MOST_SAMPLES = 6_000_000
+
+
 @dataclass(frozen=True, slots=True)
 class Record:
     """A measured run at the model's sample period.
@@ -182,7 +188,7 @@ def _cell(path: Path, line: int, name: str, cell: str, text_columns: set[str]) -
         if name == "time_utc":
             return datetime.fromisoformat(cell).timestamp()
         value = float(cell)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         if name in (*ROLES, "t_s", "time_utc"):
             raise DataError(f"{path}: row {line}: {name} = {cell[:40]!r}, expected a number") from error
         text_columns.add(name)
@@ -212,6 +218,7 @@ def _read_mcap(path: Path) -> tuple[Vector, dict[str, Vector]]:
 
 def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: float) -> Data:
     """Average to the period, report and sort what is out of order, split at long gaps."""
+    _check_size(path, t_s, columns, period_s)
     remarks = []
     order = np.argsort(t_s, kind="stable")
     disordered = int(np.sum(np.diff(t_s) < 0))
@@ -247,6 +254,22 @@ def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: floa
         ),
         remarks=tuple(remarks),
     )
+
+
+def _check_size(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: float) -> None:
+    """Refuse what is no measurement but a slip of the pen: its squares, or its rows, would not fit into the machine."""
+    for name, values in (("time", t_s), *columns.items()):
+        large = np.abs(values) > LARGEST
+        if large.any():
+            row = int(np.argmax(large))
+            raise DataError(f"{path}: row {row + 2}: {name} = {values[row]:g}, expected a number below {LARGEST:g}")
+    samples = float(t_s.max() - t_s.min()) / period_s
+    if samples > MOST_SAMPLES:
+        row = int(np.argmax(np.abs(t_s - np.median(t_s)))) + 2
+        raise DataError(
+            f"{path}: row {row}: its time makes {samples:.3g} samples of {period_s:g} s, "
+            f"expected at most {MOST_SAMPLES}"
+        )
 
 
 def _spacing(t_s: Vector) -> float:

@@ -27,6 +27,10 @@ _ESTIMATOR = ("method", "t_q_noise_std_k", "at_noise_std_k", "at_walk_std_k")
 _FORMS = {"continuous": ("numerator", "denominator"), "sampled": ("b", "a")}
 
 
+#: No coefficient, gain or noise is as large.
+LARGEST = 1e30
+
+
 def load_model(name: str | FilePath) -> ThermalModel:
     """Read a model.
 
@@ -111,8 +115,7 @@ class _Table:
     def number(self, key: str, *, low: float = -math.inf, high: float = math.inf) -> float:
         """Return a finite number between two bounds (inclusive)."""
         value = self.table.get(key)
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-        if not is_number or not low <= value <= high:  # type: ignore[operator]
+        if not _is_number(value) or not low <= value <= high:  # type: ignore[operator]
             bounds = "" if low == -math.inf and high == math.inf else f" from {low:g} to {high:g}"
             raise ModelError(f"{self.where}: {key} = {_shown(value)}, expected a number{bounds}")
         return float(value)  # type: ignore[arg-type]
@@ -120,9 +123,7 @@ class _Table:
     def numbers(self, key: str, *, length: int | None = None) -> tuple[float, ...]:
         """Return a list of finite numbers."""
         values = self.table.get(key)
-        ok = isinstance(values, list) and values and all(
-            isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in values
-        )  # fmt: skip
+        ok = isinstance(values, list) and values and all(_is_number(v) for v in values)
         if not ok or (length is not None and len(values) != length):  # type: ignore[arg-type]
             count = f"{length} " if length else ""
             raise ModelError(f"{self.where}: {key} = {_shown(values)}, expected a list of {count}numbers")
@@ -135,6 +136,11 @@ class _Table:
             expected = "a string" if choices is None else "one of: " + ", ".join(choices)
             raise ModelError(f"{self.where}: {key} = {_shown(value)}, expected {expected}")
         return value
+
+
+def _is_number(value: object) -> bool:
+    """Tell whether a value is a number that can be worked with: the powers of a larger one are not finite."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and -LARGEST < value < LARGEST
 
 
 def _shown(value: object) -> str:

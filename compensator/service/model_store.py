@@ -89,7 +89,7 @@ class ModelStore:
     def load(self, sha256: str) -> bytes:
         """Return a model file of the store."""
         if re.fullmatch("[0-9a-f]{64}", sha256) is None:
-            raise ServiceError(f"sha256 = {sha256[:70]!r}, expected 64 hexadecimal digits")
+            raise ServiceError(f"adopted model: sha256 = {sha256[:70]!r}, expected 64 hexadecimal digits")
         path = self.folder / f"{sha256}.toml"
         try:
             data = path.read_bytes()

@@ -22,6 +22,9 @@ NAN = float("nan")
 #: Version of the state. A state of another version is refused, never guessed at.
 STATE_SCHEMA = 1
 
+#: Covariances stay below this by far; the products of larger ones would not be finite.
+LARGEST = 1e60
+
 ZeroMode = Literal["auto", "rest", "warm"]
 
 
@@ -151,6 +154,6 @@ def decode_state(data: bytes) -> CompensationState:
         raise DataError(f"state: schema = {state.schema}, expected {STATE_SCHEMA}")
     nested = (state.engine, *([state.engine.gap.state] if state.engine.gap else []))
     numbers = [state.offset_um, *(value for engine in nested for value in (*engine.observer.x, *engine.observer.p))]
-    if not all(map(math.isfinite, numbers)):
-        raise DataError("state: a number of the offset or of the observer is not finite")
+    if not all(-LARGEST < value < LARGEST for value in numbers):
+        raise DataError("state: a number of the offset or of the observer is not finite, or larger than any can be")
     return state

@@ -116,7 +116,7 @@ class WiredMachine:
         self.publisher: Publisher | None = None
         if receiver is not None:
             settings = Zenoh(prefix=f"shop/{name}", mode="client", connect=[receiver.endpoint])
-            self.publisher = Publisher(settings, lambda command, payload: self.daemon.command(command, payload))
+            self.publisher = Publisher(settings, lambda *asked: self.daemon.command(*asked))
         publish = self.publisher.publish if self.publisher else lambda what, data: None
         self.daemon = Daemon(
             config=self.config, compensation=Compensation(self.config, model or load_model("quill")),
