@@ -47,16 +47,18 @@ _SILENT = {"device_timeout"}
 _GARBLED = {"device_garbled", "device_timeout"}
 #: What a request to a line that is gone, or is just coming back, ends in.
 _GONE = {"device_disconnected", "device_timeout"}
+#: Two replies at once: the second is that of the request, and is taken; the first has been given up by then.
+_ALTERNATING = {*_GARBLED, "good"}
 HARMLESS: frozenset[str] = frozenset()
 OLD = frozenset({"the last value until the guard `stuck`"})
 _LINE = {
-    "silence": _SILENT, "late": _GARBLED, "join": _GARBLED, "garbage": _GARBLED, "truncate": _GARBLED,
+    "silence": _SILENT, "late": _GARBLED, "join": _ALTERNATING, "garbage": _GARBLED, "truncate": _GARBLED,
     "wrong_length": _GARBLED, "bad_crc": _GARBLED, "disconnect": _GONE, "exception": {"device_refused"},
     "split": HARMLESS, "frozen": OLD, "wild": {"out_of_range"},
 }  # fmt: skip
 _COUPLE = {"open": {"open_circuit"}, "over": {"open_circuit", "over_range"}, "under": {"under_range"}}
 _CONTROLLER = {
-    "join": {*_GARBLED, "good"}, "exception": HARMLESS, "gap": HARMLESS, "stale_counter": _GARBLED | OLD,
+    "exception": HARMLESS, "gap": HARMLESS, "stale_counter": _GARBLED | OLD,
     "open": {"over_range"}, "over": {"over_range"}, "under": {"under_range"}, "wild": {"out_of_range", "over_range"},
 }  # fmt: skip
 #: carrier → kind → codes of which one stands in every sample while the fault lasts.
