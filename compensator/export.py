@@ -11,17 +11,24 @@ import msgspec
 
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Sample
-from compensator.recording import decode, read_messages
+from compensator.recording import decode, machines_in, read_messages
 
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
 
 
-def export(recording: Path, out: Path) -> int:
+def export(recording: Path, out: Path, machine: str = "") -> int:
     """Write a recording as CSV.
 
     Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
     offset, its state and reasons. `heat_w` is the estimate; a measured heat stands in `heat_measured_w`.
+
+    Parameters
+    ----------
+    recording, out : pathlib.Path
+        The MCAP file, and the CSV.
+    machine : str
+        Of a shop's recording: prefix of the machine, such as `shop/vmc-07`.
 
     Returns
     -------
@@ -34,12 +41,14 @@ def export(recording: Path, out: Path) -> int:
         If it is no recording, or has no samples.
     """
     rows: dict[int, dict[str, Any]] = {}
-    for record in read_messages(recording, ("sample", "estimate", "offset")):
+    for record in read_messages(recording, ("sample", "estimate", "offset"), prefix=machine):
         message = decode(record, recording)
         assert isinstance(message, (Sample, EstimateMessage, Offset))
         rows.setdefault(message.seq, {}).update(_cells(message))
     if not rows:
-        raise DataError(f"{recording}: no samples in it")
+        machines = machines_in(recording)
+        words = f"of {machine or 'one machine'} in it; a shop's recording, expected --machine" if machines else "in it"
+        raise DataError(f"{recording}: no samples {words}" + (f", one of: {', '.join(machines)}" if machines else ""))
     start = min(row["_ns"] for row in rows.values())
     for row in rows.values():
         row["t_s"] = (row.pop("_ns") - start) / 1e9

@@ -38,7 +38,7 @@ class Recorded:
     log_time_ns: int
 
 
-def read_messages(path: Path, topics: tuple[str, ...] | None = None) -> Iterator[Recorded]:
+def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: str = "") -> Iterator[Recorded]:
     """Yield the messages of a file in the order in which they were written.
 
     Parameters
@@ -47,6 +47,8 @@ def read_messages(path: Path, topics: tuple[str, ...] | None = None) -> Iterator
         An MCAP file of ours, finished or not.
     topics : tuple of str, optional
         Only these.
+    prefix : str
+        Of a shop's recording: the machine's, such as `shop/vmc-07`; its messages come by the topics of its own.
 
     Raises
     ------
@@ -58,10 +60,32 @@ def read_messages(path: Path, topics: tuple[str, ...] | None = None) -> Iterator
         try:
             for number, sequence, log_time_ns, body in container.messages():
                 topic = channels[number].topic.lstrip("/")
+                if prefix:
+                    machine, _, rest = topic.rpartition("/thermal/")
+                    topic = rest.removeprefix("y/") if machine == prefix else ""
                 if topics is None or topic in topics:
                     yield Recorded(topic, body[PAYLOAD:], sequence, log_time_ns)
         except Damaged:
             return
+
+
+def machines_in(path: Path) -> list[str]:
+    """Return the prefixes of the machines in a shop's recording; none in a recording of one machine.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file.
+    """
+    with Container(path) as container:
+        try:
+            for _ in container.messages():
+                pass
+        except Damaged:
+            pass
+        topics = [channel.topic.strip("/") for channel in container.contents.channels.values()]
+    known = {topic.rpartition("/thermal/")[0] for topic in topics if not topic.startswith("other/")}
+    return sorted(known - {""})
 
 
 def decode(record: Recorded, path: Path) -> msgspec.Struct:

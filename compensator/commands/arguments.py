@@ -40,6 +40,8 @@ def export(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `export`."""
     parser.add_argument("recording", type=Path, metavar="FILE.mcap")
     parser.add_argument("--out", type=Path, required=True, metavar="CSV")
+    words = "of a shop's recording (watch --record): the machine, such as shop/vmc-07"
+    parser.add_argument("--machine", default="", metavar="PREFIX", help=words)
 
 
 def bridge(parser: argparse.ArgumentParser) -> None:

@@ -16,5 +16,5 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the recording cannot be read.
     """
-    samples = export(arguments.recording, arguments.out)
+    samples = export(arguments.recording, arguments.out, arguments.machine)
     return Answer({"samples": samples, "out": str(arguments.out)}, f"{samples} samples → {arguments.out}")

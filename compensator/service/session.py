@@ -54,6 +54,8 @@ def session_config(settings: Zenoh) -> zenoh.Config:
     put(config, "connect/retry", {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5})
     # A dead service loses its liveliness token after this, where the network gives no sign.
     put(config, "transport/link/tx/lease", 4000)
+    if settings.mode == "router":
+        make_room(config)
     if settings.secured():
         # Zenoh shows its certificate only where `enable_mtls` is set on its side too.
         put(config, "transport/link/tls/enable_mtls", True)
@@ -63,6 +65,16 @@ def session_config(settings: Zenoh) -> zenoh.Config:
         put(config, "transport/link/tls/connect_private_key", settings.tls_key)
         put(config, "transport/link/protocols", ["tls", "quic"])
     return config
+
+
+def make_room(config: zenoh.Config) -> None:
+    """Have a router keep what a whole shop says at one instant.
+
+    Services whose clocks agree publish at the same time, and what does not fit on the way to one listener is dropped.
+    Packets of 64 KiB, for each client; 16 are the most that Zenoh takes.
+    """
+    for priority in ("interactive_high", "data"):
+        put(config, f"transport/link/tx/queue/size/{priority}", 16)
 
 
 def tls_files(settings: Zenoh) -> TlsFiles | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -22,6 +23,8 @@ from compensator.service.session import get, in_words, put, session_config
 
 #: Seconds between two attempts where nobody is there to connect to.
 RETRY_S = 1.0
+#: Messages that wait to be looked at, at most.
+WAITING = 65_536
 #: Longest wait for the answers to the first question, s.
 ANSWER_S = 3.0
 
@@ -94,6 +97,7 @@ class Listener:
         self._on_connection = on_connection
         self._session: Any = None
         self._thread: threading.Thread | None = None
+        self._hearing: threading.Thread | None = None
         self._stop = threading.Event()
         self._wanted = threading.Event()
 
@@ -113,7 +117,11 @@ class Listener:
         except zenoh.ZError as error:
             raise ServiceError(f"zenoh: nobody answers at {self._source.where}: {in_words(error)}") from error
         prefix = self._source.prefix
-        session.declare_subscriber(below(prefix, "**"), self._heard)
+        # Zenoh's own threads fill the channel without waiting for Python: where they had to wait, the router would drop
+        # what a whole shop says at one instant.
+        subscriber = session.declare_subscriber(below(prefix, "**"), zenoh.handlers.FifoChannel(WAITING))
+        self._hearing = threading.Thread(target=self._hear, args=(subscriber,), name="watch hears")
+        self._hearing.start()
         session.liveliness().declare_subscriber(below(prefix, "alive"), self._token, history=True)
         session.info.declare_transport_events_listener(self._transport, history=False)
         self._on_connection(True)
@@ -159,6 +167,8 @@ class Listener:
         session, self._session = self._session, None
         if session is not None:
             session.close()
+        if self._hearing is not None:
+            self._hearing.join()
 
     def __enter__(self) -> Listener:
         return self
@@ -167,6 +177,12 @@ class Listener:
         self.close()
 
     # ------------------------------------------------------------------ on other threads
+
+    def _hear(self, subscriber: Any) -> None:
+        """Hand on what is heard until the session is closed."""
+        with suppress(zenoh.ZError):
+            for sample in subscriber:
+                self._heard(sample)
 
     def _keep_connected(self) -> None:
         while not self._stop.is_set():

@@ -105,6 +105,8 @@ def router(shop: dict[str, Any]) -> dict[str, Any]:
             # A second link under the name of a client that is there is refused.
             "unicast": {"max_links": 1},
             "link": {
+                # Services whose clocks agree publish at one instant: a client's queue holds what a whole shop says.
+                "tx": {"queue": {"size": {"interactive_high": 16, "data": 16}}},
                 "protocols": sorted({endpoint.split("/", 1)[0] for endpoint in own["listen"]}),
                 "tls": {
                     "root_ca_certificate": own["ca"],

@@ -6,12 +6,13 @@ python -m tests.bench speed diagnosis    some of it
 
 import sys
 
-from tests.bench import audit, diagnosis, faults, identification, machines, speed, spindle
+from tests.bench import audit, diagnosis, faults, identification, machines, shop, speed, spindle
 from tests.bench.figures import surroundings, table
 
 AREAS = {
     "speed": speed.report, "calibration": identification.report, "diagnosis": diagnosis.report,
     "machines": machines.report, "spindle": spindle.report, "faults": faults.report, "audit": audit.report,
+    "shop": shop.report,
 }  # fmt: skip
 
 

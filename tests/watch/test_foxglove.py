@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from compensator.errors import ServiceError
 from compensator.watch.foxglove import FoxgloveServer, topic_of
-from tests.watch.heard import START_NS, estimate, event, offset
+from tests.watch.heard import START_NS, estimate, event, offset, sample
 
 pytest.importorskip("foxglove")
 connect = pytest.importorskip("websockets.sync.client").connect
@@ -85,3 +87,28 @@ def test_topics() -> None:
 def test_a_port_that_is_taken_is_said_in_one_line() -> None:
     with FoxgloveServer("shop", 0) as server, pytest.raises(ServiceError, match=f"--foxglove-port {server.port}"):
         FoxgloveServer("shop", server.port).__enter__()
+
+
+def test_every_path_of_the_layout_is_a_field_of_a_message() -> None:
+    layout = json.loads((Path(__file__).parents[2] / "deploy/foxglove/machine.json").read_text(encoding="utf-8"))
+    panels = layout["configById"]
+    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
+    paths += [panel["topicPath"] for panel in panels.values() if "topicPath" in panel]
+    assert len(paths) >= 10
+    messages = {
+        "offset": offset(1),
+        "sample": sample(1),
+        "estimate": estimate(1, effects=(1.0, 2.0)),
+        "event": event(1),
+    }
+    for path in paths:
+        topic, *fields = re.findall(r"[a-z_]+|\[\d+\]", path)
+        value = json.loads(messages[topic])
+        for field in fields:
+            value = value[int(field[1:-1])] if field.startswith("[") else value[field]
+        assert value is not None, path
+
+    def named(part: Any) -> set[str]:
+        return {part} if isinstance(part, str) else named(part["first"]) | named(part["second"])
+
+    assert named(layout["layout"]) == set(panels)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import subprocess
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from compensator.cli import main
 from compensator.clock import NS
 from compensator.errors import DataError
 from compensator.watch import shop_recorder
@@ -171,3 +173,20 @@ def test_damage_leaves_the_file_as_it_was(tmp_path: Path) -> None:
             counted[type(error).__name__] += 1
         assert path.read_bytes() == broken
     assert counted
+
+
+def test_one_machine_of_a_shop_becomes_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
+        for number in range(3):
+            time_ns = START_NS + number * 60 * NS
+            for name, t_q in (("vmc-07", 31.5), ("vmc-08", 40.0)):
+                recorder.take(f"shop/{name}/thermal/y/offset", offset(number, time_ns))
+                recorder.take(f"shop/{name}/thermal/sample", sample(number, time_ns, t_q=t_q))
+                recorder.take(f"shop/{name}/thermal/estimate", estimate(number, time_ns))
+    path, out = recordings(tmp_path)[0], tmp_path / "out.csv"
+    assert main(["export", str(path), "--machine", "shop/vmc-08", "--out", str(out)]) == 0
+    rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))
+    assert [row["t_q_degc"] for row in rows] == ["40.0"] * 3 and rows[0]["y_offset_um"] == "-12.34"
+    for machine in ("", "shop/vmc-09"):
+        assert main(["export", str(path), "--machine", machine, "--out", str(out)]) == 2
+        assert "expected --machine, one of: shop/vmc-07, shop/vmc-08" in capsys.readouterr().err
