@@ -11,6 +11,7 @@ from typing import Any
 
 from asyncua import Client, ua
 from asyncua.crypto import security_policies
+from cryptography import x509
 
 from compensator.bridge.register import Register
 from compensator.bridge.settings import OpcUa
@@ -80,6 +81,8 @@ class Bridge:
             client.set_user(settings.user)
             client.set_password(Path(settings.password_file).read_text(encoding="utf-8").strip())
         if settings.security_policy:
+            # A server compares the certificate's name of the program with what the program calls itself.
+            client.application_uri = _application_uri(Path(settings.certificate)) or client.application_uri
             await client.set_security(
                 getattr(security_policies, f"SecurityPolicy{settings.security_policy}"), settings.certificate,
                 settings.private_key, server_certificate=settings.server_certificate,
@@ -141,13 +144,23 @@ class Bridge:
             await _pause(stop, min(self._settings.cycle_s, self._settings.retry_s))
 
     def _tell(self, applied: Applied) -> None:
-        codes = "; ".join(r.code if r.code in ("catching_up", "expired") else r.text for r in applied.reasons)
+        codes = " ".join(r.code if r.code in ("catching_up", "expired") else r.text for r in applied.reasons)
         news = (
             f"trouble: {self.register.trouble}" if self.register.trouble else f"{applied.state}: {codes}".rstrip(": ")
         )
         if news != self._said:
             self._said = news
             self._say(news)
+
+
+def _application_uri(path: Path) -> str:
+    data = path.read_bytes()
+    try:
+        read = x509.load_pem_x509_certificate if data.startswith(b"-----") else x509.load_der_x509_certificate
+        names = read(data).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except (ValueError, x509.ExtensionNotFound):
+        return ""
+    return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")
 
 
 async def _write(node: Any, value: float, kind: ua.VariantType) -> None:

@@ -88,7 +88,7 @@ class Applied:
     @property
     def text(self) -> str:
         """Return it as one line for people."""
-        why = "; ".join(reason.text for reason in self.reasons)
+        why = " ".join(reason.text for reason in self.reasons)
         return f"{self.offset_um:+.2f} µm, {self.state}" + (f": {why}" if why else "")
 
 

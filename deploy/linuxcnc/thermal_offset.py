@@ -101,7 +101,7 @@ def run(component: Any, receiver: Receiver, reconciler: Reconciler, axis: Axis, 
         view = axis.view()
         component["counts"] = reconciler.step(monotonic_s(), applied.offset_um, view)
         _show(component, receiver, applied, view, reconciler)
-        words = "; ".join(filter(None, (reconciler.trouble.replace("axis.L", axis.name), *_words(applied))))
+        words = " ".join(filter(None, (reconciler.trouble.replace("axis.L", axis.name), *_words(applied))))
         news = f"{applied.state}{': ' if words else ''}{words}"
         if news != said:
             said = news

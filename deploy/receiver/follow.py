@@ -16,7 +16,7 @@ with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: what your co
     try:
         while True:
             applied = receiver.poll()
-            apply(applied.offset_um, f"{applied.state} {'; '.join(reason.text for reason in applied.reasons)}")
+            apply(applied.offset_um, f"{applied.state} {' '.join(reason.text for reason in applied.reasons)}")
             time.sleep(0.1)
     except KeyboardInterrupt:
         pass  # what is applied stands

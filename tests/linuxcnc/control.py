@@ -170,6 +170,7 @@ def linuxcnc(folder: Path, settings: str, **ini: str) -> Iterator[tuple[Control,
     shutil.copy(Path(__file__).with_name("operator_panel.py"), panel)
     text = changed(text, {
         "DISPLAY = dummy": "DISPLAY = ./panel.py",
+        "/opt/thermal/venv/bin/python": "./python",
         "HALFILE = thermal.hal": "HALFILE = thermal.hal\nHALFILE = sampler.hal", **ini,
     })  # fmt: skip
     (folder / "machine.ini").write_text(text, encoding="utf-8")
