@@ -173,6 +173,7 @@ BAD: list[tuple[bytes, str]] = [
     (offset(9).replace(b'"y_offset_um": 0.0', b'"y_offset_um": 1.0, "y_offset_um": 2.0'), "malformed"),
     (offset(9).replace(b'"y_offset_um": 0.0, ', b""), "malformed"),
     (offset(9, None), "malformed"),
+    (offset(9, note=math.nan), "malformed"),
     (offset(9, y_offset_rate_um_per_min=math.nan), "malformed"),
     (offset(9, y_offset_std_um=-1.0), "malformed"),
     (offset(9, valid_for_s=0.0), "malformed"),
