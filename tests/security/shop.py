@@ -176,7 +176,7 @@ class Plant:
         # A subscription takes a moment through the router: what is sent before is nobody's loss here.
         wait(lambda: self.publish() and self.seen, "the first offset on the screen")
         wait(lambda: self.publish() and self.receiver.poll().seq is not None, "the first offset at the control")
-        wait(lambda: len(self.alive) == 2, "both tokens")
+        wait(lambda: {key for key, _ in self.alive} >= BOTH, "both tokens")
         return self
 
     def __exit__(self, *_: object) -> None:
