@@ -109,8 +109,8 @@ async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None
     except zenoh.ZError as error:
         raise ServiceError(f"{path}: {in_words(error)}") from error
     with session:
-        session.info.declare_link_events_listener(_tell, history=True)
         log.info("compensator: router listens on %s", ", ".join(endpoints))
+        session.info.declare_link_events_listener(_tell, history=True)
         await ended.wait()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import getpass
 import json
 import re
@@ -53,7 +54,10 @@ def operator_of_file(path: Path) -> Operator:
     if not tls:
         return Operator(config, _user())
     files = files_of(path, tls, "connect")
-    check_files(str(path), files)
+    certificate = check_files(str(path), files)
+    wrong = certificate.wrong_at(datetime.datetime.now(datetime.UTC)) if certificate is not None else None
+    if wrong is not None:  # refused by the router, it would look like a service that is not there
+        raise ConfigError(f"{path}: {wrong}")
     if get(config, "transport/link/tls/enable_mtls") is not True:
         raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true, or no certificate is shown")
     name = common_name_of(files.certificate)

@@ -107,6 +107,8 @@ def router(shop: dict[str, Any]) -> dict[str, Any]:
             "link": {
                 # Services whose clocks agree publish at one instant: a client's queue holds what a whole shop says.
                 "tx": {"queue": {"size": {"interactive_high": 16, "data": 16}}},
+                # Nobody needs more than a model file takes.
+                "rx": {"max_message_size": 4 * 1024 * 1024},
                 "protocols": sorted({endpoint.split("/", 1)[0] for endpoint in own["listen"]}),
                 "tls": {
                     "root_ca_certificate": own["ca"],

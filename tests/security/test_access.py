@@ -135,6 +135,9 @@ def test_an_operator_commands_in_the_own_name_only(
     assert main(["hold", "--prefix", PREFIX, "--zenoh", receiver, "--timeout", "2"]) == 1
     error = capsys.readouterr().err
     assert "is alive and gives no answer" in error and "cnc-07" in error
+    assert main(["hold", "--prefix", PREFIX, "--zenoh", str(shop.client_file("operator-old"))]) == 2
+    error = capsys.readouterr().err
+    assert "certificate of 'old' has expired on" in error and error.count("\n") == 1
     assert plant.commands == []
 
 
