@@ -151,7 +151,8 @@ class Plant:
         self.shop = shop
         self._seq = 0
         self.service = Publisher(shop.settings(), self._command)
-        self.other = Publisher(shop.settings("vmc-08"), lambda *_: {"ok": True, "text": "other"})
+        self.other_commands: list[tuple[str, Sender]] = []
+        self.other = Publisher(shop.settings("vmc-08"), self._other_command)
         self.receiver = Receiver(Settings(
             machine="vmc-07", prefix=PREFIX, offset_max_um=200.0, offset_rate_max_um_per_min=1e6, valid_max_s=600.0,
             zenoh_config=str(shop.client_file("receiver-cnc-07")),
@@ -159,6 +160,10 @@ class Plant:
 
     def _command(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
         self.commands.append((name, payload, sender))
+        return {"ok": True, "text": "heard"}
+
+    def _other_command(self, name: str, _: bytes, sender: Sender) -> dict[str, Any]:
+        self.other_commands.append((name, sender))
         return {"ok": True, "text": "heard"}
 
     def __enter__(self) -> Plant:

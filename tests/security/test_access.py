@@ -141,6 +141,14 @@ def test_an_operator_commands_in_the_own_name_only(
     assert plant.commands == []
 
 
+def test_an_operator_cannot_use_anothers_name(plant: Plant, shop: Shop) -> None:
+    hold = "shop/vmc-08/thermal/command/hold"
+    with zenoh.open(shop.config("operator-bert")) as session:
+        assert [list(session.get(f"{hold}/{name}", timeout=5.0)) for name in ("anna", "bert.x", "*")] == [[], [], []]
+        assert len(list(session.get(f"{hold}/bert", timeout=5.0))) == 1
+    assert plant.other_commands == [("hold", Sender("bert", "certificate"))]
+
+
 def test_a_question_to_many_keys_is_no_command(plant: Plant, shop: Shop) -> None:
     """Whoever looks around must not zero, hold and resume: the list lets an operator ask this, the service does not."""
     plant.forget()
