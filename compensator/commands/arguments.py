@@ -151,7 +151,7 @@ def router(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--config", required=True, type=Path, metavar="FILE", help="Zenoh's own configuration, as zenohd takes it")
     add("--check", action="store_true", help="look at the configuration, open nothing")
-    words = "have Zenoh log to stdout as well; debug says who is refused what"
+    words = "have Zenoh log to stdout as well; warn says why a link is refused"
     add("--log", choices=("error", "warn", "info", "debug"), help=words)
 
 

@@ -52,6 +52,9 @@ def session_config(settings: Zenoh) -> zenoh.Config:
     put(config, "scouting/gossip/enabled", False)
     # A router that comes back is found within a second, not within the default's four.
     put(config, "connect/retry", {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5})
+    # Zenoh's way past the network, for whoever is on the same computer: others there could open it, and a killed
+    # process leaves its files behind in /dev/shm.
+    put(config, "transport/shared_memory/enabled", False)
     # A dead service loses its liveliness token after this, where the network gives no sign.
     put(config, "transport/link/tx/lease", 4000)
     if settings.mode == "router":

@@ -104,6 +104,8 @@ def router(shop: dict[str, Any]) -> dict[str, Any]:
         "transport": {
             # A second link under the name of a client that is there is refused.
             "unicast": {"max_links": 1},
+            # Else what is long would pass by the links, through memory that others on this computer can open.
+            "shared_memory": {"enabled": False},
             "link": {
                 # Services whose clocks agree publish at one instant: a client's queue holds what a whole shop says.
                 "tx": {"queue": {"size": {"interactive_high": 16, "data": 16}}},
