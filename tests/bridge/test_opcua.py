@@ -110,10 +110,11 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                 assert await at(12.0)
                 await plc.enable.write_value(True)
                 await until(lambda: at(20.0), "it goes on")
+                await until(lambda: asyncio.sleep(0, said[-1] == "following"), "all is written")
                 # Somebody else writes: it stands, says so, and goes on from there once that stands.
                 await plc.put(-30.0)
-                await until(lambda: _is(plc.state, 4), "the difference is noticed")
-                assert await at(-30.0) and "somebody else" in said[-1]
+                await until(lambda: asyncio.sleep(0, "somebody else" in said[-1]), "the difference is said")
+                assert await at(-30.0) and await plc.state.read_value() == 4
                 count = len(plc.values)
                 await until(lambda: at(20.0), "it goes on")
                 check(plc.values[count - 1 :])
@@ -124,6 +125,7 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                 assert await at(20.0)
                 await plc.offset.set_writable(True)
                 await until(lambda: at(25.0), "it goes on")
+                await until(lambda: asyncio.sleep(0, said[-1] == "following"), "all is written")
                 # What the PLC holds is no offset: nothing is written over it.
                 await plc.put(5_000.0)
                 await until(lambda: asyncio.sleep(0, "put it right" in said[-1]), "it is said")
