@@ -35,7 +35,8 @@ from compensator.config import Zenoh, load_config
 from compensator.errors import ServiceError
 from compensator.identify.settings import Settings
 from compensator.messages import Offset, number
-from compensator.report.page import Block, Figure, Line, Page, Table, write_page
+from compensator.report.demonstration import MachineDay, page_of, verdict
+from compensator.report.formats import checked, write
 from compensator.service.asking import ask
 from compensator.service.compensation import Outcome
 from compensator.service.composition import run_service
@@ -104,10 +105,11 @@ class Day:
 
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command `demo`."""
-    return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed))
+    also = checked(arguments.page, option="--page") if arguments.page else None
+    return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed, also=also))
 
 
-def run_demo(out: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], str]:
+def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) -> tuple[dict[str, Any], str]:
     """Run the demo and write its results.
 
     Parameters
@@ -118,25 +120,26 @@ def run_demo(out: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], str
         Length of the simulated run, h.
     seed : int
         Seed of the simulated day.
+    also : pathlib.Path, optional
+        Another file that the page goes into, such as a PDF.
 
     Returns
     -------
     (dict, str)
         Figures, and the table as text.
     """
-    results = {}
-    figures: list[Figure] = []
+    days = []
     for name in MACHINES:
         calibrate(out / name, machine=name, seed=seed)
         day = run_day(out / name, machine=name, hours=hours, seed=seed, model="calibration/model.toml")
-        results[name] = _figures(day)
-        figures += _pictures(name, day)
+        days.append(_shown(name, day))
+    results = {day.name: day.figures for day in days}
     page = out / "report.html"
     table = _table(results)
-    loop = close_the_loop(out / "conduction", hours=hours, seed=seed)
-    paper = paper_case(out / "paper", seed=seed)
-    blocks: list[Block] = [*figures, Table(head=table[0], rows=table[1:]), _loop_table(loop), _beside_the_print(paper)]
-    write_page(page, Page(title="A simulated day, compensated", verdict=_verdict(results), blocks=blocks))
+    loop, second_day = close_the_loop(out / "conduction", hours=hours, seed=seed)
+    made = page_of(days, table, loop, second_day, paper_case(out / "paper", seed=seed))
+    for path in (page, *([also] if also is not None else [])):
+        write(path, made)
     text = "\n".join(
         "  ".join(f"{cell:>{width}}" for cell, width in zip(row, _widths(table), strict=True)) for row in table
     )
@@ -148,7 +151,7 @@ def run_demo(out: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], str
         f"{rms['extended']:.2f} with the extended one."
     )
     result = {"machines": results, "loop": loop, "report": str(page)}
-    return result, f"{text}\n\n{_verdict(results)}\n{said}\npage: {page}"
+    return result, f"{text}\n\n{verdict(days)}\n{said}\npage: {page}"
 
 
 # ---------------------------------------------------------------------------- calibration
@@ -209,7 +212,9 @@ def paper_case(folder: Path, *, seed: int) -> dict[str, Any]:
 # ---------------------------------------------------------------------------- the loop
 
 
-def close_the_loop(folder: Path, *, hours: float, seed: int) -> dict[str, Any]:
+def close_the_loop(
+    folder: Path, *, hours: float, seed: int
+) -> tuple[dict[str, Any], dict[str, tuple[Vector, Vector]]]:  # fmt: skip
     """Let an effect act that the calibration never saw, find it in the service's own recordings, and run with it.
 
     The effect is drawn by the seed and sealed: nothing here knows what it is until the table is written.
@@ -225,8 +230,8 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        What was drawn, what was found, and the error on the second day.
+    (dict, dict)
+        What was drawn, what was found, and the error on the second day; that error over time, h and µm.
     """
     effect = draw_effect(seed, EFFECT_UM, hours)
     first = "../calibration/model.toml"
@@ -246,9 +251,10 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> dict[str, Any]:
         for name, model in (("first", None), ("extended", adopt))
     }  # fmt: skip
     adopted_h = days["extended"].adopted_at * PERIOD_S / 3600.0
-    errors = {}
+    errors, curves = {}, {}
     for name, day in days.items():
         values = _errors(day)
+        curves[name] = (values["t_h"], values["followed"])
         judged = values["t_h"] >= adopted_h + values["t_h"][0]
         errors[name], errors["without"] = values["followed"][judged], values["without"][judged]
     drawn = effect.reveal().describe()
@@ -260,20 +266,7 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> dict[str, Any]:
         "held_out_rms_um": {"before": found["before"]["rms_um"], "after": found["after"]["rms_um"]},
         "adopted_after_h": adopted_h,
         "second_day_rms_um": {name: float(np.std(values)) for name, values in errors.items()},
-    }  # fmt: skip
-
-
-def _loop_table(loop: Mapping[str, Any]) -> Table:
-    rms = loop["second_day_rms_um"]
-    rows = [["without compensation", f"{rms['without']:.2f}"], ["first model", f"{rms['first']:.2f}"],
-            ["extended model", f"{rms['extended']:.2f}"]]  # fmt: skip
-    return Table(
-        title="The loop closed: an effect the calibration never saw, on a second day with another duty",
-        head=["conduction machine", "rms µm"], rows=rows,
-        note=f"Found in the recordings of the first day: {', '.join(loop['found']) or 'nothing'} ({loop['verdict']}). "
-        f"Drawn by the seed and not passed on: {loop['drawn']}. The running service took the extended model over; "
-        f"judged from then on, {loop['adopted_after_h']:.1f} h after the start.",
-    )  # fmt: skip
+    }, curves  # fmt: skip
 
 
 def write_table(path: Path, columns: Mapping[str, Vector]) -> None:
@@ -628,48 +621,18 @@ def _table(results: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def _beside_the_print(paper: Mapping[str, Any]) -> Table:
-    rows = [
-        [f"{r['path']}: {r['figure']}", f"{r['found']:.4g}", f"{r['std']:.2g}", f"{r['reference']:.4g}"]
-        for r in paper["comparison"]
-    ]
-    return Table(
-        title="The paper's own case: identified from a run with 1 % measuring error, beside what is printed",
-        head=["path and figure", "identified", "standard error", "printed"], rows=rows,
-        note="One step of 90 W in quiet air: the TTF comes back, the slow part of DTF and TDTF only within its errors.",
-    )  # fmt: skip
-
-
 def _widths(table: list[list[str]]) -> list[int]:
     return [max(len(row[i]) for row in table) for i in range(len(table[0]))]
 
 
-def _verdict(results: Mapping[str, Any]) -> str:
-    parts = [
-        f"{name}: {figures['without']['peak_to_peak_um']:.0f} µm of thermal error become "
-        f"{figures['followed']['peak_to_peak_um']:.1f} µm"
-        for name, figures in results.items()
-    ]
-    return "Peak to peak over a day after its calibration. " + "; ".join(parts) + "."
-
-
-def _pictures(name: str, day: Day) -> list[Figure]:
-    errors = _errors(day)
+def _shown(name: str, day: Day) -> MachineDay:
+    """Return what the page shows of a day."""
     hours = [(o.estimate.time_utc_ns - START_NS) / NS / 3600 for o in day.outcomes]
     heat = [number(o.estimate.heat_w) for o in day.outcomes]
-    return [
-        Figure(
-            title=f"{name}: thermal error with and without compensation", x_label="time, h", y_label="error in Y, µm",
-            lines=(Line("without", errors["t_h"], errors["without"]), Line("with", errors["t_h"], errors["followed"])),
-        ),
-        Figure(
-            title=f"{name}: heat", x_label="time, h", y_label="heat, W",
-            lines=(
-                Line("true", day.truth["t_s"] / 3600.0, day.truth["heat_w"]),
-                Line("estimated from T_Q and AT", np.array(hours), np.array(heat)),
-            ),
-        ),
-    ]  # fmt: skip
+    return MachineDay(
+        name=name, figures=_figures(day), errors=_errors(day),
+        heat=(day.truth["t_s"] / 3600.0, day.truth["heat_w"], np.array(hours), np.array(heat)),
+    )  # fmt: skip
 
 
 __all__ = ["Day", "Scores", "configuration", "hardware", "run", "run_day", "run_demo"]

@@ -13,7 +13,7 @@ from compensator.audit.findings import Difference, Finding, utc
 from compensator.audit.recording_audit import RecordingAudit
 from compensator.audit.series import Audit
 from compensator.chain import NOTHING
-from compensator.report.envelope import Envelope
+from compensator.report.envelope import Envelope, line_of
 from compensator.report.page import (
     Block,
     Cell,
@@ -246,7 +246,7 @@ class Curves:
     def line(self, name: str, curve: str) -> Line:
         """Return a curve to draw."""
         self._flush()
-        return Line(name, *self.curves[curve].points())
+        return line_of(name, self.curves[curve])
 
     def _flush(self) -> None:
         if self._rows:

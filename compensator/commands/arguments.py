@@ -11,7 +11,7 @@ _SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (defaul
 
 
 def _page(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--page", type=Path, metavar="FILE", help="a page for people, .html, .pdf or .png")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="write the page here (too): .html, .pdf, or .png")
 
 
 def demo(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +20,7 @@ def demo(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder for the results")
     add("--hours", type=float, default=24.0, help="length of the simulated run, h (default 24)")
     add("--seed", type=int, default=1, help="seed of the simulated day (default 1)")
+    _page(parser)
 
 
 def of_service(parser: argparse.ArgumentParser) -> None:
@@ -61,6 +62,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
     add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html comes beside it")
+    _page(parser)
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
     add("--name", help="name of the model (default: that of the file)")
     words = "with a TTF, or from T_Q - AT straight to y (default: with one where heat_w is known)"
@@ -90,6 +92,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="DIR", help="diagnosis.json, model.toml and report.html come there")
+    _page(parser)
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 

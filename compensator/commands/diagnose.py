@@ -19,6 +19,7 @@ from compensator.diagnose.summary import figures, text
 from compensator.model.model_file import load_model
 from compensator.model.model_writer import write_model
 from compensator.report.diagnosis import write_report
+from compensator.report.formats import checked
 from compensator.tables import roles_of
 
 #: So few values are searched in this process; starting others takes as long.
@@ -34,12 +35,16 @@ def run(arguments: argparse.Namespace) -> Answer:
         If the data or the model cannot be read, or there is too little.
     """
     given = arguments
-    return diagnose_files(given.data, given.model, given.out, columns=given.column, scheduler=given.scheduler)
+    also = checked(given.page, option="--page") if given.page else None
+    return diagnose_files(
+        given.data, given.model, given.out, columns=given.column, scheduler=given.scheduler, also=also
+    )  # fmt: skip
 
 
 def diagnose_files(
-    data: Sequence[Path], model: str | Path, out: Path, *, columns: Sequence[str] = (), scheduler: str | None = None
-) -> Answer:
+    data: Sequence[Path], model: str | Path, out: Path, *, columns: Sequence[str] = (), scheduler: str | None = None,
+    also: Path | None = None,
+) -> Answer:  # fmt: skip
     """Diagnose files and write `diagnosis.json`, `model.toml` and `report.html` into a folder."""
     base = load_model(model)
     remarks: list[str] = []
@@ -47,10 +52,13 @@ def diagnose_files(
     values = sum(run.t_s.size * (len(run.channels) + 2) for run in runs)
     with progress("searching") as told, workers(FOLDS if values > ALONE else 1, scheduler) as executor:
         diagnosis = diagnose(base, runs, told=told, mapped=executor.map if executor else map)
-    return write(diagnosis, base.sha256, data, out, remarks)
+    return write(diagnosis, base.sha256, data, out, remarks, also=also)
 
 
-def write(diagnosis: Diagnosis, base_sha256: str, data: Sequence[Path], out: Path, remarks: Sequence[str]) -> Answer:
+def write(
+    diagnosis: Diagnosis, base_sha256: str, data: Sequence[Path], out: Path, remarks: Sequence[str], *,
+    also: Path | None = None,
+) -> Answer:  # fmt: skip
     """Write what was found."""
     out.mkdir(parents=True, exist_ok=True)
     found = figures(diagnosis)
@@ -64,7 +72,7 @@ def write(diagnosis: Diagnosis, base_sha256: str, data: Sequence[Path], out: Pat
     }  # fmt: skip
     model = write_model(out / "model.toml", dataclasses.replace(diagnosis.model, provenance=provenance))
     (out / "diagnosis.json").write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    page = write_report(out / "report.html", diagnosis, model, remarks)
+    page = write_report(out / "report.html", diagnosis, model, remarks, also=also)
     files = {"model": str(out / "model.toml"), "model_sha256": model.sha256, "report": str(page)}
     words = [text(diagnosis), *([f"remarks: {'; '.join(remarks)}"] if remarks else []),
              f"model: {files['model']}\npage: {page}"]  # fmt: skip

@@ -56,6 +56,8 @@ class Request:
         Fit up to this hour.
     reference : str, optional
         A model to put the coefficients beside.
+    page : pathlib.Path, optional
+        Another file that the page goes into, such as a PDF.
     """
 
     data: Sequence[Path]
@@ -67,6 +69,7 @@ class Request:
     columns: Sequence[str] = ()
     fit_until_h: float | None = None
     reference: str | None = None
+    page: Path | None = None
 
     def __post_init__(self) -> None:
         taken = {path.resolve() for path in (*self.data, *self.etve)}
@@ -92,6 +95,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     request = Request(
         data=given.data, out=given.out, name=given.name or given.out.stem, settings=settings, etve=given.etve,
         validate=given.validate, columns=given.column, fit_until_h=given.fit_until, reference=given.reference,
+        page=_checked(given.page),
     )  # fmt: skip
     return identify(request)
 
@@ -114,16 +118,28 @@ def identify(request: Request) -> Answer:
             fit_until_s=None if request.fit_until_h is None else request.fit_until_h * 3600.0,
             provenance=provenance(request), remarks=remarks, told=told,
         )  # fmt: skip
-    return write(calibration, criticise(calibration), request.out, reference=request.reference)
+    return write(
+        calibration, criticise(calibration), request.out, reference=request.reference, also=request.page
+    )  # fmt: skip
 
 
-def write(calibration: Calibration, criticism: Criticism, out: Path, *, reference: str | None = None) -> Answer:
+def _checked(page: Path | None) -> Path | None:
+    if page is None:
+        return None
+    from compensator.report.formats import checked
+
+    return checked(page, option="--page")
+
+
+def write(
+    calibration: Calibration, criticism: Criticism, out: Path, *, reference: str | None = None, also: Path | None = None
+) -> Answer:
     """Write the model file and the page beside it."""
     from compensator.report.identification import write_report
 
     model = write_model(out, finished(calibration, criticism))
     rows: Sequence[Row] = compare(model, load_model(reference)) if reference else ()
-    page = write_report(out.parent / "report.html", calibration, criticism, model, rows)
+    page = write_report(out.parent / "report.html", calibration, criticism, model, rows, also=also)
     result = {"model": str(out), "model_sha256": model.sha256, "report": str(page)} | figures(calibration, criticism)
     if rows:
         result["comparison"] = [

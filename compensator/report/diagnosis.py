@@ -12,6 +12,7 @@ from compensator.diagnose.outcome import Diagnosis, Effect
 from compensator.diagnose.summary import name, verdict
 from compensator.identify.summary import with_std
 from compensator.model.thermal_model import ThermalModel
+from compensator.report.formats import write
 from compensator.report.page import (
     Block,
     Details,
@@ -34,13 +35,15 @@ SHOWN = 6
 _TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
 
 
-def write_report(path: Path, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Path:
+def write_report(
+    path: Path, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str], *, also: Path | None = None
+) -> Path:
     """Write the page.
 
     Parameters
     ----------
-    path : pathlib.Path
-        The HTML file.
+    path, also : pathlib.Path
+        The HTML file, and another file that it goes into, of any of `formats.SUFFIXES`.
     diagnosis : Diagnosis
         What was found.
     model : ThermalModel
@@ -57,9 +60,10 @@ def write_report(path: Path, diagnosis: Diagnosis, model: ThermalModel, remarks:
         blocks.append(_ranking(diagnosis))
     blocks.append(_details(t, diagnosis, model, remarks))
     title = f"Diagnosis: what {model.name} lacks"
-    return write_page(
-        path, Page(title=title, verdict=verdict(diagnosis), blocks=blocks, tone=_TONES[diagnosis.verdict])
-    )
+    page = Page(title=title, verdict=verdict(diagnosis), blocks=blocks, tone=_TONES[diagnosis.verdict])
+    if also is not None:
+        write(also, page)
+    return write_page(path, page)
 
 
 def _hours(diagnosis: Diagnosis) -> Vector:

@@ -7,12 +7,16 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from compensator.report.figure import Line
+
 Vector = npt.NDArray[np.float64]
 
 #: Columns of pixels that a curve has at least; each keeps its lowest and its highest point.
 COLUMNS = 1000
 #: Points that are kept before a curve is thinned again.
 _MOST = 8 * COLUMNS
+#: From this width of a column on, a curve of a working machine fills its picture, s.
+_WIDE_S = 2048.0
 #: Pieces of a strip that are told apart.
 _PIECES = 1000
 #: A distance of so many periods or columns between two points is a gap.
@@ -43,6 +47,10 @@ class Envelope:
     def __init__(self, *, period_s: float = 60.0) -> None:
         self._period_s = period_s
         self._width_s = 0.0
+        #: Of each column its number, sum and count; what came since it was last thinned is not in them.
+        self._sums = np.empty((3, 0))
+        self._summed_s = 0.0
+        self._new: list[tuple[Vector, Vector]] = []
         self._t: list[Vector] = []
         self._y: list[Vector] = []
         self._size = 0
@@ -57,6 +65,7 @@ class Envelope:
         y : numpy.ndarray, shape (n,)
             Values; NaN where one is missing.
         """
+        self._new.append((t_s, y))
         self._t.append(t_s)
         self._y.append(y)
         self._size += t_s.size
@@ -67,6 +76,30 @@ class Envelope:
     def known(self) -> bool:
         """Whether there is any value."""
         return any(bool(np.isfinite(y).any()) for y in self._y)
+
+    def columns(self) -> tuple[Vector, Vector, Vector, Vector] | None:
+        """Return time, mean, lowest and highest of each column; None where columns are narrow and a curve says more.
+
+        Returns
+        -------
+        tuple of numpy.ndarray, shape (n,), or None
+            s, and the curve's unit; NaN where a column has no value.
+        """
+        self._thin()
+        if self._width_s < _WIDE_S:
+            return None
+        t, y = self._t[0], self._y[0]
+        numbers = np.floor(t / self._width_s)
+        starts = np.concatenate([[0], np.flatnonzero(np.diff(numbers)) + 1])
+        low, high = np.fmin.reduceat(y, starts), np.fmax.reduceat(y, starts)
+        own, sums, counts = self._sums
+        mean = np.full(starts.size, np.nan)
+        np.divide(sums, counts, out=mean, where=counts > 0.0)
+        at = (own + 0.5) * self._width_s
+        gaps = np.flatnonzero(np.diff(own) > _GAP) + 1
+        between = (at[gaps - 1] + at[gaps]) / 2.0
+        mean, low, high = (np.insert(values, gaps, np.nan) for values in (mean, low, high))
+        return np.insert(at, gaps, between), mean, low, high
 
     def points(self) -> tuple[Vector, Vector]:
         """Return the curve in the order of time, with a NaN wherever nothing is known for longer than a column."""
@@ -79,12 +112,26 @@ class Envelope:
         t, y = np.concatenate([*self._t, np.empty(0)]), np.concatenate([*self._y, np.empty(0)])
         order = np.argsort(t, kind="stable")
         t, y = t[order], y[order]
-        if t.size > 2 * COLUMNS:
+        if t.size > 2 * COLUMNS or (self._width_s and self._new):
             span_s = max(float(t[-1] - t[0]), 1.0)
             self._width_s = max(self._width_s, 2.0 ** math.floor(math.log2(span_s / COLUMNS)))
+            self._add_up()
             keep = _extremes(np.floor(t / self._width_s), y)
             t, y = t[keep], y[keep]
         self._t, self._y, self._size = [t], [y], t.size
+
+    def _add_up(self) -> None:
+        """Bring the sums to the columns as they are now."""
+        times = (np.concatenate([t for t, _ in self._new]), np.concatenate([y for _, y in self._new]))
+        known = np.isfinite(times[1])
+        fresh = np.array([np.floor(times[0] / self._width_s), np.where(known, times[1], 0.0), known.astype(np.float64)])
+        old = self._sums.copy()
+        if self._summed_s:
+            old[0] = np.floor(old[0] * (self._summed_s / self._width_s))
+        number, place = np.unique(np.concatenate([old[0], fresh[0]]), return_inverse=True)
+        both = np.concatenate([old[1:], fresh[1:]], axis=1)
+        sums = [np.bincount(place, weights=weights, minlength=number.size) for weights in both]
+        self._sums, self._new, self._summed_s = np.array([number, *sums]), [], self._width_s
 
 
 def _extremes(column: Vector, y: Vector) -> npt.NDArray[np.int_]:
@@ -93,6 +140,15 @@ def _extremes(column: Vector, y: Vector) -> npt.NDArray[np.int_]:
     starts = np.concatenate([[0], np.flatnonzero(np.diff(column[order])) + 1])
     known = np.add.reduceat(np.isfinite(y[order]).astype(np.int_), starts)
     return np.unique(np.concatenate([order[starts], order[starts + np.maximum(known - 1, 0)]]))
+
+
+def line_of(name: str, curve: Envelope) -> Line:
+    """Return a curve to draw: its points, or, over a long time, its means and what they lie between."""
+    columns = curve.columns()
+    if columns is None:
+        return Line(name, *curve.points())
+    t, mean, low, high = columns
+    return Line(name, t, mean, band=(low, high))
 
 
 class Stretches:

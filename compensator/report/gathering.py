@@ -207,12 +207,15 @@ class _Reader:
         for name, channel in sample.channels.items():
             good = channel.quality == "good"
             self._put(f"channel {name}", t, number(channel.mean) if good else math.nan)
-            missed = self.history.channels.setdefault(name, Missed())
+            missed = self.history.channels.get(name)
+            if missed is None:
+                missed = self.history.channels[name] = Missed()
             missed.samples += 1
             if not good:
                 missed.missing += 1
                 missed.qualities[channel.quality] += 1
-            missed.errors.update(channel.errors)
+            if channel.errors:
+                missed.errors.update(channel.errors)
 
     def _estimate(self, estimate: _Estimate) -> None:
         t = estimate.time_utc_ns * _NS
@@ -288,7 +291,10 @@ class _Reader:
         self._episode = None
 
     def _put(self, name: str, t: float, value: float) -> None:
-        times, values = self._buffers.setdefault(name, ([], []))
+        buffer = self._buffers.get(name)
+        if buffer is None:
+            buffer = self._buffers[name] = ([], [])
+        times, values = buffer
         times.append(t)
         values.append(value)
         if len(times) >= _TOGETHER:

@@ -14,6 +14,7 @@ from compensator.identify.comparison import Row as Comparison
 from compensator.identify.criticism import LAGS, Criticism, PathView, ResidualView
 from compensator.identify.summary import verdict, with_std
 from compensator.model.thermal_model import ThermalModel
+from compensator.report.formats import write
 from compensator.report.page import (
     Block,
     Details,
@@ -36,14 +37,15 @@ Vector = npt.NDArray[np.float64]
 
 
 def write_report(
-    path: Path, calibration: Calibration, criticism: Criticism, model: ThermalModel, comparison: Sequence[Comparison]
-) -> Path:
+    path: Path, calibration: Calibration, criticism: Criticism, model: ThermalModel, comparison: Sequence[Comparison],
+    *, also: Path | None = None,
+) -> Path:  # fmt: skip
     """Write the page.
 
     Parameters
     ----------
-    path : pathlib.Path
-        The HTML file.
+    path, also : pathlib.Path
+        The HTML file, and another file that it goes into, of any of `formats.SUFFIXES`.
     calibration : Calibration
         What came out.
     criticism : Criticism
@@ -65,6 +67,8 @@ def write_report(
     page = Page(
         title=f"Calibration: {model.name}", verdict=verdict(calibration), blocks=blocks, tone=_tone(calibration)
     )
+    if also is not None:
+        write(also, page)
     return write_page(path, page)
 
 
@@ -206,7 +210,7 @@ def _still(view: ResidualView) -> Block:
     own = Figure(
         title=f"{view.name}: autocorrelation of the residual", x_label="lag, samples", y_label="correlation",
         stems=(Stems("residual", lags, view.autocorrelation),), limits=(-view.limit, view.limit), height=3.0,
-        note=f"Dashed: 99 % of white noise. Chance of so much in white noise: {view.white_chance:.2g}.",
+        note=f"Dashed: 99 % of white noise. Chance of so much in white noise: {_chance(view.white_chance)}.",
     )  # fmt: skip
     both = np.arange(-LAGS, LAGS + 1, dtype=np.float64)
     cross = tuple(
@@ -217,6 +221,10 @@ def _still(view: ResidualView) -> Block:
         for name, (values, limit) in view.cross.items()
     )  # fmt: skip
     return Row(figures=(own, *cross))
+
+
+def _chance(share: float) -> str:
+    return f"{share:.2g}" if share >= 0.001 else "under 0.001"
 
 
 def _choice(calibration: Calibration) -> Block:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
 from compensator.reasons import explain
+from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
 from compensator.report.page import (
     Block,
@@ -15,7 +16,6 @@ from compensator.report.page import (
     Code,
     Details,
     Figure,
-    Line,
     Page,
     Section,
     Span,
@@ -117,7 +117,10 @@ def _tone(history: History) -> Tone:
 
 def _picture(history: History, title: str, y_label: str, curves: Mapping[str, str], note: str = "", height: float = 2.8,
              spans: tuple[Span, ...] = ()) -> Figure:  # fmt: skip
-    lines = tuple(Line(name, *history.curves[key].points()) for name, key in curves.items() if key in history.curves)
+    drawn = [(name, history.curves[key]) for name, key in curves.items() if key in history.curves]
+    lines = tuple(line_of(name, curve) for name, curve in drawn)
+    if any(line.band is not None for line in lines):
+        note = f"{note} Lines are means, shaded is what lies between the lowest and the highest.".strip()
     return Figure(title=title, x_label=TIME, y_label=y_label, lines=lines, clock=True, height=height, note=note,
                   x_limits=(history.first_s, history.last_s), spans=spans)  # fmt: skip
 

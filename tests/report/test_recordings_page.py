@@ -275,3 +275,34 @@ def test_a_state_that_flickers_for_a_year_takes_no_memory() -> None:
         assert len(strip.pieces) <= 1001
     assert strip.count == 100_000
     assert strip.pieces[0][0] == 0.0 and strip.pieces[-1][1] == 60.0 * 199_999
+
+
+def test_over_a_long_time_means_stand_between_the_lowest_and_the_highest() -> None:
+    rng, curve = np.random.default_rng(2), Envelope()
+    t = START_S + 60.0 * np.arange(200_000)
+    y = np.sin(np.arange(t.size) / 3000.0) + rng.normal(size=t.size)
+    y[50_000:60_000] = np.nan
+    keep = np.ones(t.size, bool)
+    keep[100_000:120_000] = False
+    for part in np.array_split(np.flatnonzero(keep), 97):
+        curve.add(t[part], y[part])
+    columns = curve.columns()
+    assert columns is not None
+    at, mean, low, high = columns
+    known = np.isfinite(mean)
+    assert np.array_equal(known, np.isfinite(low)) and np.all((low <= mean) & (mean <= high) | ~known)
+    width = np.median(np.diff(at))
+    for i in np.flatnonzero(known)[5:-5:40]:
+        inside = keep & (t >= at[i] - width / 2) & (t < at[i] + width / 2)
+        assert (mean[i], low[i], high[i]) == pytest.approx(
+            (np.nanmean(y[inside]), np.nanmin(y[inside]), np.nanmax(y[inside]))
+        )
+    for first, last in ((51_000, 59_000), (101_000, 119_000)):
+        assert not known[(at > t[first]) & (at < t[last])].any()
+    assert (~known).any()
+
+
+def test_a_day_is_drawn_point_by_point() -> None:
+    curve = Envelope()
+    curve.add(START_S + 60.0 * np.arange(1440), np.arange(1440.0))
+    assert curve.columns() is None
