@@ -122,6 +122,8 @@ class Envelope:
 
     def _add_up(self) -> None:
         """Bring the sums to the columns as they are now."""
+        if not self._new:
+            return
         times = (np.concatenate([t for t, _ in self._new]), np.concatenate([y for _, y in self._new]))
         known = np.isfinite(times[1])
         fresh = np.array([np.floor(times[0] / self._width_s), np.where(known, times[1], 0.0), known.astype(np.float64)])
