@@ -84,11 +84,10 @@ def test_a_full_disk(small_disk: Path, place: tuple[Site, Receiver]) -> None:
     site, control = place
     with site.service() as service:
         control.more(3)
-        with (small_disk / "other").open("wb") as other:
+        with (small_disk / "other").open("wb", buffering=0) as other:
             try:
                 while True:
                     other.write(bytes(4096))
-                    other.flush()
             except OSError:
                 pass
             refused(control, 4)
