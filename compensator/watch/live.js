@@ -18,6 +18,7 @@ const signed = (value, digits = 2) => known(value) ? (value < 0 ? "−" : "+") +
 const plain = (value, digits = 2) => known(value) ? (value < 0 ? "−" : "") + Math.abs(value).toFixed(digits) : "–";
 const clock = (t_s, seconds = false) => new Date(1000 * t_s).toLocaleTimeString("en-GB",
   seconds ? {} : {hour: "2-digit", minute: "2-digit"});
+const stamp = (t_s) => `${new Date(1000 * t_s).toLocaleDateString("en-CA")} ${clock(t_s, true)}`;
 const age = (s) => !known(s) ? "–" : s < 120 ? `${Math.max(s, 0).toFixed(0)} s` : s < 3600 ? `${Math.floor(s / 60)} min`
   : s < 172800 ? `${Math.floor(s / 3600)} h ${Math.floor(s % 3600 / 60)} min` : `${(s / 86400).toFixed(1)} d`;
 const wordLink = (code) => make("a", {href: `#word=${code.split(":")[0]}`}, code);
@@ -170,7 +171,7 @@ function events(found) {
   const key = JSON.stringify(found);
   if ($("events").dataset.key === key) return;
   $("events").dataset.key = key;
-  const lines = found.slice(0, 20).map((event) => make("li", {}, make("b", {}, `${clock(event.time_utc_ns / 1e9, true)} ${event.kind}: `),
+  const lines = found.slice(0, 20).map((event) => make("li", {}, make("b", {}, `${stamp(event.time_utc_ns / 1e9)} ${event.kind}: `),
     event.text, ...(event.do ? [" ", make("b", {}, "To do: "), event.do] : [])));
   $("events").replaceChildren(lines.length ? make("ul", {}, ...lines) : make("p", {}, "None was seen."));
 }

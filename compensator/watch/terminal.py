@@ -42,14 +42,14 @@ def view(shop: Shop, *, prefix: str, where: str, connected: bool, console: Conso
         Its size says how much there is room for.
     """
     machines = shop.overview()
-    head = Text(f"{headline(machines)}  ·  {prefix or 'everything'} at {where}  ·  {_utc()}", style="bold")
-    parts: list[RenderableType] = [head]
+    about = Text(f"{prefix or 'everything'} at {where}, {_utc()}", style="dim")
+    parts: list[RenderableType] = [Text(headline(machines), style="bold"), about]
     if not connected:
         parts.append(Text(f"✗ No connection to {where}; trying again. What stands here is old.", style="bold red"))
     if len(machines) == 1:
         parts.append(detail(machines[0], shop.history(machines[0]["prefix"]), console.width))
     elif machines:
-        parts.append(overview(shop, machines, console.width, rows=max(console.height - 7, 5)))
+        parts.append(overview(shop, machines, console.width, rows=max(console.height - 8, 5)))
     if shop.ignored:
         parts.append(Text(f"{shop.ignored} message(s) with keys or of machines that are not followed.", style="yellow"))
     parts.append(Text("Ctrl-C ends the view; nothing is sent to the machines.", style="dim"))
@@ -80,16 +80,16 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
     names = [name for name, least in _COLUMNS if width >= least]
     table = Table(expand=width < 140, box=None, padding=(0, 1, 0, 0), header_style="dim")
     for name in names:
-        left = name in ("machine", "state", "why", "alive", "last 24 h")
+        left, why = name in ("machine", "state", "why", "alive", "last 24 h"), name == "why"
         table.add_column(
             name, justify="left" if left else "right", no_wrap=name != "machine", overflow="ellipsis",
-            ratio=1 if name == "why" and width < 140 else None, max_width=60 if name == "why" else None,
+            ratio=1 if why and width < 140 else None, max_width=max(40, width - 140) if why else None,
         )  # fmt: skip
     shown = machines[:rows]
     for machine in shown:
         cells = _cells(machine)
         if "last 24 h" in names:
-            cells["last 24 h"] = Text(sparkline(shop.history(machine["prefix"]).get("y_offset_um", []), 24))
+            cells["last 24 h"] = Text(_offsets(shop.history(machine["prefix"]), 24))
         table.add_row(*(cells[name] for name in names))
     left_out = machines[len(shown) :]
     if not left_out:
@@ -100,9 +100,9 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
 
 
 def _cells(machine: dict[str, Any]) -> dict[str, Text]:
-    why = "; ".join([reason["means"] for reason in machine["reasons"]] + machine["warnings"])
+    why = " ".join([reason["means"] for reason in machine["reasons"]] + machine["warnings"])
     if machine["shown"] == "silent":
-        why = "; ".join([machine["means"], *machine["warnings"]])
+        why = " ".join([machine["means"], *machine["warnings"]])
     return {
         "machine": Text(machine["prefix"]), "state": state(machine),
         "offset µm": Text(signed(machine["y_offset_um"]), style="dim" if machine["shown"] == "silent" else ""),
@@ -130,17 +130,16 @@ def state(machine: dict[str, Any]) -> Text:
 def detail(machine: dict[str, Any], history: dict[str, list[Any]], width: int) -> RenderableType:
     """Return everything of one machine."""
     parts: list[RenderableType] = [_verdict(machine)]
-    numbers = Table.grid(padding=(0, 2))
-    for _ in range(2 if width < 110 else 4):
-        numbers.add_column(style="dim")
-        numbers.add_column(justify="right")
     pairs = _pairs(machine)
     per_row = 1 + (width >= 60) + 2 * (width >= 110)
     numbers = Table.grid(padding=(0, 2))
     for i in range(0, len(pairs), per_row):
         numbers.add_row(*(cell for name, value in pairs[i : i + per_row] for cell in (Text(name, style="dim"), value)))
-    parts += [numbers, *_last_day(history, width)]
-    parts += [_titled(title, lines) for title, lines in _lists(machine) if lines]
+    lists = [(title, lines) for title, lines in _lists(machine) if lines]
+    urgent = [(title, lines) for title, lines in lists if title in ("Why", "Mind")]
+    parts += [_titled(title, lines) for title, lines in urgent]
+    parts += [Text(""), numbers, *_last_day(history, width)]
+    parts += [_titled(title, lines) for title, lines in lists[len(urgent) :]]
     return Panel(
         Group(*parts), title=f"{machine['machine']}  ({machine['prefix']})", border_style=_STYLES[machine["tone"]]
     )
@@ -183,7 +182,7 @@ def _last_day(history: dict[str, list[Any]], width: int) -> list[RenderableType]
         if len(values) > 1:
             hours = (history["t_s"][-1] - history["t_s"][0]) / 3600.0
             said = f"{plain(min(values), 1)} to {plain(max(values), 1)} {unit}"
-            bars = sparkline(history[column], max(width - 46, 12))
+            bars = sparkline(_evenly(history["t_s"], history[column], max(width - 46, 12)), max(width - 46, 12))
             lines.append(Text.assemble((f"{name:<9}", "dim"), bars, f" {said}", (f" in {hours:.1f} h", "dim")))
     return lines
 
@@ -197,7 +196,7 @@ def _lists(machine: dict[str, Any]) -> list[tuple[str, list[str]]]:
     ]  # fmt: skip
     devices = [f"{name}: {error}" for name, error in (machine["devices"] or {}).items() if error != "ok"]
     events = [
-        f"{datetime.fromtimestamp(event['time_utc_ns'] / NS, UTC):%H:%M:%S} {event['kind']}: {event['text']}"
+        f"{datetime.fromtimestamp(event['time_utc_ns'] / NS, UTC):%m-%d %H:%M:%S} {event['kind']}: {event['text']}"
         + (f" → {event['do']}" if event["do"] else "")
         for event in machine["events"][:EVENTS]
     ]
@@ -210,6 +209,22 @@ def _titled(title: str, lines: list[str]) -> RenderableType:
     for line in lines:
         table.add_row(Text("•"), Text(line))
     return Group(Text(f"\n{title}", style="bold"), table)
+
+
+def _offsets(history: dict[str, list[Any]], width: int) -> str:
+    return sparkline(_evenly(history["t_s"], history["y_offset_um"], width), width) if history else ""
+
+
+def _evenly(t_s: Sequence[float], values: Sequence[float | None], width: int) -> list[float | None]:
+    """Return the values at even steps of time, None where nothing was heard."""
+    if len(t_s) < 2 or t_s[-1] <= t_s[0]:
+        return list(values)
+    count = min(width, len(t_s))
+    parts: list[list[float]] = [[] for _ in range(count)]
+    for t, value in zip(t_s, values, strict=True):
+        if value is not None:
+            parts[min(int((t - t_s[0]) / (t_s[-1] - t_s[0]) * count), count - 1)].append(value)
+    return [sum(part) / len(part) if part else None for part in parts]
 
 
 def sparkline(values: Sequence[float | None], width: int) -> str:
