@@ -59,6 +59,7 @@ def client_config(settings: Settings) -> Any:
         config.insert_json5("connect/endpoints", json.dumps(list(settings.connect)))
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("scouting/gossip/enabled", "false")
+        config.insert_json5("transport/shared_memory/enabled", "false")  # it leaves files behind
         retry = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
         config.insert_json5("connect/retry", json.dumps(retry))
     config.insert_json5("connect/timeout_ms", str(CONNECT_TIMEOUT_MS))

@@ -109,7 +109,8 @@ def test_what_waited_while_the_program_stood_still_is_judged_by_the_wall_clock()
 
         until(stood, "the old offset is noticed")
         last = receiver.poll()
-        assert receiver.follower.dropped == {"late": 1} and last.state == "holding"
+        # Once as a message, and perhaps as the answer to a query that was under way.
+        assert set(receiver.follower.dropped) == {"late"} and last.state == "holding"
         assert last.offset_um == pytest.approx(5.0, abs=0.02)
 
 
