@@ -108,6 +108,8 @@ class _Machine:
 
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
+            # The simulated machine keeps its history; what is measured here is the service's memory.
+            del self.world._times[:-1], self.world._rows[:-1]
 
         self.clock = _Clock(START_NS, advance)
 
