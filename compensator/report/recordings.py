@@ -36,6 +36,8 @@ _MUCH = 0.1
 _DAYS = 31
 #: So many rows stand on the page at once; more are there to open.
 _ROWS = 12
+#: Ends of a recording that have sentences of their own.
+_ENDS: Mapping[str, Cell] = {"finished": Code("finished"), "no end": Code("open")}
 #: Curves in a picture of channels, and pieces of time shaded in one.
 _CURVES, _SHADED = 5, 100
 _UNITS = (("_degc", "temperature, °C"), ("_um", "displacement, µm"), ("_w", "power, W"), ("_rpm", "speed, 1/min"),
@@ -300,15 +302,15 @@ def _events(history: History) -> Block:
 
 def _files(history: History) -> Details:
     files: list[list[Cell]] = [
-        [file.name, str(file.samples), _utc(file.first_s), _utc(file.last_s), file.end] for file in history.files
+        [file.name, str(file.samples), _utc(file.first_s), _utc(file.last_s), _ENDS.get(file.end, file.end)]
+        for file in history.files
     ]
     models: list[list[Cell]] = [[name, _utc(first), sha] for sha, (name, first) in history.models.items()]
     return Details(
         title=f"{len(files)} recording(s), {len(models)} model(s)",
         blocks=[
             Table(title="Recordings", head=["file", "samples", "first, UTC", "last, UTC", "end"], rows=files,
-                  note="A file without an end is still being written, or the service was ended hard. Whether anything "
-                  "was changed is not looked at here: compensator replay does."),
+                  note="Whether anything was changed is not looked at here: compensator replay does."),
             Table(title="Models", head=["model", "from, UTC", "SHA-256"], rows=models),
         ],
     )  # fmt: skip

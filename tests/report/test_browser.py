@@ -1,0 +1,69 @@
+"""Every page in a real browser, narrow and wide, light and dark: nothing sticks out, nothing is complained about."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+WIDTHS = (360, 1400)
+#: Puts each page into a frame of each width, opens what can be opened, and tells what sticks out.
+HARNESS = """<!doctype html><meta charset="utf-8"><body>%s<pre id="seen"></pre><script>
+addEventListener("load", () => {
+  const seen = [...document.querySelectorAll("iframe")].map(frame => {
+    const page = frame.contentDocument, view = frame.contentWindow;
+    const closed = page.documentElement.scrollWidth;
+    page.querySelectorAll("details").forEach(one => one.open = true);
+    const out = [...page.querySelectorAll("main *")].filter(one => !one.parentElement.closest(".scroll, svg"))
+      .filter(one => one.getBoundingClientRect().right > view.innerWidth + 0.5).map(one => one.outerHTML.slice(0, 90));
+    const style = view.getComputedStyle(page.body);
+    return {name: frame.title, width: view.innerWidth, closed, opened: page.documentElement.scrollWidth, out,
+      paper: style.backgroundColor, ink: style.color,
+      curve: view.getComputedStyle(page.querySelector("svg path[style*=line-]") || page.body).stroke};
+  });
+  document.getElementById("seen").textContent = JSON.stringify(seen);
+});
+</script></body>"""
+
+
+def seen(pages: dict[str, Path], folder: Path, *options: str) -> list[dict]:
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        pytest.skip("chromium is not installed: pages were not looked at in a browser")
+    frames = "".join(
+        f'<iframe title="{name}" width="{width}" height="900" style="border:0" '
+        f'srcdoc="{html.escape(path.read_text(encoding="utf-8"))}"></iframe>'
+        for name, path in pages.items() for width in WIDTHS
+    )  # fmt: skip
+    harness = folder / "harness.html"
+    harness.write_text(HARNESS % frames, encoding="utf-8")
+    done = subprocess.run(
+        [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", "--dump-dom",
+         "--virtual-time-budget=20000", "--enable-logging=stderr", "--window-size=1500,1000", *options,
+         harness.as_uri()],
+        capture_output=True, text=True, timeout=110, check=True,
+    )  # fmt: skip
+    assert not [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    found = re.search(r'<pre id="seen">(.*?)</pre>', done.stdout, re.S)
+    assert found and found[1]
+    return json.loads(html.unescape(found[1]))
+
+
+@pytest.mark.parametrize(
+    ("scheme", "paper"), [(1, "rgb(255, 255, 255)"), (0, "rgb(22, 24, 28)")], ids=("light", "dark")
+)
+def test_nothing_sticks_out(pages: dict[str, Path], tmp_path: Path, scheme: int, paper: str) -> None:
+    looked = seen(pages, tmp_path, f"--blink-settings=preferredColorScheme={scheme}")
+    assert len(looked) == len(pages) * len(WIDTHS)
+    for one in looked:
+        assert one["out"] == [], (one["name"], one["width"])
+        assert max(one["closed"], one["opened"]) <= one["width"], one["name"]
+        assert one["paper"] == paper and one["ink"] != paper
+    # Pictures follow the scheme, too.
+    curves = {one["curve"] for one in looked if one["name"] == "report"}
+    assert curves == {"rgb(213, 94, 0)" if scheme else "rgb(240, 144, 60)"}
