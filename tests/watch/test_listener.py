@@ -14,7 +14,7 @@ import zenoh
 from compensator.clock import SystemClock
 from compensator.config import Zenoh
 from compensator.errors import ServiceError, UsageError
-from compensator.service.publisher import Publisher, Sender
+from compensator.service.publisher import COMMANDS, Publisher, Sender
 from compensator.service.session import session_config
 from compensator.watch.listener import Listener, endpoints_of, of_endpoints, of_settings
 from compensator.watch.shop import Shop
@@ -85,7 +85,13 @@ def services() -> Iterator[tuple[int, list[Publisher], list[str]]]:
                 now_ns = SystemClock().utc_ns()
                 publisher.publish("offset", offset(5, now_ns, machine=name))
                 publisher.publish("status", status(5, now_ns, machine=name))
-            yield port, publishers, commands
+            # A service of another make that takes whatever reaches it for a command.
+            settings = Zenoh(prefix="shop", mode="client", connect=[f"tcp/127.0.0.1:{port}"])
+            with zenoh.open(session_config(settings)) as session:
+                for name in COMMANDS:
+                    for key in (f"shop/vmc-07/thermal/command/{name}", f"shop/vmc-07/thermal/command/{name}/*"):
+                        session.declare_queryable(key, lambda query: commands.append(str(query.key_expr)))
+                yield port, publishers, commands
 
 
 def test_one_look_knows_every_machine_and_commands_none(services: tuple[int, list[Publisher], list[str]]) -> None:
