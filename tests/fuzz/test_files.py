@@ -26,8 +26,8 @@ from tests.service.records import QUILL, day
 from tests.service.simulated import TABLE as TABLES
 from tests.service.simulated import config
 
-FUZZ = settings(max_examples=80, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-FEW = settings(FUZZ, max_examples=25)
+FUZZ = settings(max_examples=50, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+FEW = settings(FUZZ, max_examples=15)
 SEED = st.integers(0, 2**32)
 #: A configuration with a device of every family, as an engineer writes it.
 WHOLE = (
@@ -151,7 +151,7 @@ def test_tables(place: Path, capfd: pytest.CaptureFixture[str], seed: int, stamp
     called(capfd, "simulate", path, "--model", "quill", "--out", place / "out.csv")
 
 
-@settings(FUZZ, max_examples=12)
+@settings(FUZZ, max_examples=8)
 @given(seed=SEED)
 def test_tables_of_a_calibration(place: Path, capfd: pytest.CaptureFixture[str], seed: int) -> None:
     path = place / "run.csv"
@@ -245,11 +245,11 @@ def test_refusals_keep_no_memory(place: Path) -> None:
             refuse(lambda: load_data(path, 60.0))
         gc.collect()
 
-    all_of(range(60))
+    all_of(range(40))
     tracemalloc.start()
-    all_of(range(60))
+    all_of(range(40))
     first = tracemalloc.get_traced_memory()[0]
-    all_of(range(60))
+    all_of(range(40))
     grown = tracemalloc.get_traced_memory()[0] - first
     tracemalloc.stop()
     assert grown < 100_000, grown

@@ -74,7 +74,7 @@ EXPECTED: dict[str, dict[str, frozenset[str]]] = {
 #: What only a configured register map can say.
 EXPECTED["map float32"] = {"open": frozenset({"invalid"})}
 EXPECTED["map int16"] = {"open": frozenset({"stale"})}
-PARAMETERS: dict[str, dict[str, float]] = {"late": {"delay_s": 2.0}, "split": {"pieces": 3}, "gap": {"frames": 5}}
+PARAMETERS: dict[str, dict[str, float]] = {"late": {"delay_s": 1.0}, "split": {"pieces": 3}, "gap": {"frames": 5}}
 #: Beyond the range of the channel; within that of the device.
 WILD = {"t_q_degc": 300.0, "at_degc": 200.0, "y_um": 495.0}
 #: How far a reading may be from the simulated machine's truth: the step of the coarsest module.
@@ -169,9 +169,16 @@ async def run_course(rack: Rack, receiver: Receiver, folder: Path, name: str, co
         if done in begins:
             for channel, kind in begins[done].places:
                 _switch_on(machine, channel, kind)
+        faulty = any(begin <= done < begin + e.samples for begin, e in begins.items())
+        if not faulty and any(channel.quality != "good" for channel in outcome.sample.channels.values()):
+            # Test machines may be slow: simulated time waits for them, but never within a fault.
+            machine.waits_for = set(ROLES)
         if done in ends:
-            for channel, _ in ends[done].places:
+            for channel, kind in ends[done].places:
                 machine.faults[channel][0].clear()
+                if kind == "late":
+                    # No device answers a later request before an earlier one.
+                    machine.pause_s = 1.2 * PARAMETERS["late"]["delay_s"]
             # Devices on the line of a fault are asked again, too.
             machine.waits_for = set(ROLES)
 
@@ -228,7 +235,7 @@ def _check(
     for i in range(begin, end):
         context = (course.layout, episode, i - begin, offsets[i])
         for role in ROLES:
-            true = _true(samples[i], role, truth, begin, i)
+            true = _true(samples, role, truth, i)
             _check_channel(samples[i], role, kinds, carriers, course, true, held[role], seen, context)
         missing = [role for role in ROLES[:2] if samples[i].channels[role].quality != "good"]
         lost = lost + 1 if missing else 0
@@ -250,16 +257,17 @@ def _check(
     return seen
 
 
-def _true(message: Sample, role: str, truth: Sequence[dict[str, float]], begin: int, i: int) -> float:
+def _true(samples: Sequence[Sample], role: str, truth: Sequence[dict[str, float]], i: int) -> float:
     """Return what a channel should have given.
 
-    A device that was slow gives its value to the next poll: it is one poll old at most, here a minute. The controller's
-    mean is that of the blocks since the last read, of 10 s at most; where simulated minutes take milliseconds it may
-    reach back over several of them.
+    A device that was slow gives its value to the next poll, which in real time is the one after; and the controller's
+    mean is that of the blocks since the last read, of 10 s at most. Where simulated minutes take milliseconds both may
+    reach back over several of them: not so a serial or Modbus device that answered in the sample before.
     """
-    first, zero = (begin - 12, 250.0) if role == "y_um" else (i - 1, 0.0)
-    recent = [one[role] + zero for one in truth[first : i + 1]]
-    mean = number(message.channels[role].mean)
+    answered = role != "y_um" and samples[i - 1].channels[role].quality == "good"
+    zero = 250.0 if role == "y_um" else 0.0
+    recent = [one[role] + zero for one in truth[i - (1 if answered else 12) : i + 1]]
+    mean = number(samples[i].channels[role].mean)
     return mean if min(recent) <= mean <= max(recent) else recent[-1]
 
 
@@ -270,6 +278,7 @@ def _check_channel(
     channel = message.channels[role]
     seen.codes[role].add(channel.quality)
     frozen = kinds.get(role) == "frozen"
+    assert channel.quality != "good" or channel.count >= 1, (role, channel, context)
     if channel.quality == "good" and not frozen:
         # Whatever happens on the wire: a value that is given is the machine's own of this minute.
         assert abs(number(channel.mean) - true) <= TOLERANCE[role], (role, channel, true, context)
@@ -279,12 +288,14 @@ def _check_channel(
         assert channel.mean is None or channel.device_quality == "good", (role, channel, context)
     expected = EXPECTED[carriers[role]].get(kinds.get(role, ""), HARMLESS)
     shared = len([c for c in carriers.values() if c == carriers[role]]) > 1 or "map" in carriers[role]
-    if role not in kinds and channel.quality == "device_timeout":
+    if role not in kinds and channel.quality in _GARBLED:
         seen.slow += 1
     elif role not in kinds and not shared:
         assert channel.quality == "good", (role, channel, context)
+    elif role == "y_um" and channel.quality == "good" and context[2] in (0, 1):
+        pass  # blocks of before that were still under way; their value has been looked at above
     elif role in kinds and not shared and not OLD & expected:
-        assert channel.quality in ({*expected, "device_timeout"} if expected else {"good", "device_timeout"}), context
+        assert channel.quality in (expected | _GARBLED if expected else {"good", *_GARBLED}), context
     elif role in kinds and not OLD & expected and expected:
         # Two faults on one line: one may stand in front of the other, and a reply that was held back may come with the
         # next; what is good has been compared with the truth above.
@@ -302,7 +313,7 @@ def _check_recovery(
     assert last >= after[-3], context
     for role in ROLES:
         channel = samples[last].channels[role]
-        true = _true(samples[last], role, truth, end, last)
+        true = _true(samples, role, truth, last)
         assert channel.quality != "good" or abs(number(channel.mean) - true) <= TOLERANCE[role], context
     seen.distance_um = abs(number(offsets[last].y_offset_um) - float(reference(course.samples)[last]))
     seen.std_after_um = number(offsets[last].y_offset_std_um)

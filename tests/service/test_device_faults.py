@@ -77,4 +77,4 @@ async def test_pairs_for_one_sample(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", [7])
 async def test_some_pairs_for_an_hour(tmp_path: Path, seed: int) -> None:
     """`make bench` runs all of them."""
-    await run_all(tmp_path, without(pairs(HOUR, seed), 4, seed))
+    await run_all(tmp_path, without(pairs(HOUR, seed), 3, seed))

@@ -44,7 +44,7 @@ from sim_hardware.wire import (
 from sim_hardware.wire.faults import Faults
 from tests.service.simulated import START_NS, TABLE, config
 
-TIMEOUT_S = 0.25
+TIMEOUT_S = 0.4
 PATIENCE_S = 60.0
 KINDS: dict[str, type] = {"offset": Offset, "sample": Sample, "event": Event}
 KEYS = {"offset": "thermal/y/offset", "sample": "thermal/sample", "event": "thermal/event"}
@@ -112,6 +112,8 @@ class WiredMachine:
         self.outcomes: list[Outcome] = []
         self.after: Callable[[Outcome], None] = lambda outcome: None
         self.waits_for: set[str] = set()
+        #: Real seconds before the next sample: replies under way arrive in their own minute.
+        self.pause_s = 0.0
         self.receiver = receiver
         self.publisher: Publisher | None = None
         if receiver is not None:
@@ -197,6 +199,9 @@ class WiredMachine:
         return config(**{**table, **changes})
 
     async def _advance(self, t_s: float) -> None:
+        pause_s, self.pause_s = self.pause_s, 0.0
+        if pause_s:
+            await asyncio.sleep(pause_s)
         self.world.advance_to(t_s)
         self.capa.push(1)
         # A device that is asked again after a few seconds is back long before the minute is over.
