@@ -88,12 +88,16 @@ def sole_voice(settings: Zenoh) -> Iterator[None]:
     ------
     ServiceError
         If another service of this prefix is alive, or starts at the same moment and was first.
+    zenoh.ZError
+        If a client reaches nobody.
     """
     with ExitStack() as held:
         if settings.connect:
             try:
                 session = held.enter_context(zenoh.open(_asking(settings)))
             except zenoh.ZError:
+                if settings.mode == "client":  # it can say nothing either
+                    raise
                 log.warning("zenoh: nobody is reached, so whether another service is alive elsewhere is not known")
             else:
                 held.callback(_claim(session, settings.prefix).undeclare)

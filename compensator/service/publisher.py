@@ -7,7 +7,9 @@ as a whole, and to handing commands over to the service's loop.
 from __future__ import annotations
 
 import json
+import logging
 import re
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, Literal, NamedTuple
@@ -19,6 +21,10 @@ from compensator.errors import ServiceError
 from compensator.service.presence import sole_voice
 from compensator.service.session import in_words, session_config, tell_links
 
+log = logging.getLogger("compensator")
+
+#: How long a client waits before it tries its router again, s.
+RETRY_S = 1.0
 #: Commands that the service takes, each a query on `thermal/command/<name>/<who sends it>` or `thermal/command/<name>`.
 COMMANDS = ("zero", "hold", "resume", "adopt", "back")
 #: What a sender's name may be made of; it is a chunk of a key.
@@ -74,7 +80,7 @@ class Publisher:
     Raises
     ------
     ServiceError
-        From `open`, when an endpoint cannot be listened on, a client finds no router, or the machine has its service.
+        From `open`, when an endpoint cannot be listened on, or the machine has its service.
     """
 
     def __init__(self, settings: Zenoh, on_command: CommandHandler) -> None:
@@ -84,21 +90,33 @@ class Publisher:
         self._session: Any = None
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []
+        self._closing = threading.Event()
+        self._waiting: threading.Thread | None = None
 
     def key(self, name: str) -> str:
         """Return the full key of a message or command."""
         return f"{self._settings.prefix}/{_KEYS.get(name, f'thermal/command/{name}')}"
 
     def open(self) -> None:
-        """Open the session and declare everything."""
+        """Open the session and declare everything.
+
+        A client that reaches no router goes on trying in the background: compensation and recording wait for nobody.
+        """
+        try:
+            self._begin()
+        except zenoh.ZError as error:
+            endpoints = ", ".join(self._settings.listen + self._settings.connect) or "no endpoints"
+            words = f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})"
+            if self._settings.mode != "client":
+                raise ServiceError(words) from error
+            log.warning("%s: is the router there, and does it take this certificate? It is tried again", words)
+            self._waiting = threading.Thread(target=self._begin_later, name="zenoh-router", daemon=True)
+            self._waiting.start()
+
+    def _begin(self) -> None:
         # First of all: nothing may be said or answered in the name of a machine that has its service.
         with sole_voice(self._settings):
-            try:
-                self._session = zenoh.open(session_config(self._settings))
-            except zenoh.ZError as error:
-                endpoints = ", ".join(self._settings.listen + self._settings.connect) or "no endpoints"
-                raise ServiceError(f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})") from error
-            session = self._session
+            session = zenoh.open(session_config(self._settings))
             token = f"{self._settings.prefix}/thermal/alive"
             self._declared.append(session.liveliness().declare_token(token))
         for name in _KEYS:
@@ -117,6 +135,22 @@ class Publisher:
             for key in (self.key(name), f"{self.key(name)}/*"):
                 self._declared.append(session.declare_queryable(key, self._answer_command(name)))
         tell_links(session, self._settings.connect)
+        self._session = session  # last: from here on other threads publish
+
+    def _begin_later(self) -> None:
+        """Try until the router is there, or the service ends."""
+        said = ""
+        while not self._closing.wait(RETRY_S):
+            try:
+                self._begin()
+            except zenoh.ZError:
+                continue
+            except ServiceError as error:  # another service has the machine; the control is to hear one voice only
+                if str(error) != said:
+                    log.error("%s; nothing is published from here until it is gone", error)
+                    said = str(error)
+                continue
+            return
 
     def publish(self, name: str, data: bytes) -> None:
         """Publish one message; never waits."""
@@ -126,6 +160,10 @@ class Publisher:
 
     def close(self) -> None:
         """Undeclare everything and close the session; may be called twice."""
+        self._closing.set()
+        if self._waiting is not None:
+            self._waiting.join()
+            self._waiting = None
         session, self._session = self._session, None
         if session is None:
             return
