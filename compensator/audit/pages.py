@@ -97,7 +97,8 @@ def _tone(found: Audit) -> Tone:
 
 def _span(found: Audit) -> str:
     times = [ns for file in found.files if file.samples for ns in (file.first_ns, file.last_ns)]
-    return f", {utc(min(times))} to {utc(max(times))}" if times else ""
+    first, last = (utc(ns)[:16].replace("T", " ") for ns in (min(times), max(times))) if times else ("", "")
+    return f", {first} to {last} UTC" if times else ""
 
 
 def _timeline(found: Audit) -> list[Block]:

@@ -109,7 +109,7 @@ def _prediction(calibration: Calibration) -> Figure:
     return Figure(
         title="Measured and predicted deformation, free run from T_Q and AT", x_label="time, h", y_label="Y, µm",
         lines=(Line("measured", t, y), Line("predicted", t, predicted)), spans=spans,
-        note="Nothing measured of Y is fed back. Shaded: took no part in fitting or choosing.",
+        note="Nothing measured of Y is fed back." + (" Shaded: took no part in fitting or choosing." if spans else ""),
     )  # fmt: skip
 
 
