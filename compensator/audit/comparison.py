@@ -207,7 +207,7 @@ class _Run:
     ) -> None:  # fmt: skip
         self._model, self._row, self._point = model, row, point
         self._compensation: Compensation | None = None
-        self._config = b""
+        self._config = self._recorded = b""
         self._last_ns = 0
         self._names: dict[str, None] = {}
         self._result = Comparison("", model.name, Spread(), Spread(), Spread(), Spread(), Spread(), 0, [])
@@ -241,12 +241,14 @@ class _Run:
         self, container: Container, file: str, events: list[Event], estimate: _Estimate
     ) -> Compensation:  # fmt: skip
         """Return the compensation with the other model and the configuration of the file."""
-        part = container.contents.attachments.get("config.toml")
-        data = part.data if part else b""
-        if self._compensation is not None and data == self._config:
+        parts = [container.contents.attachments.get(name) for name in ("config.toml", "model.toml")]
+        data, model = (part.data if part else b"" for part in parts)
+        if self._compensation is not None and (data, model) == (self._config, self._recorded):
             return self._compensation
         config, recorded = model_of(container.contents, file)
-        self._names[recorded.name] = None
+        self._names[recorded.name], self._recorded = None, model
+        if self._compensation is not None and data == self._config:
+            return self._compensation
         compensation = self._made(config)
         zero = any(event.kind == "zero" for event in events)
         if estimate.t_q_ref_degc is not None and estimate.at_ref_degc is not None and not zero:

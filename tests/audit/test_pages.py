@@ -86,6 +86,13 @@ def test_both_offsets_of_two_models(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert text.index("<svg") < text.index("Before and after")
 
 
+def test_every_model_that_recorded_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    service = Service(tmp_path / "rec").run(20)
+    service.adopt(other_model())
+    service.run(20).stop()
+    assert "quill on what quill, other recorded" in page(capsys, 0, tmp_path / "rec", "--model", "quill")
+
+
 def test_a_page_of_another_format_is_refused_before_the_work(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(rec), "--page", "page.doc"]) == 2
     assert "--page page.doc: expected a name that ends in .html, .pdf or .png" in capsys.readouterr().err

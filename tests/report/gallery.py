@@ -28,7 +28,8 @@ def make(folder: Path) -> dict[str, Path]:
     model = pages["identify"].with_name("model.toml")
     assert main(["identify", str(run), "--out", str(model), "--order", "2", "2", "1", "--kind", "direct",
                  "--fit-until", "9", "--reference", "quill"]) == 0  # fmt: skip
-    assert main(["diagnose", str(run), "--model", str(model), "--out", str(pages["diagnose"].parent)]) == 0
+    assert main(["diagnose", str(run), "--model", str(model), "--out", str(pages["diagnose"].parent),
+                 "--page", str(pages["diagnose"].with_name("page.pdf"))]) == 0  # fmt: skip
     assert main(["report", str(rec), "--out", str(pages["report"])]) == 0
     assert main(["replay", str(rec), "--page", str(pages["replay"])]) == 0
     assert main(["replay", str(rec), "--model", "quill", "--page", str(pages["replay-model"])]) == 0

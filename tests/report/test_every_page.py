@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from compensator.cli import main
 from compensator.reasons import WORDS
 from compensator.report.drawing import ON_PAPER
 
@@ -141,6 +142,22 @@ def test_warnings_and_alarms_are_met_in_the_gallery(pages: dict[str, Path]) -> N
     linked = {name: set(re.findall(r'href="#word-(\w+)"', path.read_text("utf-8"))) for name, path in pages.items()}
     assert "validity_range" in linked["identify"] and "altered" in linked["replay-found"]
     assert {"hold", "degraded", "t_q_missing", "operator_hold"} <= linked["report"]
+
+
+def test_a_page_is_written_as_pdf_beside_the_html(pages: dict[str, Path]) -> None:
+    data = pages["diagnose"].with_name("page.pdf").read_bytes()
+    assert data.startswith(b"%PDF") and len(re.findall(rb"/Type /Page\b", data)) >= 2
+
+
+@pytest.mark.parametrize(
+    "command", [["demo"], ["identify", "none.csv", "--out", "m.toml"],
+                ["diagnose", "none.csv", "--model", "quill", "--out", "d"]],
+)  # fmt: skip
+def test_a_page_of_another_format_is_refused_before_the_work(
+    command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command, "--page", "page.doc"]) == 2
+    assert "--page page.doc: expected a name that ends in .html, .pdf or .png" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------------------- colours
