@@ -218,7 +218,9 @@ class Search:
     def _is_worth(self, hypothesis: Hypothesis, without: Joint, joint: Joint) -> bool:
         """Tell whether an effect takes enough to be of use, the base model's own error counted as still there."""
         allowance = self.evidence.allowance
-        return joint.cost + allowance < (1.0 - hypothesis.worth) * (without.cost + allowance)
+        beside = self.evidence.setting.rough and any(not isinstance(p.hypothesis, ChangedPaths) for p in without.parts)
+        share = hypothesis.worth_beside if beside else hypothesis.worth
+        return joint.cost + allowance < (1.0 - share) * (without.cost + allowance)
 
     def score(self, joint: Joint, colour: float) -> float:
         """Return *J*."""

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from compensator.diagnose.diagnosis import diagnose
+from sim_hardware.physics import Duty, draw_effect
 from tests.bench import machines
 
 #: Thirteen seeds in a row draw thirteen kinds.
@@ -32,6 +34,16 @@ def test_the_extended_model_takes_the_error_off_a_day_that_nothing_saw(results):
     assert len(left) >= 6
     assert np.median(left) < 0.15
     assert max(left) <= 1.05
+
+
+def test_what_holds_on_another_day_holds_on_the_blocks_that_were_held_out(first):
+    """A step at some time would follow the jumps of what sticks, and hold nowhere else."""
+    model, _ = first
+    effect = draw_effect(27, 8.0, 24.0)
+    assert effect.reveal().describe()["kind"] == "hysteresis"
+    found = diagnose(model, machines.runs(Duty.working_day(104, hours=24.0), 104, [effect]))
+    assert [e.part.hypothesis.kind for e in found.effects] == ["hysteresis"]
+    assert found.after.rms_um < 0.4 * found.before.rms_um
 
 
 def test_nothing_is_named_where_nothing_acts(first):

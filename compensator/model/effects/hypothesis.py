@@ -111,6 +111,8 @@ class Hypothesis:
     deployable: ClassVar[bool] = True
     #: Least share of the residual's sum of squares that it must take: less is of no use to anybody.
     worth: ClassVar[float] = 0.05
+    #: The same beside another effect where forms are not exact: what acts at some time only follows what they leave.
+    worth_beside: ClassVar[float] = 0.05
     #: Weight that holds its amplitudes small, against columns of norm 1; 0 leaves them free.
     ridge: ClassVar[float] = 0.0
     path: str = ""

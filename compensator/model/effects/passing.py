@@ -21,6 +21,7 @@ class Drift(Hypothesis):
 
     kind: ClassVar[str] = "drift"
     deployable: ClassVar[bool] = False
+    worth_beside: ClassVar[float] = 0.75
 
     def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
         """Return the time, h."""
@@ -59,6 +60,7 @@ class Step(Hypothesis):
 
     kind: ClassVar[str] = "step"
     deployable: ClassVar[bool] = False
+    worth_beside: ClassVar[float] = 0.75
 
     def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
         """Return 0 before and 1 after, over one sample."""
@@ -79,6 +81,7 @@ class Periodic(Hypothesis):
 
     kind: ClassVar[str] = "periodic"
     deployable: ClassVar[bool] = False
+    worth_beside: ClassVar[float] = 0.75
 
     def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
         """Return sine and cosine."""
