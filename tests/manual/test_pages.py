@@ -13,6 +13,7 @@ import pytest
 from compensator.identify.settings import Settings
 from compensator.model.effects import kinds
 from compensator.model.effects.hypothesis import Hypothesis
+from compensator.model.effects.passing import Drift
 from compensator.model.effects.unobserved import Unobserved
 from compensator.model.model_file import load_model
 
@@ -21,7 +22,7 @@ MODEL, IDENTIFY, DIAGNOSE = (TOP / f"compensator/{room}/MATHEMATICS.md" for room
 EFFECTS = TOP / "compensator/model/effects"
 #: `module.NAME` = value, as the pages on the mathematics quote what the code has.
 QUOTED = re.compile(r"`(\w+)\.(\w+)` = (-?[\d.]+(?:e-?\d+)?)")
-CLASSES = {"Settings": Settings(), "Hypothesis": Hypothesis, "Unobserved": Unobserved}
+CLASSES = {"Settings": Settings(), "Drift": Drift, "Hypothesis": Hypothesis, "Unobserved": Unobserved}
 
 
 def constant(room: str, holder: str, name: str) -> Any:
