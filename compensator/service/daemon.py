@@ -20,7 +20,7 @@ from compensator.service.adoption import Adoption
 from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.grid import Grid
-from compensator.service.journal import Journal
+from compensator.service.journal import Entry, Journal
 from compensator.service.publisher import UNNAMED, Reply, Sender
 from compensator.service.retrace import samples_between
 from compensator.service.sampling import ChannelCollector
@@ -32,8 +32,11 @@ log = logging.getLogger("compensator")
 
 #: Part of the poll interval that a sample waits for devices at most.
 WAIT_PART = 0.5
-#: So long an offset waits for the disk: a part of the poll interval, so that no poll comes late, and at most so many s.
+#: So long the loop stands still for the disk: a part of the poll interval, so that no poll is late, at most so many s.
 DISK_PART, DISK_S = 0.4, 2.0
+#: So long an offset waits for the disk while polling goes on: a part of the sample's period, at least `DISK_S`, at most
+#: so many s. A quarter of a minute old is no harm, the rate goes with it; an offset that is not on record may be.
+PATIENCE_PART, PATIENCE_S = 0.25, 15.0
 
 
 @dataclass(slots=True)
@@ -57,6 +60,17 @@ class Latency:
         self.seconds.append(value)
         if len(self.seconds) > keep:
             del self.seconds[: keep // 2]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Decided:
+    """A sample that is decided and on its way to the disk; `began` is when that was begun, s."""
+
+    outcome: Outcome
+    entry: Entry
+    sample: bytes
+    estimate: bytes
+    began: float
 
 
 class Daemon:
@@ -99,12 +113,17 @@ class Daemon:
         self._journal = Journal(
             machine=config.machine.name, recorder=recorder, publish=publish, clock=clock, sequence=first_sequence,
             limit_s=min(DISK_PART * config.sampling.poll_interval_s, DISK_S),
+            patience_s=min(max(PATIENCE_PART * compensation.model.period_s, DISK_S), PATIENCE_S),
         )  # fmt: skip
         self._takeover = Takeover(adoption, self._journal, clock, lambda: self._compensation)
         self._commands = Commands(self._journal, self._takeover, unproven=config.zenoh.takes_unproven())
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
+        #: Outcomes that were published and not yet told to whoever runs the service.
+        self._said: list[Outcome] = []
+        #: A sample that is decided and waits for the disk while polling goes on.
+        self._pending: asyncio.Task[None] | None = None
         self._earlier = notes
         self._first = True
         #: Whether a sample broke off half-way, so that its file cannot give the state after it.
@@ -142,18 +161,24 @@ class Daemon:
                 if self._stop:
                     break
                 label_ns, last = grid.label_ns, grid.polled()
-                outcome = await self._turn(period_s / polls, label_ns if last else None)
+                await self._turn(period_s / polls, label_ns if last else None)
                 if last:
                     self._tell_clock_step(grid.next_sample())
                     done += 1
-                if outcome is not None and on_sample is not None:
-                    on_sample(outcome)
+                self._tell(on_sample)
                 if on_poll is not None:
                     on_poll()
         finally:
             await self._close()
+            self._tell(on_sample)
 
-    async def _turn(self, interval_s: float, label_ns: int | None) -> Outcome | None:
+    def _tell(self, on_sample: Callable[[Outcome], None] | None) -> None:
+        said, self._said = self._said, []
+        if on_sample is not None:
+            for outcome in said:
+                on_sample(outcome)
+
+    async def _turn(self, interval_s: float, label_ns: int | None) -> None:
         """Poll, and make the sample where one ends here; whatever goes wrong, the offset is held and it is said.
 
         This is the supervisor, the one place that catches everything: a defect in any room must not leave the
@@ -161,17 +186,18 @@ class Daemon:
         """
         try:
             await self._poll(interval_s)
-            return await self._sample(label_ns) if label_ns is not None else None
+            if label_ns is not None:
+                await self._sample(label_ns)
         except Exception as error:
             log.exception("internal error")
             self._journal.note("error", f"internal error: {type(error).__name__}: {error}")
             self._compensation.fail()
             if label_ns is not None:
                 await self._hold(label_ns)
-            return None
 
     async def _hold(self, label_ns: int) -> None:
         """Publish that the last offset stands, without the sample that could not be worked on."""
+        await self._pass_pending()
         held = self._compensation.held(self._config.machine.name, self._journal.sequence, label_ns)
         offset = await self._journal.record(label_ns, self._compensation.state(), offset=held)
         self._publish("offset", encode(offset or held))
@@ -184,6 +210,7 @@ class Daemon:
     async def _close(self) -> None:
         self.stop()
         self._commands.close()
+        await self._pass_pending()
         await self._takeover.end()
         await self._journal.close(self._compensation.state())
         for state in self._devices.values():
@@ -235,7 +262,9 @@ class Daemon:
 
     # ------------------------------------------------------------------ one sample
 
-    async def _sample(self, label_ns: int) -> Outcome:
+    async def _sample(self, label_ns: int) -> None:
+        """Decide; publish once it is on disk, and poll on where that takes long."""
+        await self._pass_pending()
         began = time.perf_counter()
         self._pass_pause(label_ns)
         self._compensation = self._takeover.swap()
@@ -255,18 +284,38 @@ class Daemon:
             self._journal.note(kind, text)
         self._tell_state(self._journal.expected(outcome.offset))
         sample, estimate = encode(outcome.sample), encode(outcome.estimate)
-        offset = await self._journal.record(label_ns, state, sample=sample, estimate=estimate, offset=outcome.offset)
+        entry = self._journal.put(label_ns, state, sample=sample, estimate=estimate, offset=outcome.offset)
+        decided = _Decided(outcome=outcome, entry=entry, sample=sample, estimate=estimate, began=began)
+        if await self._journal.tried(entry):
+            self._say(decided)
+        else:
+            self._pending = asyncio.create_task(self._say_later(decided))
+
+    async def _say_later(self, decided: _Decided) -> None:
+        await self._journal.waited(decided.entry)
+        self._say(decided)
+
+    async def _pass_pending(self) -> None:
+        """Let the sample before be published first, on disk or not."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            await pending
+
+    def _say(self, decided: _Decided) -> None:
+        """Publish a sample, the offset first."""
+        offset = self._journal.settled(decided.entry)
         assert offset is not None
         self._tell_state(offset)
-        outcome = Outcome(outcome.sample, outcome.estimate, offset, outcome.notes)
+        whole = decided.outcome
+        outcome = Outcome(whole.sample, whole.estimate, offset, whole.notes)
         self._publish("offset", encode(offset))
-        self.latency.add(time.perf_counter() - began)
-        self._publish("sample", sample)
-        self._publish("estimate", estimate)
+        self.latency.add(time.perf_counter() - decided.began)
+        self._publish("sample", decided.sample)
+        self._publish("estimate", decided.estimate)
         self._publish("status", encode(self._status(outcome)))
         self._journal.sequence += 1
         self._takeover.follow(outcome)
-        return outcome
+        self._said.append(outcome)
 
     def _pass_pause(self, label_ns: int) -> None:
         """Tell the compensation, before its first sample, for how long nobody measured."""

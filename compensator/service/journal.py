@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from compensator.clock import Clock
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
@@ -19,6 +19,13 @@ DISK_LATE = "the disk takes the recording too late"
 DISK_BACK = "the disk takes the recording again"
 #: How often it is said that the service waits for the disk at its end, s.
 CLOSING_S = 10.0
+
+
+class Entry(NamedTuple):
+    """What is on its way to the disk, and the attempt to bring it there."""
+
+    group: Group
+    attempt: asyncio.Future[None]
 
 
 class Journal:
@@ -37,18 +44,21 @@ class Journal:
     sequence : int
         Number of the first sample.
     limit_s : float
-        So long an offset waits for the disk, s.
+        So long the loop stands still for the disk, s.
+    patience_s : float
+        So long an offset waits for the disk while polling goes on, s; not where the disk was late before.
     """
 
     def __init__(
         self, *, machine: str, recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, sequence: int,
-        limit_s: float,
+        limit_s: float, patience_s: float,
     ) -> None:  # fmt: skip
         self._machine = machine
         self._recorder = recorder
         self._publish = publish
         self._clock = clock
         self._limit_s = limit_s
+        self._patience_s = patience_s
         self._thread = RecordingThread(recorder)
         self._events: list[Event] = []
         #: What the next sample brings along: whether it opens a file, and another model.
@@ -73,14 +83,11 @@ class Journal:
         self._events = [*self._events[1 - WAITING_EVENTS :], event]
         self._publish("event", encode(event))
 
-    async def record(
+    def put(
         self, time_utc_ns: int, state: bytes, *, sample: bytes = b"", estimate: bytes = b"",
         offset: Offset | None = None,
-    ) -> Offset | None:  # fmt: skip
-        """Bring a sample and the waiting events to disk, and return the offset as it is to be published.
-
-        Where the disk does not take it within `limit_s`, or not at all, the offset says so; the sample waits and is
-        written in its order.
+    ) -> Entry:  # fmt: skip
+        """Have a sample and the waiting events brought to disk.
 
         Parameters
         ----------
@@ -100,12 +107,34 @@ class Journal:
         self._events, self._new_file, self._model = [], False, None
         attempt = asyncio.wrap_future(self._thread.put(group))
         attempt.add_done_callback(lambda done: done.cancelled() or done.exception())  # seen, also when it ends later
-        await self._clock.settle([attempt], self._limit_s)
-        reason, in_flight = self._thread.published(group)
-        self._tell_disk(reason, in_flight, attempt.exception() if attempt.done() else None)
+        return Entry(group, attempt)
+
+    async def tried(self, entry: Entry) -> bool:
+        """Stand still for the disk, and not long; tell whether more waiting would be of no use."""
+        await self._clock.settle([entry.attempt], self._limit_s)
+        return entry.attempt.done() or bool(self._reason)
+
+    async def waited(self, entry: Entry) -> None:
+        """Wait on while others work."""
+        await self._clock.settle([entry.attempt], self._patience_s)
+
+    def settled(self, entry: Entry) -> Offset | None:
+        """Return the offset as it is to be published now.
+
+        Where the disk has not taken it, or refused, the offset says so; the sample waits and is written in its order.
+        """
+        reason, in_flight = self._thread.published(entry.group)
+        self._tell_disk(reason, in_flight, entry.attempt.exception() if entry.attempt.done() else None)
         for text, data in self._recorder.remarks():
             self.note("recording", text, data)
+        offset = entry.group.offset
         return degraded(offset, reason) if offset is not None and reason else offset
+
+    async def record(self, time_utc_ns: int, state: bytes, *, offset: Offset | None = None) -> Offset | None:
+        """Bring an offset without a sample, and the waiting events, to disk; return it as it is to be published."""
+        entry = self.put(time_utc_ns, state, offset=offset)
+        await self.tried(entry)
+        return self.settled(entry)
 
     def expected(self, offset: Offset) -> Offset:
         """Return the offset as it is published if the disk does as it did with the sample before."""
@@ -121,7 +150,7 @@ class Journal:
             elif reason == FAILED:
                 self.note("recording", f"{DISK_FAILED}: {error or self._error}", data)
             else:
-                self.note("recording", f"{DISK_LATE}: not within {self._limit_s:g} s", data)
+                self.note("recording", f"{DISK_LATE}: not within {self._limit_s + self._patience_s:g} s", data)
         elif self._reason and not reason:
             lost, self._thread.lost = self._thread.lost, 0
             text = f"{DISK_BACK}; " + (f"{lost} sample(s) were not recorded" if lost else "nothing was lost")
