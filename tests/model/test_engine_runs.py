@@ -195,7 +195,6 @@ at_walk_std_k = 0.01
     assert all(math.isnan(e.heat_w) for e in run)
 
 
-@register("test-channel")
 class ChannelLag:
     """Adds a lagged channel to y: what an effect of the model file looks like to the engine."""
 
@@ -221,6 +220,15 @@ class ChannelLag:
         (self._state,) = state
 
 
+@pytest.fixture
+def lag_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kind of effect that is there for one test only."""
+    known = kinds()
+    monkeypatch.setattr("compensator.model.effects.base._KINDS", dict(known))
+    register("test-channel")(ChannelLag)
+
+
+@pytest.mark.usefixtures("lag_kind")
 def test_effects_run_hold_a_missing_channel_and_survive_gaps() -> None:
     table = EffectTable(kind="test-channel", table={"channel": "coolant_degc", "gain_um_per_k": 2.0})
     model = dataclasses.replace(with_method("inverse"), effects=(table,))

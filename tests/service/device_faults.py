@@ -297,7 +297,8 @@ def _check_channel(
     elif role == "y_um" and channel.quality == "good" and context[2] in (0, 1):
         pass  # blocks of before that were still under way; their value has been looked at above
     elif role in kinds and not shared and not OLD & expected:
-        assert channel.quality in (expected | _GARBLED if expected else {"good", *_GARBLED}), context
+        in_time = {"good"} if not expected or kinds[role] == "late" else set()  # late may be in time on a busy machine
+        assert channel.quality in (expected | _GARBLED | in_time), (role, channel, context)
     elif role in kinds and not OLD & expected and expected:
         # Two faults on one line: one may stand in front of the other, and a reply that was held back may come with the
         # next; what is good has been compared with the truth above.
