@@ -13,7 +13,7 @@ import pytest
 from scipy import linalg, signal
 
 from compensator.errors import ModelError
-from compensator.model.effects import Signals, register
+from compensator.model.effects import Signals, kinds, register
 from compensator.model.engine import Engine, Estimate
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.thermal_model import EffectTable, ThermalModel
