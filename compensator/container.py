@@ -18,6 +18,31 @@ import lz4.frame
 import zstandard
 
 from compensator.errors import DataError
+from compensator.framing import (
+    ATTACHMENT,
+    ATTACHMENT_INDEX,
+    CHANNEL,
+    CHUNK,
+    CHUNK_INDEX,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MESSAGE,
+    MESSAGE_INDEX,
+    METADATA,
+    METADATA_INDEX,
+    SCHEMA,
+    STATISTICS,
+    SUMMARY_OFFSET,
+    Damaged,
+    Fields,
+    Torn,
+)
+from compensator.index import Index
+
+__all__ = [
+    "LONGEST", "MAGIC", "PAYLOAD", "Attachment", "Channel", "Container", "Contents", "Damaged", "Message", "Torn",
+]  # fmt: skip
 
 MAGIC = b"\x89MCAP0\r\n"
 #: Longest record and chunk that is believed, bytes; ours are below 2 MiB.
@@ -28,32 +53,8 @@ _LONGEST_HEADER = 4096
 _T = TypeVar("_T")
 
 _FRAME = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<BQHIQQ")
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_CODE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
-_ATTACHMENT, _ATTACHMENT_INDEX, _STATISTICS, _METADATA, _METADATA_INDEX, _SUMMARY_OFFSET, _DATA_END = range(9, 16)
-_SHORTEST = {_FOOTER: 20, _MESSAGE_CODE: 22, _CHUNK: 40, _DATA_END: 4, _STATISTICS: 46}
-
-
-class Damaged(DataError):
-    """A file that is no MCAP file from here on."""
-
-    def __init__(self, path: Path, offset: int, text: str) -> None:
-        super().__init__(f"{path}: byte {offset}: {text}")
-        self.offset, self.text = offset, text
-
-
-class Torn(Damaged):
-    """A file that ends inside a record.
-
-    Parameters
-    ----------
-    rest : bytes
-        The beginning of the record that is not whole, at most 1 MiB of it.
-    """
-
-    def __init__(self, path: Path, offset: int, rest: bytes = b"") -> None:
-        super().__init__(path, offset, "the file ends inside a record")
-        self.rest = rest
+_HEAD = struct.Struct("<BQHIQQ")
+_SHORTEST = {FOOTER: 20, MESSAGE: 22, CHUNK: 40, DATA_END: 4, STATISTICS: 46}
 
 
 class Message(NamedTuple):
@@ -153,6 +154,8 @@ class Container:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.contents = Contents()
+        #: What the index leads to, beside what is there.
+        self.index = Index()
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         try:
             self._file: BinaryIO = path.open("rb")
@@ -197,13 +200,15 @@ class Container:
                 raise Torn(self.path, 0)
             raise DataError(f"{self.path}: not an MCAP file")
         self._at = len(MAGIC)
-        unpack = _MESSAGE.unpack_from
+        unpack = _HEAD.unpack_from
         contents, channels = self.contents, self.contents.channels
+        loose: dict[int, int] = {}
+        first_ns, last_ns = 2**64, 0
         while True:
             if self._at + 31 > len(self._buffer):
                 self._need(31)
             buffer, at = self._buffer, self._at
-            if len(buffer) - at >= 31 and buffer[at] == _MESSAGE_CODE:
+            if len(buffer) - at >= 31 and buffer[at] == MESSAGE:
                 _, length, channel, sequence, log_time, _ = unpack(buffer, at)
                 end = at + 9 + length
                 if end > len(buffer) or length < 22:
@@ -213,14 +218,18 @@ class Container:
                 if channel not in channels:
                     raise Damaged(self.path, self._base + at, f"a message of channel {channel}, which is not there")
                 contents.messages += 1
+                loose[channel] = loose.get(channel, 0) + 1
+                first_ns = min(first_ns, log_time)
+                last_ns = max(last_ns, log_time)
                 self._at = end
                 yield Message(channel, sequence, log_time, buffer[at + 11 : end])
                 continue
             code, length = self._frame()
             body = self._buffer[self._at + 9 : self._at + 9 + length]
-            if code == _CHUNK:
+            if code == CHUNK:
                 yield from self._chunk(body)
-            elif code == _DATA_END:
+            elif code == DATA_END:
+                self.index.add_loose(loose, first_ns, last_ns)
                 self._end(body)
                 return
             else:
@@ -233,7 +242,8 @@ class Container:
         self.contents.chunked = True
         data = self._uncompressed(body, offset)
         at, size = 0, len(data)
-        unpack, channels, contents = _MESSAGE.unpack_from, self.contents.channels, self.contents
+        places: dict[int, list[int]] = {}
+        unpack, channels, contents = _HEAD.unpack_from, self.contents.channels, self.contents
         while at < size:
             if size - at < 9:
                 raise Damaged(self.path, offset, "the chunk ends inside a record")
@@ -241,21 +251,26 @@ class Container:
             end = at + 9 + length
             if end > size or length < _SHORTEST.get(code, 0):
                 raise Damaged(self.path, offset, f"a record of {length} bytes in the chunk, {size - at - 9} are there")
-            if code == _MESSAGE_CODE:
+            if code == MESSAGE:
                 _, _, channel, sequence, log_time, _ = unpack(data, at)
-                if channel not in channels:
-                    raise Damaged(self.path, offset, f"a message of channel {channel}, which is not there")
+                place = places.get(channel)
+                if place is None:
+                    if channel not in channels:
+                        raise Damaged(self.path, offset, f"a message of channel {channel}, which is not there")
+                    place = places[channel] = []
+                place += (log_time, at)
                 contents.messages += 1
                 yield Message(channel, sequence, log_time, data[at + 11 : end])
-            elif code in (_SCHEMA, _CHANNEL):
+            elif code in (SCHEMA, CHANNEL):
                 self._other(code, data[at + 9 : end], offset)
             else:
                 raise Damaged(self.path, offset, f"a record of kind {code} in the chunk")
             at = end
+        self.index.add_chunk(Fields(self.path, offset, body), offset, 9 + len(body), places)
 
     def _uncompressed(self, body: bytes, offset: int) -> bytes:
         size, crc = struct.unpack_from("<QI", body, 16)
-        fields = _Fields(self.path, offset, body, 28)
+        fields = Fields(self.path, offset, body, 28)
         compression = fields.text()
         data = fields.bytes8()
         fields.done()
@@ -281,17 +296,18 @@ class Container:
     # ------------------------------------------------------------------ other records
 
     def _other(self, code: int, body: bytes, offset: int) -> None:
-        fields = _Fields(self.path, offset, body)
+        fields = Fields(self.path, offset, body)
         contents = self.contents
-        if code == _HEADER:
+        if code == HEADER:
             fields.text()
             contents.library = fields.text()
             fields.done()
-        elif code == _SCHEMA:
+        elif code == SCHEMA:
             number = fields.number("<H")
             self._schemas[number] = (fields.text(), fields.text(), fields.bytes4())
             fields.done()
-        elif code == _CHANNEL:
+            self.index.add_description(SCHEMA, number, body)
+        elif code == CHANNEL:
             number, schema = fields.number("<H"), fields.number("<H")
             topic, encoding, metadata = fields.text(), fields.text(), fields.table()
             fields.done()
@@ -299,22 +315,29 @@ class Container:
             channel = Channel(topic, encoding, metadata, name, schema_encoding, data)
             if contents.channels.setdefault(number, channel) != channel:
                 raise Damaged(self.path, offset, f"a second channel {number}, {topic}")
-        elif code == _METADATA:
+            self.index.add_description(CHANNEL, number, body)
+        elif code == METADATA:
             name = fields.text()
             table = fields.table()
             fields.done()
+            self.index.add_metadata(offset, 9 + len(body), name)
             self._keep(contents.metadata, name, table, "metadata")
-        elif code == _ATTACHMENT:
+        elif code == ATTACHMENT:
             log_time, create_time = fields.number("<Q"), fields.number("<Q")
             name, media_type, data = fields.text(), fields.text(), fields.bytes8()
             crc = fields.number("<I")
             fields.done()
+            self.index.add_attachment(offset, 9 + len(body), log_time, create_time, len(data), name, media_type)
             if crc and zlib.crc32(body[:-4]) != crc:
                 contents.late.append(f"attachment {name}: its CRC is wrong")
             self._keep(
                 contents.attachments, name, Attachment(name, media_type, log_time, create_time, data), "attachment"
             )
-        elif code != _MESSAGE_INDEX:
+        elif code == MESSAGE_INDEX:
+            channel_number, entries = fields.number("<H"), fields.bytes4()
+            fields.done()
+            self.index.add_message_index(offset, 9 + len(body), channel_number, entries)
+        else:
             raise Damaged(self.path, offset, f"a record of kind {code}")
 
     def _keep(self, kept: dict[str, _T], name: str, value: _T, kind: str) -> None:
@@ -331,27 +354,25 @@ class Container:
         if stated and stated != crc:
             raise Damaged(self.path, offset, "the CRC of the data is wrong")
         self._at += 9 + len(body)
-        summary = zlib.crc32(b"")
+        summary, summary_start = zlib.crc32(b""), self._base + self._at
         while True:
             code, length = self._frame()
             start = self._at
             self._at += 9 + length
             record = self._buffer[start : self._at]
-            if code == _FOOTER:
+            if code == FOOTER:
                 break
-            if code not in (_SCHEMA, _CHANNEL, _CHUNK_INDEX, _ATTACHMENT_INDEX, _STATISTICS, _METADATA_INDEX,
-                            _SUMMARY_OFFSET):  # fmt: skip
+            if code not in (SCHEMA, CHANNEL, CHUNK_INDEX, ATTACHMENT_INDEX, STATISTICS, METADATA_INDEX,
+                            SUMMARY_OFFSET):  # fmt: skip
                 raise Damaged(self.path, self._base + start, f"a record of kind {code} in the summary")
-            if code == _STATISTICS and int.from_bytes(record[9:17], "little") != self.contents.messages:
-                raise Damaged(
-                    self.path, self._base + start,
-                    f"the summary counts {int.from_bytes(record[9:17], 'little')} messages, "
-                    f"{self.contents.messages} are there",
-                )  # fmt: skip
+            self.index.summarise(
+                code, self._base + start, Fields(self.path, self._base + start, record, 9), len(record)
+            )
             summary = zlib.crc32(record, summary)
         stated = int.from_bytes(record[25:29], "little")
         if stated and stated != zlib.crc32(record[:25], summary):
             raise Damaged(self.path, self._base + self._at, "the CRC of the summary is wrong")
+        self.index.finish(summary_start, self._base + start, Fields(self.path, self._base + start, record, 9))
         self._need(len(MAGIC) + 1)
         rest = self._buffer[self._at : self._at + len(MAGIC) + 1]
         if rest != MAGIC:
@@ -379,16 +400,16 @@ class Container:
         offset = self._base + self._at
         left = self._size - offset
         if left < 9 or len(self._buffer) - self._at < 9:
-            code = self._buffer[self._at] if len(self._buffer) > self._at else _MESSAGE_CODE
-            if not (code == 0 or _HEADER <= code <= _DATA_END):
+            code = self._buffer[self._at] if len(self._buffer) > self._at else MESSAGE
+            if not (code == 0 or HEADER <= code <= DATA_END):
                 raise Damaged(self.path, offset, f"a record of kind {code}")
             raise self._torn(offset)
         code, length = _FRAME.unpack_from(self._buffer, self._at)
         if code == 0 and self._only_zeros():
             raise self._torn(offset)
-        if not _HEADER <= code <= _DATA_END:
+        if not HEADER <= code <= DATA_END:
             raise Damaged(self.path, offset, f"a record of kind {code}")
-        longest = _LONGEST_HEADER if code == _HEADER else LONGEST
+        longest = _LONGEST_HEADER if code == HEADER else LONGEST
         if not _SHORTEST.get(code, 0) <= length <= longest:
             raise Damaged(self.path, offset, f"a record of {length} bytes, expected at most {longest}")
         self._need(9 + length)
@@ -412,55 +433,3 @@ class Container:
             self._need(1)
             if len(self._buffer) == self._at:
                 return True
-
-
-class _Fields:
-    """Fields of one record; a length that leads beyond it is damage."""
-
-    def __init__(self, path: Path, offset: int, body: bytes, at: int = 0) -> None:
-        self._path, self._offset, self._body, self._at = path, offset, body, at
-
-    def _take(self, count: int) -> bytes:
-        end = self._at + count
-        if end > len(self._body):
-            raise Damaged(self._path, self._offset, f"a field of {count} bytes in a record of {len(self._body)}")
-        data = self._body[self._at : end]
-        self._at = end
-        return data
-
-    def number(self, form: str) -> int:
-        """Take a number."""
-        (value,) = struct.unpack(form, self._take(struct.calcsize(form)))
-        return int(value)
-
-    def bytes4(self) -> bytes:
-        """Take bytes with a short length."""
-        return self._take(self.number("<I"))
-
-    def bytes8(self) -> bytes:
-        """Take bytes with a long length."""
-        return self._take(self.number("<Q"))
-
-    def text(self) -> str:
-        """Take a text."""
-        data = self.bytes4()
-        try:
-            return data.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise Damaged(self._path, self._offset, f"a text that is not UTF-8: {data[:20]!r}") from error
-
-    def table(self) -> dict[str, str]:
-        """Take a table of texts."""
-        inner = _Fields(self._path, self._offset, self.bytes4())
-        found: dict[str, str] = {}
-        while inner._at < len(inner._body):
-            key = inner.text()
-            if key in found:
-                raise Damaged(self._path, self._offset, f"key {key!r} stands twice")
-            found[key] = inner.text()
-        return found
-
-    def done(self) -> None:
-        """See that nothing is left."""
-        if self._at != len(self._body):
-            raise Damaged(self._path, self._offset, f"{len(self._body) - self._at} bytes more than the record has")

@@ -206,6 +206,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "unreadable": (
         "A record is intact and yet not what its schema says.", "Audit with the version that wrote it."),
+    "index": (
+        "The index of the recording does not lead to all that is in it: readers that seek would miss records.",
+        "Find out who had access; the records themselves stand, so a copy made by reading all of it has a right index.",
+    ),
 }  # fmt: skip
 
 

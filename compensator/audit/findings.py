@@ -10,10 +10,11 @@ from typing import Any, Literal
 #: the end are missing, and not because the service was killed. `broken`: values of the chain do not belong together.
 #: `damaged`: no MCAP from some byte on. `missing_file`: a recording between two others. `unsigned`, `false_signature`:
 #: no seal, or none of the key given. `state`: the state that a file opens with is not the one that the file before
-#: ends with. `unreadable`: intact, and yet not what its schema says.
+#: ends with. `unreadable`: intact, and yet not what its schema says. `index`: the index of the file does not lead to
+#: all that is in it, or to something else.
 Kind = Literal[
     "altered", "removed", "inserted", "reordered", "truncated", "broken", "damaged", "missing_file", "unsigned",
-    "false_signature", "state", "unreadable",
+    "false_signature", "state", "unreadable", "index",
 ]  # fmt: skip
 
 #: So many findings of one file are kept; the rest is counted.

@@ -136,7 +136,8 @@ def _proven(found: Audit) -> Table:
     worked_out = bool(found.samples) and not any(file.not_worked_out for file in found.files)
     not_signed = sum(finding.kind in ("unsigned", "false_signature") for finding in found.findings)
     cut = sum(finding.kind == "truncated" for finding in found.findings)
-    inside = found.findings_count - of_files - not_signed - cut
+    index = sum(finding.kind == "index" for finding in found.findings)
+    inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
         ["Every estimate and every offset is what this program makes of the samples",
          no if found.differing else yes if worked_out else open_,
@@ -145,6 +146,8 @@ def _proven(found: Audit) -> Table:
          f"hash chain over {records} records in {len(chained)} of {len(found.files)} file(s)"],
         ["No file is missing between the first and the last", no if of_files else yes if whole else open_,
          "each chain begins with the last value of the file before"],
+        ["Readers that seek find every record, and nothing else", no if index else yes if whole and not ends else open_,
+         "index and summary of each file held against what is in it"],
         ["Nobody wrote all of it anew from some point on",
          (no if not_signed else yes) if found.signed else open_,
          "signatures checked against the key given" if found.signed else "only a signature can exclude that: "

@@ -167,6 +167,7 @@ class _Audit:
         if chained:
             self._check.rest(self._rest)
         self._classify(error)
+        self._index()
         if chained:
             self._check.finish()
         if self._work is not None:
@@ -264,6 +265,13 @@ class _Audit:
             self._end = "finished"
         else:
             self._end = "torn" if unlisted or error.rest or error.offset < self._size else "open"
+
+    def _index(self) -> None:
+        """Say where the index would lead readers that seek past what is there, or elsewhere."""
+        index = self._container.index
+        for where, what in index.faults:
+            self._findings.add("index", what, topic=where)
+        self._findings.count += index.count - len(index.faults)
 
     def _was_compact(self, torn: Torn) -> bool:
         """Tell whether the file had been finished: only then metadata and attachments stand before the channels."""

@@ -41,7 +41,7 @@ def lines_of(path: Path) -> tuple[list[Line], Contents]:
 
 def rewrite(
     path: Path, edit: Callable[[list[Line]], list[Line]] = list, *, contents: Callable[[Contents], None] | None = None,
-    chunked: bool = True, late: Attachment | None = None,
+    chunked: bool = True, chunk_size: int = 2**20, late: Attachment | None = None,
 ) -> None:  # fmt: skip
     """Write a file again with other messages, attachments or metadata; everything else fits, CRCs included."""
     lines, there = lines_of(path)
@@ -49,7 +49,7 @@ def rewrite(
         contents(there)
     with path.open("wb") as file:
         compression = CompressionType.ZSTD if chunked else CompressionType.NONE
-        writer = Writer(file, use_chunking=chunked, compression=compression, enable_data_crcs=True)
+        writer = Writer(file, chunk_size, use_chunking=chunked, compression=compression, enable_data_crcs=True)
         writer.start(library=there.library)
         numbers = {}
         for channel in there.channels.values():

@@ -1,0 +1,322 @@
+"""Whether the index of an MCAP file leads to every record of it, and to nothing else.
+
+The hash chain covers what the records say. Readers that seek (Foxglove, the JavaScript library) see only what the
+index leads them to: an entry that is gone or leads elsewhere hides records that are still there. So what stands in the
+data section is noted while it is read, and the index is held against it: the message indexes behind each chunk, and in
+the summary the chunks, attachments and metadata, the statistics, the repeated schemas and channels, and the offsets.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+from compensator.framing import (
+    ATTACHMENT_INDEX,
+    CHANNEL,
+    CHUNK_INDEX,
+    METADATA_INDEX,
+    SCHEMA,
+    STATISTICS,
+    SUMMARY_OFFSET,
+    Fields,
+)
+
+#: So many faults are kept; the rest is counted.
+KEPT = 50
+_NAMES = {SCHEMA: "schema", CHANNEL: "channel", STATISTICS: "statistics", CHUNK_INDEX: "chunk index",
+          ATTACHMENT_INDEX: "attachment index", METADATA_INDEX: "metadata index"}  # fmt: skip
+_THINGS = {CHUNK_INDEX: "chunk", ATTACHMENT_INDEX: "attachment", METADATA_INDEX: "metadata table"}
+
+#: What an entry says of what it leads to, in words.
+_Entry = dict[str, Any]
+
+
+class Index:
+    """Notes what is in a file, and what its index says of it."""
+
+    def __init__(self) -> None:
+        #: Which part of the index is wrong, and what is wrong with it: the first `KEPT` of them, and their number.
+        self.faults: list[tuple[str, str]] = []
+        self.count = 0
+        #: For each kind the entry that is due, by the offset of what it leads to, and the offsets that were found.
+        self._due: dict[int, dict[int, _Entry]] = {kind: {} for kind in _THINGS}
+        self._found: dict[int, set[int]] = {kind: set() for kind in _THINGS}
+        #: Schemas and channels by number, and those that the summary repeats.
+        self._described: dict[int, dict[int, bytes]] = {SCHEMA: {}, CHANNEL: {}}
+        self._repeated: dict[int, set[int]] = {SCHEMA: set(), CHANNEL: set()}
+        #: Messages of the chunk that was read last for which no message index came yet; where the next one must stand.
+        self._places: dict[int, list[int]] = {}
+        self._chunk: _Entry = {}
+        self._next = 0
+        self._chunk_at = 0
+        self._messages: dict[int, int] = {}
+        self._loose = 0
+        self._first_ns, self._last_ns = 2**64, 0
+        #: Groups of the summary as they stand there, and as the summary offsets say.
+        self._groups: list[list[int]] = []
+        self._stated: list[tuple[int, int, int]] = []
+        self._offsets_at = 0
+        self._statistics: _Entry | None = None
+
+    def _fault(self, where: str, what: str) -> None:
+        self.count += 1
+        if len(self.faults) < KEPT:
+            self.faults.append((where, what))
+
+    # ------------------------------------------------------------------ the data section
+
+    def add_chunk(self, head: Fields, offset: int, length: int, places: dict[int, list[int]]) -> None:
+        """Note a chunk.
+
+        Parameters
+        ----------
+        head : Fields
+            What it says of itself.
+        offset, length : int
+            Where it stands, bytes.
+        places : dict of int to list of int
+            By channel: log time (ns) and place in the chunk (bytes) of one message after the other.
+        """
+        self._close_chunk()
+        start_ns, end_ns, size = head.number("<Q"), head.number("<Q"), head.number("<Q")
+        head.number("<I")
+        compression, stored = head.text(), head.bytes8()
+        first_ns = min((min(place[::2]) for place in places.values()), default=0)
+        last_ns = max((max(place[::2]) for place in places.values()), default=0)
+        if (start_ns, end_ns) != (first_ns, last_ns):
+            self._fault(f"chunk at byte {offset}", f"says that its messages are from {start_ns} to {end_ns} ns, "
+                        f"they are from {first_ns} to {last_ns} ns")  # fmt: skip
+        self._places, self._chunk_at, self._next = places, offset, offset + length
+        self._chunk = {
+            "first message (ns)": first_ns, "last message (ns)": last_ns, "length": length, "message indexes": {},
+            "length of the message indexes": 0, "compression": compression, "compressed size": len(stored),
+            "size": size,
+        }  # fmt: skip
+        self._due[CHUNK_INDEX][offset] = self._chunk
+        for channel, place in places.items():
+            self._messages[channel] = self._messages.get(channel, 0) + len(place) // 2
+        if places:
+            self._first_ns, self._last_ns = min(self._first_ns, first_ns), max(self._last_ns, last_ns)
+
+    def add_message_index(self, offset: int, length: int, channel: int, entries: bytes) -> None:
+        """Hold a message index against the messages of the chunk before it.
+
+        Parameters
+        ----------
+        offset, length : int
+            Where it stands, bytes.
+        channel : int
+            Number of the channel.
+        entries : bytes
+            Log times (ns) and places in the chunk (bytes).
+        """
+        where = f"message index of channel {channel} at byte {offset}"
+        if offset != self._next:
+            self._fault(where, "does not stand behind a chunk")
+            return
+        self._next += length
+        self._chunk["length of the message indexes"] += length
+        place = self._places.pop(channel, None)
+        if place is None:
+            if entries or channel in self._chunk["message indexes"]:
+                self._fault(where, f"leads into the chunk at byte {self._chunk_at}, which has no (more) messages of it")
+            return
+        self._chunk["message indexes"][channel] = offset
+        if entries == struct.pack(f"<{len(place)}Q", *place):
+            return
+        due = set(zip(place[::2], place[1::2], strict=True))
+        whole = len(entries) % 16 == 0
+        stated = list(struct.iter_unpack("<QQ", entries)) if whole else []
+        missing, wrong = len(due - set(stated)), len(stated) - len(due & set(stated))
+        if missing or wrong or not whole:
+            self._fault(where, f"leads to {len(due) - missing} of the {len(due)} messages of the chunk at byte "
+                        f"{self._chunk_at}, and {wrong} time(s) to something else")  # fmt: skip
+
+    def _close_chunk(self) -> None:
+        """See that every message of the chunk had its index."""
+        for channel, place in self._places.items():
+            what = f"no message index leads to its {len(place) // 2} message(s) of channel {channel}"
+            self._fault(f"chunk at byte {self._chunk_at}", what)
+        self._places = {}
+
+    def add_loose(self, messages: dict[int, int], first_ns: int, last_ns: int) -> None:
+        """Note the messages that stand in no chunk.
+
+        Parameters
+        ----------
+        messages : dict of int to int
+            How many, by channel.
+        first_ns, last_ns : int
+            First and last log time, ns.
+        """
+        for channel, count in messages.items():
+            self._messages[channel] = self._messages.get(channel, 0) + count
+            self._loose += count
+        self._first_ns, self._last_ns = min(self._first_ns, first_ns), max(self._last_ns, last_ns)
+
+    def add_description(self, kind: int, number: int, body: bytes) -> None:
+        """Note a schema or channel."""
+        if self._described[kind].setdefault(number, body) != body:
+            self._fault(f"{_NAMES[kind]} {number}", "stands there twice, and not the same")
+
+    def add_attachment(
+        self, offset: int, length: int, log_ns: int, create_ns: int, size: int, name: str, media_type: str
+    ) -> None:  # fmt: skip
+        """Note an attachment."""
+        self._due[ATTACHMENT_INDEX][offset] = {
+            "length": length, "log time (ns)": log_ns, "creation time (ns)": create_ns, "size": size, "name": name,
+            "media type": media_type,
+        }  # fmt: skip
+
+    def add_metadata(self, offset: int, length: int, name: str) -> None:
+        """Note a metadata table."""
+        self._due[METADATA_INDEX][offset] = {"length": length, "name": name}
+
+    # ------------------------------------------------------------------ the summary
+
+    def summarise(self, kind: int, offset: int, fields: Fields, length: int) -> None:
+        """Take a record of the summary.
+
+        Parameters
+        ----------
+        kind : int
+            Its kind.
+        offset, length : int
+            Where it stands, bytes.
+        fields : Fields
+            What it says.
+        """
+        if kind == SUMMARY_OFFSET:
+            self._offsets_at = self._offsets_at or offset
+            self._stated.append((fields.number("<B"), fields.number("<Q"), fields.number("<Q")))
+            fields.done()
+            return
+        if self._offsets_at:
+            self._fault(_NAMES[kind], f"stands at byte {offset}, behind the summary offsets")
+        if self._groups and self._groups[-1][0] == kind:
+            self._groups[-1][2] += length
+        else:
+            self._groups.append([kind, offset, length])
+        if kind in _THINGS:
+            self._entry(kind, *_entry_of(kind, fields))
+        elif kind == STATISTICS:
+            if self._statistics is not None:
+                self._fault("statistics", "stand there twice")
+            self._statistics = _statistics_of(fields)
+        else:
+            self._repeat(kind, fields)
+
+    def _entry(self, kind: int, offset: int, entry: _Entry) -> None:
+        where = f"{_NAMES[kind]} of the {_THINGS[kind]} at byte {offset}"
+        due = self._due[kind].get(offset)
+        if due is None:
+            self._fault(where, f"no {_THINGS[kind]} stands there")
+        elif offset in self._found[kind]:
+            self._fault(where, "stands there twice")
+        else:
+            self._found[kind].add(offset)
+            self._compare(where, entry, due)
+
+    def _compare(self, where: str, entry: _Entry, due: _Entry) -> None:
+        for name, value in due.items():
+            if entry[name] != value:
+                self._fault(where, f"{name}: {entry[name]!r} stands there, {value!r} is right")
+
+    def _repeat(self, kind: int, fields: Fields) -> None:
+        body = fields.rest()
+        number = int.from_bytes(body[:2], "little")
+        if self._described[kind].get(number) != body or number in self._repeated[kind]:
+            self._fault(f"{_NAMES[kind]} {number}", "is repeated in the summary otherwise than it stands in the file")
+        self._repeated[kind].add(number)
+
+    def finish(self, summary_start: int, footer_at: int, footer: Fields) -> None:
+        """Say what can only be said at the end.
+
+        Parameters
+        ----------
+        summary_start, footer_at : int
+            Where the summary and the footer stand, bytes.
+        footer : Fields
+            What the footer says.
+        """
+        self._close_chunk()
+        chunks = len(self._due[CHUNK_INDEX])
+        if chunks and self._loose:
+            self._fault("chunk index", f"{self._loose} message(s) stand in no chunk, so it leads to none of them")
+        if footer_at == summary_start:
+            self._fault("summary", "is missing, so readers that seek find nothing")
+            return
+        for kind, entries in self._due.items():
+            for offset in entries.keys() - self._found[kind]:
+                self._fault(_NAMES[kind], f"no entry leads to the {_THINGS[kind]} at byte {offset}"
+                            + (f", {entries[offset]['name']}" if "name" in entries[offset] else ""))  # fmt: skip
+        for kind, described in self._described.items():
+            for number in described.keys() - self._repeated[kind]:
+                self._fault(f"{_NAMES[kind]} {number}", "is not repeated in the summary")
+        if self._statistics is None:
+            self._fault("statistics", "are missing")
+        else:
+            self._compare("statistics", self._statistics, self._totals())
+        self._places_of_groups(summary_start, footer_at, footer.number("<Q"), footer.number("<Q"))
+
+    def _totals(self) -> _Entry:
+        any_there = bool(self._messages)
+        return {
+            "messages": sum(self._messages.values()), "schemas": len(self._described[SCHEMA]),
+            "channels": len(self._described[CHANNEL]), "attachments": len(self._due[ATTACHMENT_INDEX]),
+            "metadata tables": len(self._due[METADATA_INDEX]), "chunks": len(self._due[CHUNK_INDEX]),
+            "first message (ns)": self._first_ns if any_there else 0,
+            "last message (ns)": self._last_ns if any_there else 0, "messages by channel": self._messages,
+        }  # fmt: skip
+
+    def _places_of_groups(self, start: int, footer_at: int, stated_start: int, stated_offsets: int) -> None:
+        """Hold footer and summary offsets against where the groups of the summary stand."""
+        if stated_start != start:
+            self._fault("footer", f"says that the summary begins at byte {stated_start}, it begins at byte {start}")
+        if stated_offsets != self._offsets_at and (self._offsets_at or stated_offsets != footer_at):
+            self._fault("footer", f"says that the summary offsets begin at byte {stated_offsets}, "
+                        f"they begin at byte {self._offsets_at}")  # fmt: skip
+        if not self._stated:  # readers walk through the summary
+            return
+        groups = [tuple(group) for group in self._groups]
+        for kind, begin, length in groups:
+            if self._stated.count((kind, begin, length)) != 1:
+                self._fault(f"summary offset of kind {_NAMES[kind]}", f"none leads to those at byte {begin}")
+        for group in self._stated:
+            if group[2] and group not in groups:
+                name = _NAMES.get(group[0], group[0])
+                self._fault(f"summary offset of kind {name}", f"none of them stand at byte {group[1]}")
+
+
+def _entry_of(kind: int, fields: Fields) -> tuple[int, _Entry]:
+    """Return where an entry leads, and what it says of what stands there."""
+    entry: _Entry = {}
+    if kind == CHUNK_INDEX:
+        entry["first message (ns)"], entry["last message (ns)"] = fields.number("<Q"), fields.number("<Q")
+        offset = fields.number("<Q")
+        entry["length"], entry["message indexes"] = fields.number("<Q"), fields.counts()
+        entry["length of the message indexes"], entry["compression"] = fields.number("<Q"), fields.text()
+        entry["compressed size"], entry["size"] = fields.number("<Q"), fields.number("<Q")
+    else:
+        offset = fields.number("<Q")
+        entry["length"] = fields.number("<Q")
+        if kind == ATTACHMENT_INDEX:
+            for name in ("log time (ns)", "creation time (ns)", "size"):
+                entry[name] = fields.number("<Q")
+        entry["name"] = fields.text()
+        if kind == ATTACHMENT_INDEX:
+            entry["media type"] = fields.text()
+    fields.done()
+    return offset, entry
+
+
+def _statistics_of(fields: Fields) -> _Entry:
+    entry = {"messages": fields.number("<Q"), "schemas": fields.number("<H")}
+    for name in ("channels", "attachments", "metadata tables", "chunks"):
+        entry[name] = fields.number("<I")
+    for name in ("first message (ns)", "last message (ns)"):
+        entry[name] = fields.number("<Q")
+    counts = {**entry, "messages by channel": fields.counts()}
+    fields.done()
+    return counts
