@@ -15,6 +15,7 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -73,7 +74,11 @@ class Finisher:
     def __init__(self, folder: Path, machine: str, retention: Retention, signer: Signer | None) -> None:
         self._folder, self._machine, self._retention, self._signer = folder, machine, retention, signer
         self._lock = threading.Lock()
-        self._jobs: deque[tuple[Path, int]] = deque()
+        self._jobs: deque[tuple[Path | None, int]] = deque()
+        #: What the disk did not let be made compact; tried again with the next file.
+        self._refused: list[Path] = []
+        #: Why the last removal failed, empty where none did.
+        self._unremoved = ""
         self._thread: threading.Thread | None = None
         self._remarks: list[tuple[str, dict[str, Any]]] = []
 
@@ -88,10 +93,27 @@ class Finisher:
             Now, ns since 1970 UTC, for the retention.
         """
         with self._lock:
-            self._jobs.append((path, now_ns))
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._work, name="finish recordings")
-                self._thread.start()
+            jobs = [*(refused for refused in self._refused if refused != path), path]
+            self._refused = []
+            self._begin([(job, now_ns) for job in jobs])
+
+    def make_room(self, now_ns: int) -> None:
+        """Have what is beyond the retention removed in the background: the disk does not take the recording.
+
+        Parameters
+        ----------
+        now_ns : int
+            Now, ns since 1970 UTC.
+        """
+        with self._lock:
+            if not self._jobs:
+                self._begin([(None, now_ns)])
+
+    def _begin(self, jobs: Sequence[tuple[Path | None, int]]) -> None:
+        self._jobs.extend(jobs)
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, name="finish recordings")
+            self._thread.start()
 
     def wait(self) -> None:
         """Wait until nothing is left to do."""
@@ -112,39 +134,61 @@ class Finisher:
                     self._thread = None
                     return
                 path, now_ns = self._jobs.popleft()
-            try:
-                said = compact(path, self._signer, patient=True)
-                if said:
-                    self._say(f"{path.name}: {said}", {"file": path.name})
+            error = self._compacted(path) if path is not None else None
+            # Also where the disk is too full for the copy: this is what makes room for it.
+            if self._remove_oldest(now_ns) and path is not None and isinstance(error, OSError):
+                error = self._compacted(path)
                 self._remove_oldest(now_ns)
-            except (OSError, McapError, DataError) as error:
+            if error is not None and path is not None and path.exists():
                 self._say(f"{path.name}: could not be made compact and stays as it is: {error}", {"file": path.name})
+                if isinstance(error, OSError):
+                    with self._lock:
+                        self._refused.append(path)
+
+    def _compacted(self, path: Path) -> Exception | None:
+        """Make a file compact; return why it could not be."""
+        try:
+            said = compact(path, self._signer, patient=True)
+        except (OSError, McapError, DataError) as error:
+            return error
+        if said:
+            self._say(f"{path.name}: {said}", {"file": path.name})
+        return None
 
     def _say(self, text: str, data: dict[str, Any]) -> None:
         log.info("%s", text)
         with self._lock:
             self._remarks = [*self._remarks[-99:], (text, data)]
 
-    def _remove_oldest(self, now_ns: int) -> None:
-        """Remove what is beyond the retention; the newest finished file stays, for the next start needs it."""
+    def _remove_oldest(self, now_ns: int) -> bool:
+        """Remove what is beyond the retention, and tell whether something was.
+
+        The newest two stay: the one that is being written, and the finished one that the next start needs.
+        """
         limits = self._retention
         if limits.keep_days is None and limits.keep_mb is None:
-            return
+            return False
         paths = recordings(self._folder, self._machine)
-        sizes = {path: path.stat().st_size for path in paths}
         oldest_ns = -1 if limits.keep_days is None else now_ns - int(limits.keep_days * 86_400) * NS
         removed = []
-        for path in paths[:-2]:
-            too_much = limits.keep_mb is not None and sum(sizes.values()) > limits.keep_mb * 1e6
-            if not too_much and _began_ns(path, self._machine) >= oldest_ns:
-                break
-            path.unlink()
-            removed.append((path.name, sizes.pop(path)))
+        try:
+            sizes = {path: path.stat().st_size for path in paths}
+            for path in paths[:-2]:
+                too_much = limits.keep_mb is not None and sum(sizes.values()) > limits.keep_mb * 1e6
+                if not too_much and _began_ns(path, self._machine) >= oldest_ns:
+                    break
+                path.unlink()
+                removed.append((path.name, sizes.pop(path)))
+        except OSError as error:
+            if str(error) != self._unremoved:  # a disk that takes nothing is asked every minute
+                self._say(f"what is beyond the limit of what is kept could not be removed: {error}", {})
+            self._unremoved = str(error)
         if removed:
             size = sum(size for _, size in removed)
             names = [name for name, _ in removed]
             text = f"{len(names)} recording(s) removed by the limit of what is kept, up to {names[-1]}"
             self._say(text, {"removed": names, "bytes": size})
+        return bool(removed)
 
 
 def _began_ns(path: Path, machine: str) -> int:

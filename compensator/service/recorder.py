@@ -103,8 +103,10 @@ class Recorder:
                 self._live.seal("hour", time_utc_ns, self._signer)
             if sync:
                 self._live.sync()
-        except BaseException:
+        except BaseException as error:
             self._give_up()
+            if isinstance(error, OSError):
+                self._finisher.make_room(time_utc_ns)
             raise
 
     def close(self) -> None:

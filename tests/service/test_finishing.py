@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import threading
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -213,6 +217,90 @@ def test_the_size_of_all_files_is_limited_and_the_newest_stay(tmp_path: Path) ->
     tiny = days(tmp_path / "tiny", 5, keep_mb=0.000001)
     tiny.stop()
     assert len(recordings(tmp_path / "tiny", MACHINE)) == 2  # the newest and the one before it: a restart needs them
+
+
+def test_a_disk_that_refuses_the_copy_is_made_room_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No file can be made compact; what is beyond the limit goes all the same, and the newest two stay."""
+
+    def full(*_: object, **__: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(finishing, "compact", full)
+    service = days(tmp_path, 6, keep_days=2.5)
+    remarks = service.recorder.remarks()
+    assert [data["removed"][0][7:15] for _, data in remarks if "removed" in data] == ["20260105", "20260106"]
+    assert sum("could not be made compact and stays as it is" in text for text, _ in remarks) >= 5
+    live = service.recorder.path
+    service.kill()
+    left = recordings(tmp_path, MACHINE)
+    assert [path.name[7:15] for path in left] == ["20260107", "20260108", "20260109", "20260110"] and left[-1] == live
+    monkeypatch.undo()
+    # Once the disk takes it the next finished file brings those along that it refused.
+    finisher = service.recorder._finisher
+    finisher.put(left[-1], service.now_ns - DAY_NS)
+    finisher.wait()
+    assert all(lines_of(path)[1].chunked for path in left)
+    assert audit(left).clean
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False, timeout=30).returncode:
+        pytest.skip("a file system can be mounted by root only, and not in every container")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], capture_output=True, check=False, timeout=30)
+
+
+def test_on_a_full_disk_the_limit_makes_the_room_that_the_recording_needs(small_disk: Path) -> None:
+    service = days(small_disk, 4, keep_days=3.5)
+    before = recordings(small_disk, MACHINE)
+    with (small_disk / "other").open("wb", buffering=0) as other, suppress(OSError):
+        while other.write(bytes(4096)) == 4096:
+            pass
+    # A week later: the day's end does not fit any more, nor does the new file.
+    service.start_ns += 7 * DAY_NS
+    with pytest.raises(OSError, match="No space"):
+        service._write([], service.compensation.state())
+    service.recorder._finisher.wait()
+    left = recordings(small_disk, MACHINE)
+    assert left == before[-2:]  # the limit has no use for the newest two, a restart has
+    service.run(5)
+    service.recorder._finisher.wait()
+    remarks = service.recorder.remarks()
+    assert [name for _, data in remarks for name in data.get("removed", [])] == [path.name for path in before[:-1]]
+    for text, data in remarks:
+        service.note("recording", text, data)
+    service.run(1).stop()
+    found = audit(recordings(small_disk, MACHINE))
+    assert found.clean, found.findings
+    assert f"begins after {before[2].name}, which the limit of what is kept removed" in " ".join(found.remarks)
+
+
+def test_over_weeks_the_folder_stays_below_the_limit(tmp_path: Path) -> None:
+    keep_mb, sizes, removed = 0.2, [], 0
+    service = Service(tmp_path, retention=Retention(keep_mb=keep_mb))
+    for day in range(21):
+        service.start_ns = START_NS + day * DAY_NS - service.seq * MINUTE_NS
+        service.run(12)
+        service.recorder._finisher.wait()
+        live = service.recorder.path
+        sizes.append(sum(path.stat().st_size for path in recordings(tmp_path, MACHINE) if path != live))
+        for text, data in service.recorder.remarks():
+            removed += len(data["removed"])
+            service.note("recording", text, data)
+    service.stop()
+    assert max(sizes) <= keep_mb * 1e6 and max(sizes[:4]) < 0.7 * max(sizes[10:])
+    left = recordings(tmp_path, MACHINE)
+    assert removed == 21 - len(left) and len(left) > 5
+    found = audit(left)
+    assert found.clean, found.findings
+    assert found.files[0].previous_file and any(
+        f"begins after {found.files[0].previous_file}, which the limit of what is kept removed" in remark
+        for remark in found.remarks
+    )
 
 
 def test_files_of_others_are_not_touched(tmp_path: Path) -> None:
