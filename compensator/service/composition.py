@@ -18,6 +18,7 @@ from compensator.recording import first_sequence
 from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
+from compensator.service.early import EarlyNote
 from compensator.service.finishing import Retention
 from compensator.service.model_store import ModelStore
 from compensator.service.precautions import precautions
@@ -171,13 +172,15 @@ async def run_service(
         except ConfigError as error:  # recording goes on, whether anybody can be told or not
             log.error("%s; the router will refuse the service", error)
         store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
-        resumed = resume(loaded, model)
+        note = EarlyNote(folder, config.machine.name)
+        early = note.read(config.limits.offset_max_um)
+        resumed = resume(loaded, model, early)
+        first = first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s)
         checks: tuple[str, str, dict[str, Any]] = ("plausibility", resumed.compensation.plausibility.describe(), {})
         daemon = Daemon(
             config=config, compensation=resumed.compensation, devices=fleet.devices, recorder=recorder,
-            publish=publish, clock=clock,
-            first_sequence=first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s),
-            adoption=Adoption(config, folder, store), notes=(*resumed.notes, checks),
+            publish=publish, clock=clock, first_sequence=max(first, early.seq + 1 if early is not None else 0),
+            adoption=Adoption(config, folder, store), notes=(*resumed.notes, checks), early=note,
         )  # fmt: skip
         try:
             with publisher:

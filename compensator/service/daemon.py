@@ -19,6 +19,7 @@ from compensator.messages import SCHEMA, Offset, Sample, Status, encode
 from compensator.service.adoption import Adoption
 from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
+from compensator.service.early import EarlyNote
 from compensator.service.grid import Grid
 from compensator.service.journal import Entry, Journal
 from compensator.service.publisher import UNNAMED, Reply, Sender
@@ -96,12 +97,15 @@ class Daemon:
         Prepares other models; without it the commands `adopt` and `back` are refused.
     notes : sequence of (str, str, dict)
         Events of what went before: kind, text and data.
+    early : EarlyNote, optional
+        Where an offset is noted that is published before it is on disk.
     """
 
     def __init__(
         self, *, config: Config, compensation: Compensation, devices: Mapping[str, Device],
         recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, first_sequence: int,
         adoption: Adoption | None = None, notes: Sequence[tuple[str, str, dict[str, Any]]] = (),
+        early: EarlyNote | None = None,
     ) -> None:  # fmt: skip
         self._config = config
         self._compensation = compensation
@@ -113,7 +117,7 @@ class Daemon:
         self._journal = Journal(
             machine=config.machine.name, recorder=recorder, publish=publish, clock=clock, sequence=first_sequence,
             limit_s=min(DISK_PART * config.sampling.poll_interval_s, DISK_S),
-            patience_s=min(max(PATIENCE_PART * compensation.model.period_s, DISK_S), PATIENCE_S),
+            patience_s=min(max(PATIENCE_PART * compensation.model.period_s, DISK_S), PATIENCE_S), early=early,
         )  # fmt: skip
         self._takeover = Takeover(adoption, self._journal, clock, lambda: self._compensation)
         self._commands = Commands(self._journal, self._takeover, unproven=config.zenoh.takes_unproven())

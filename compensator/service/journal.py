@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from compensator.clock import Clock
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
+from compensator.service.early import EarlyNote
 from compensator.service.recording_thread import FAILED, WAITING_EVENTS, Group, RecordingThread
 
 log = logging.getLogger("compensator")
@@ -47,11 +48,13 @@ class Journal:
         So long the loop stands still for the disk, s.
     patience_s : float
         So long an offset waits for the disk while polling goes on, s; not where the disk was late before.
+    early : EarlyNote, optional
+        Where an offset is noted that is published before it is on disk.
     """
 
     def __init__(
         self, *, machine: str, recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, sequence: int,
-        limit_s: float, patience_s: float,
+        limit_s: float, patience_s: float, early: EarlyNote | None = None,
     ) -> None:  # fmt: skip
         self._machine = machine
         self._recorder = recorder
@@ -59,6 +62,7 @@ class Journal:
         self._clock = clock
         self._limit_s = limit_s
         self._patience_s = patience_s
+        self._early = early
         self._thread = RecordingThread(recorder)
         self._events: list[Event] = []
         #: What the next sample brings along: whether it opens a file, and another model.
@@ -128,6 +132,10 @@ class Journal:
         for text, data in self._recorder.remarks():
             self.note("recording", text, data)
         offset = entry.group.offset
+        if self._early is not None and not reason:
+            self._early.forget()
+        elif self._early is not None and offset is not None:
+            self._early.keep(offset)
         return degraded(offset, reason) if offset is not None and reason else offset
 
     async def record(self, time_utc_ns: int, state: bytes, *, offset: Offset | None = None) -> Offset | None:

@@ -18,6 +18,7 @@ from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording import recordings
 from compensator.service.compensation import Compensation
+from compensator.service.early import Early
 from compensator.service.retrace import opening_of, replayed, steps_of, warm_up
 from compensator.service.state import CompensationState, decode_state
 
@@ -66,7 +67,7 @@ class _Last:
                 self.operator_hold = name == "hold" or (self.operator_hold and name != "resume")
 
 
-def resume(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
+def resume(loaded: LoadedConfig, model: ThermalModel, early: Early | None = None) -> Resumed:
     """Bring a compensation to where the last recording ends.
 
     Parameters
@@ -75,12 +76,27 @@ def resume(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
         The present configuration.
     model : ThermalModel
         The present model.
+    early : Early, optional
+        The last offset that was published while the disk did not take it.
 
     Returns
     -------
     Resumed
         Before the pause since then, which the first sample tells.
     """
+    resumed = _from_disk(loaded, model)
+    compensation = resumed.compensation
+    if early is not None and early.seq > compensation.last[0]:
+        compensation.go_on_from(early.y_offset_um, model_changed=compensation.is_under_way)
+        resumed.note(
+            f"goes on from the offset {early.y_offset_um:.3f} µm of sample {early.seq}, "
+            "which was published while the disk did not take it",
+            early_seq=early.seq, offset_um=early.y_offset_um,
+        )  # fmt: skip
+    return resumed
+
+
+def _from_disk(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
     config = loaded.config
     resumed = Resumed(Compensation(config, model))
     folder = loaded.resolve(config.recording.folder)
