@@ -65,6 +65,12 @@ def test_a_machine_is_never_left_without_service() -> None:
     assert found["Type"] == ["notify"] and found["NotifyAccess"] == ["main"]
 
 
+def test_what_a_kill_must_leave_in_memory_is_left() -> None:
+    """With `RemoveIPC` systemd takes the note of the last offset out of /dev/shm between two starts."""
+    found = settings()
+    assert found["RemoveIPC"] == ["no"] and "PrivateDevices" not in found
+
+
 def test_a_restart_by_the_watchdog_ends_before_the_offset_becomes_invalid() -> None:
     """Stuck just after a sample: watchdog, abort, restart, start, and a whole sample again within 150 s."""
     found = {key: float(settings()[key][0]) for key in ("WatchdogSec", "TimeoutAbortSec", "RestartSec")}
