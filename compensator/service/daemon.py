@@ -272,9 +272,7 @@ class Daemon:
         began = time.perf_counter()
         self._pass_pause(label_ns)
         self._compensation = self._takeover.swap()
-        if self._broken_off:
-            self._journal.start_new_file()
-        state = self._compensation.state()
+        state, broke_off = self._compensation.state(), self._broken_off
         self._broken_off = True
         self._commands.obey(self._compensation)
         raw = Sample(
@@ -284,6 +282,8 @@ class Daemon:
         )  # fmt: skip
         outcome = self._compensation.process(raw)
         self._broken_off = False
+        if broke_off:  # once for all that broke off in a row
+            self._journal.start_new_file()
         for kind, text in outcome.notes:
             self._journal.note(kind, text)
         self._tell_state(self._journal.expected(outcome.offset))

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
+from compensator.audit.series import audit, summary
+from compensator.config import parse_config
 from compensator.messages import Offset
+from compensator.recording import decode, read_messages, recordings
 from drivers.reading import Reading
+from tests.audit.made import CONFIG, QUILL
 from tests.service.simulated import Bench
 
 
@@ -51,6 +57,54 @@ async def test_a_defect_holds_the_offset_until_resume(
     assert sent[-1].state in ("ok", "degraded")
     told = [msgspec.json.decode(d)["text"] for n, d in bench.published if n == "event"]
     assert "internal error: ZeroDivisionError: a defect" in told
+
+
+@pytest.mark.parametrize("where", ["_guards.judge", "_decide", "plausibility.take", "_set_zero"])
+async def test_a_sample_that_breaks_off_half_way_leaves_a_recording_that_audits_clean(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """What it had changed by then is in no record; the next file opens with the state that came of it."""
+    bench = Bench(tmp_path, parse_config(CONFIG, source="test"))
+    bench.recorder.attachments = {"config.toml": CONFIG, "model.toml": QUILL}
+    monkeypatch.setattr(type(bench.daemon._compensation.plausibility), "is_on", True)
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    room, _, name = where.rpartition(".")
+    compensation = bench.daemon._compensation
+    broken_room = getattr(compensation, room) if room else compensation
+    bench.at_sample[20] = lambda: setattr(broken_room, name, broken)
+    bench.at_sample[19] = lambda: bench.daemon.command("zero", b'{"mode": "warm"}')
+
+    def mend(error: str, text: str) -> None:
+        delattr(broken_room, name)
+        bench.daemon.command("resume", b"")
+
+    note = bench.daemon._journal.note
+    errors: list[str] = []
+
+    def noted(kind: str, text: str, data: dict[str, Any] | None = None) -> None:
+        note(kind, text, data)
+        if kind == "error":
+            errors.append(text)
+            if len(errors) == 3:
+                mend(kind, text)
+
+    bench.daemon._journal.note = noted  # type: ignore[method-assign]
+    await bench.run(40)
+    assert errors == ["internal error: ZeroDivisionError: a defect"] * 3
+    files = recordings(tmp_path / "rec", "vmc-07")
+    found = audit(files)
+    assert found.clean, summary(found)
+    assert len(files) == 2 and [file.began for file in found.files] == ["start", "new"]
+    assert found.samples == 37 and found.files[0].samples == 20
+    said = [decode(record, files[0]).text for record in read_messages(files[0], ("event",))]  # type: ignore[union-attr]
+    assert said.count(errors[0]) == 3  # why three samples are missing stands where they are missing
+    offsets = [msgspec.json.decode(d, type=Offset) for n, d in bench.published if n == "offset"]
+    assert [o.seq for o in offsets] == list(range(40))
+    assert all(o.state == "hold" and "internal_error" in o.reasons for o in offsets[20:23])
+    assert {o.y_offset_um for o in offsets[20:23]} == {offsets[19].y_offset_um}
 
 
 class _Sleeper:
