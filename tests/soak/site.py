@@ -26,6 +26,13 @@ RATE_UM_PER_MIN = 12.0
 PATIENCE_S = 60.0
 #: Reasons with which an offset is published before it is on disk.
 EARLY = {"recording_late", "recording_failed"}
+#: The service, but for how long it waits for a token that a dead one may have left.
+SOON = """
+from compensator.cli import main
+from compensator.service import presence
+presence.STALE_S = {stale_s}
+raise SystemExit(main())
+"""
 
 
 def free_port() -> int:
@@ -186,9 +193,12 @@ rate_max_per_min = 100.0
 stuck_after_min = 6000.0
 """
 
-    def start(self, config: Path | None = None, **options: Any) -> subprocess.Popen[str]:
-        """Start the service; it may not be ready yet."""
-        command = [sys.executable, "-m", "compensator", "run", "--config", str(config or self.config)]
+    def start(
+        self, config: Path | None = None, *, stale_s: float | None = None, **options: Any
+    ) -> subprocess.Popen[str]:
+        """Start the service; it may not be ready yet. With `stale_s` it waits for that long until a token counts."""
+        program = ["-m", "compensator"] if stale_s is None else ["-c", SOON.format(stale_s=stale_s)]
+        command = [sys.executable, *program, "run", "--config", str(config or self.config)]
         return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
 
     @contextlib.contextmanager

@@ -57,7 +57,8 @@ def test_a_second_service_is_refused_and_the_first_goes_on(site: Site, port: int
             control.more(2)
             for config, expected in ((site.config, "vmc-07.lock: held by another service"),
                                      (elsewhere(site, "second"), "alive: another service is alive")):  # fmt: skip
-                second = site.start(config)
+                # A token that stands for this long is that of a living one, for whoever does not wait for a dead one's.
+                second = site.start(config, stale_s=1.0)
                 _, said = second.communicate(timeout=PATIENCE_S)
                 assert second.returncode == 1
                 assert expected in said and said.strip().count("\n") == 0, said

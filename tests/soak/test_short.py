@@ -12,7 +12,7 @@ from tests.soak import kills, month
 
 @pytest.mark.timeout(300)
 def test_killed_again_and_again(tmp_path: Path) -> None:
-    result = kills.run(tmp_path, 5, seed=5, longest_s=1.0)
+    result = kills.run(tmp_path, 5, seed=5, longest_s=0.5, period_s=0.25)
     assert sum(result.kills.values()) == 5 and result.kills["adopting"] == 1
     assert result.offsets >= 5 and result.recorded >= result.offsets
 
