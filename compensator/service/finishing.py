@@ -28,6 +28,7 @@ from mcap.writer import CompressionType, Writer
 from compensator import __version__, chain
 from compensator.clock import NS
 from compensator.container import PAYLOAD, Container, Damaged, Message, Torn
+from compensator.durable import sync_folder
 from compensator.errors import DataError
 from compensator.messages import encode
 from compensator.recording import end_of_chain, recordings
@@ -246,11 +247,7 @@ def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) 
         except BaseException:
             part.unlink(missing_ok=True)
             raise
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
+    sync_folder(path.parent)
     return said
 
 

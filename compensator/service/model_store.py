@@ -14,6 +14,7 @@ from typing import Literal
 
 import msgspec
 
+from compensator.durable import sync_folder
 from compensator.errors import ServiceError
 
 _FILE = "adopted.json"
@@ -146,11 +147,7 @@ class ModelStore:
                 file.flush()
                 os.fsync(file.fileno())
             part.replace(path)
-            directory = os.open(self.folder, os.O_RDONLY)
-            try:
-                os.fsync(directory)
-            finally:
-                os.close(directory)
+            sync_folder(self.folder)
         except OSError as error:
             raise ServiceError(f"{path}: {error.strerror or error}; the model is not kept") from error
 

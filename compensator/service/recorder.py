@@ -8,22 +8,19 @@ it is signed every hour and at the end. A finished file is rewritten compact by 
 
 from __future__ import annotations
 
-import fcntl
 import os
 import platform
-from collections.abc import Iterable
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import mcap
-from mcap.writer import CompressionType, Writer
 
 from compensator import __version__, chain
 from compensator.clock import NS
 from compensator.container import Attachment, Channel, Contents
+from compensator.durable import LiveFile, sync_folder
 from compensator.messages import MESSAGES, encode, shipped_schema
 from compensator.recording import end_of_chain, recordings
 from compensator.service.finishing import Finisher, Retention
@@ -169,7 +166,9 @@ class Recorder:
         if previous and not before:
             end = end_of_chain(previous[-1])
             before = end.value if end else b""
-        self.path, descriptor = self._create(time_utc_ns, previous[-1] if previous else None)
+        names = self._names(time_utc_ns, previous[-1] if previous else None)
+        live = self._live = _Live(names, self._machine, before or chain.NOTHING, time_utc_ns)
+        self.path = live.path
         metadata = {
             "machine": self._machine,
             "file": self.path.name,
@@ -185,22 +184,17 @@ class Recorder:
                        for name, data in self.attachments.items()]  # fmt: skip
         if state:
             attachments.append(_attached("state.json", "application/json", state, time_utc_ns))
-        live = self._live = _Live(self.path, descriptor, self._machine, before or chain.NOTHING, time_utc_ns)
         live.begin(metadata, attachments)
         live.sync()
         self._day = day
-        directory = os.open(self._folder, os.O_RDONLY)
-        try:
-            os.fsync(directory)  # the file's name, too, must outlive a power cut
-        finally:
-            os.close(directory)
+        sync_folder(self._folder)
         if self._reason in ("start", "failure"):
             # A kill leaves files that are not finished: at a start any of them, after a failure the last.
             for path in previous if self._reason == "start" else previous[-1:]:
                 self._finisher.put(path, time_utc_ns)
 
-    def _create(self, time_utc_ns: int, newest: Path | None) -> tuple[Path, int]:
-        """Create a file that did not exist, named by machine and UTC time."""
+    def _names(self, time_utc_ns: int, newest: Path | None) -> Iterator[Path]:
+        """Yield names for a new file by machine and UTC time."""
         stamp = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
         number = 0
         if newest is not None:
@@ -210,49 +204,18 @@ class Recorder:
                 stamp, number = last, int(suffix or 0) + 1
         for count in range(number, number + 1000):
             ending = f"-{count:03d}" if count else ""
-            path = self._folder / f"{self._machine}_{stamp}{ending}.mcap"
-            try:
-                descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            except FileExistsError:
-                continue
-            # Held until the file is finished, so that nobody takes it for one that was left behind.
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return path, descriptor
-        raise OSError(f"{self._folder}: a thousand recordings of {stamp}")
+            yield self._folder / f"{self._machine}_{stamp}{ending}.mcap"
 
 
-@dataclass(slots=True)
-class _Sink:
-    """What the writer wrote since the last sync; the file gets it in one piece."""
-
-    data: bytearray
-    size: int = 0
-
-    def write(self, data: bytes) -> None:
-        self.data += data
-        self.size += len(data)
-
-    def tell(self) -> int:
-        return self.size
-
-    def flush(self) -> None:
-        return
-
-
-class _Live:
+class _Live(LiveFile):
     """The file that is being written, with its chain."""
 
-    def __init__(self, path: Path, descriptor: int, machine: str, before: bytes, time_ns: int) -> None:
-        self.path = path
+    def __init__(self, paths: Iterable[Path], machine: str, before: bytes, time_ns: int) -> None:
+        super().__init__(paths)
         self.time_ns = self.sealed_ns = time_ns
         self._machine = machine
-        self._descriptor = descriptor
-        self._sink = _Sink(bytearray())
-        # Without chunks a message is in the file as soon as it is written; the data CRC covers a finished one.
-        self._writer = Writer(self._sink, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
         self._sequence = 0
-        self.synced = 0
         self._chain = chain.ChainWriter(machine, before)
 
     @property
@@ -263,16 +226,16 @@ class _Live:
     def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
         """Write what the file opens with."""
         contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
-        self._writer.start(profile="", library=f"compensator {__version__}")
+        self.writer.start(profile="", library=f"compensator {__version__}")
         for topic in TOPICS:
             name, data, about = MESSAGES[topic].__name__, shipped_schema(topic), {"machine": self._machine}
-            schema = self._writer.register_schema(name, "jsonschema", data)
-            number = self._writer.register_channel(f"/{topic}", "json", schema, about)
+            schema = self.writer.register_schema(name, "jsonschema", data)
+            number = self.writer.register_channel(f"/{topic}", "json", schema, about)
             self._channels[topic] = number
             contents.channels[number] = Channel(f"/{topic}", "json", about, name, "jsonschema", data)
-        self._writer.add_metadata("run", metadata)
+        self.writer.add_metadata("run", metadata)
         for part in attachments:
-            self._writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
+            self.writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
         self._write("chain", self._chain.begin(chain.parts_of(contents), self.time_ns))
 
     def add(self, records: Iterable[tuple[str, bytes]], time_ns: int) -> None:
@@ -291,39 +254,8 @@ class _Live:
         self.sealed_ns = time_ns
         self.add([("seal", encode(message))], time_ns)
 
-    def sync(self) -> None:
-        """Bring everything to disk."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        view = memoryview(bytes(self._sink.data))
-        while view:
-            view = view[os.write(self._descriptor, view) :]
-        self._sink.data.clear()
-        os.fsync(self._descriptor)
-        self.synced = self._sink.size
-
-    def finish(self) -> None:
-        """Write the end and close the file."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self.sync()
-        os.close(self._descriptor)
-
-    def give_up(self) -> bool:
-        """Cut off what is not whole and close the file; tell whether the disk took that."""
-        cut = True
-        try:
-            os.ftruncate(self._descriptor, self.synced)
-        except OSError:
-            cut = False
-        with suppress(OSError):
-            os.close(self._descriptor)
-        if not self.synced:
-            with suppress(OSError):
-                self.path.unlink()
-                cut = True
-        return cut
-
     def _write(self, topic: str, data: bytes) -> None:
-        self._writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns, sequence=self._sequence)
+        self.writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns, sequence=self._sequence)
         self._sequence += 1
 
 

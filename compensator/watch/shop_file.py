@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from compensator import __version__
 from compensator.container import PAYLOAD, Container, Contents, Damaged, Torn
+from compensator.durable import sync_folder
 from compensator.errors import DataError
 
 
@@ -60,11 +61,7 @@ def compact(path: Path) -> str:
             raise DataError(f"{path}: {error}") from error
         finally:
             part.unlink(missing_ok=True)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
+    sync_folder(path.parent)
     return f"{count} messages, compact" + ("" if ended else "; it had no end, every whole message was kept")
 
 

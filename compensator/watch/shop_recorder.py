@@ -7,24 +7,19 @@ more than that, and what never arrived is counted from the numbers of the messag
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
-import os
 import threading
 from collections import deque
-from collections.abc import Iterable
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mcap.writer import CompressionType, Writer
-
 from compensator import __version__
 from compensator.clock import NS, Clock
+from compensator.durable import LiveFile
 from compensator.messages import MESSAGES, shipped_schema
 from compensator.watch.machine import KINDS, Malformed, decoded
 from compensator.watch.sequence import Sequence
@@ -209,7 +204,7 @@ class ShopRecorder:
         file, self._file = self._file, None
         if file is None:
             return
-        file.finish(self.messages, self.not_recorded, self.missed(), self._clock.utc_ns())
+        file.end(self.messages, self.not_recorded, self.missed(), self._clock.utc_ns())
         self._finish_later([file.path])
 
     def _finish_later(self, paths: Iterable[Path]) -> None:
@@ -232,42 +227,21 @@ def _compact_all(paths: list[Path]) -> None:
             log.info("%s: %s", path.name, said)
 
 
-@dataclass(slots=True)
-class _Sink:
-    """What the writer wrote since the last sync; the file gets it in one piece."""
-
-    data: bytearray = field(default_factory=bytearray)
-    size: int = 0
-
-    def write(self, data: bytes) -> None:
-        self.data += data
-        self.size += len(data)
-
-    def tell(self) -> int:
-        return self.size
-
-    def flush(self) -> None:
-        return
-
-
-class _File:
+class _File(LiveFile):
     """The file that is being written; its channels come with their first message."""
 
     def __init__(self, folder: Path, time_ns: int, prefix: str) -> None:
-        self.path, self._descriptor = _create(folder, time_ns)
-        self._sink = _Sink()
-        self._writer = Writer(self._sink, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)  # type: ignore[arg-type]
+        super().__init__(_names(folder, time_ns))
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._synced = 0
-        self._writer.start(profile="", library=f"compensator {__version__}")
+        self.writer.start(profile="", library=f"compensator {__version__}")
         metadata = {
             "prefix": prefix,
             "file": self.path.name,
             "compensator": __version__,
             "started_utc_ns": str(time_ns),
         }
-        self._writer.add_metadata("shop", metadata)
+        self.writer.add_metadata("shop", metadata)
 
     def add(self, arrival: _Arrival, numbered: tuple[str, int, int]) -> bool:
         """Write one message: log time is its arrival, publish time its own; tell whether there was room for it."""
@@ -278,7 +252,7 @@ class _File:
             if len(self._channels) >= CHANNELS:
                 return False
             channel = self._channels[topic] = self._register(topic, kind, arrival.key)
-        self._writer.add_message(channel, arrival.time_ns, arrival.payload, time_ns, sequence=number)
+        self.writer.add_message(channel, arrival.time_ns, arrival.payload, time_ns, sequence=number)
         return True
 
     def _register(self, topic: str, kind: str, key: str) -> int:
@@ -287,45 +261,23 @@ class _File:
             if kind not in self._schemas:
                 data = shipped_schema(kind) if kind in MESSAGES else ALIVE
                 name = MESSAGES[kind].__name__ if kind in MESSAGES else "Alive"
-                self._schemas[kind] = self._writer.register_schema(name, "jsonschema", data)
+                self._schemas[kind] = self.writer.register_schema(name, "jsonschema", data)
             schema = self._schemas[kind]
         encoding = "octet-stream" if kind == "other" else "json"
         about = {"key": key, "machine": key.rpartition("/thermal/")[0]}
-        return self._writer.register_channel(topic, encoding, schema, about)
+        return self.writer.register_channel(topic, encoding, schema, about)
 
-    def sync(self) -> None:
-        """Bring everything to disk."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        view = memoryview(bytes(self._sink.data))
-        while view:
-            view = view[os.write(self._descriptor, view) :]
-        self._sink.data.clear()
-        os.fsync(self._descriptor)
-        self._synced = self._sink.size
-
-    def finish(self, messages: int, not_recorded: int, missed: dict[str, int], time_ns: int) -> None:
+    def end(self, messages: int, not_recorded: int, missed: dict[str, int], time_ns: int) -> None:
         """Say what never arrived since the recorder began, write the end and close."""
         summary = {"messages": messages, "not_recorded": not_recorded, "missed": missed}
         try:
-            schema = self._writer.register_schema("ShopSummary", "jsonschema", SUMMARY)
-            channel = self._writer.register_channel("/summary", "json", schema)
-            self._writer.add_message(channel, time_ns, json.dumps(summary).encode(), time_ns)
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self.sync()
+            schema = self.writer.register_schema("ShopSummary", "jsonschema", SUMMARY)
+            channel = self.writer.register_channel("/summary", "json", schema)
+            self.writer.add_message(channel, time_ns, json.dumps(summary).encode(), time_ns)
+            self.finish()
         except OSError:
             self.give_up()
             raise
-        os.close(self._descriptor)
-
-    def give_up(self) -> None:
-        """Cut off what is not whole and close."""
-        with suppress(OSError):
-            os.ftruncate(self._descriptor, self._synced)
-        with suppress(OSError):
-            os.close(self._descriptor)
-        if not self._synced:
-            with suppress(OSError):
-                self.path.unlink()
 
 
 #: Schema of the last message of a file.
@@ -342,15 +294,8 @@ ALIVE = (
 )
 
 
-def _create(folder: Path, time_ns: int) -> tuple[Path, int]:
-    """Create a file that did not exist, named by the time, and hold it until it is finished."""
+def _names(folder: Path, time_ns: int) -> Iterator[Path]:
+    """Yield names for a new file by the time."""
     stamp = datetime.fromtimestamp(time_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
     for count in range(1000):
-        path = folder / f"shop_{stamp}{f'-{count:03d}' if count else ''}.mcap"
-        try:
-            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        except FileExistsError:
-            continue
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return path, descriptor
-    raise OSError(f"{folder}: a thousand recordings of {stamp}")
+        yield folder / f"shop_{stamp}{f'-{count:03d}' if count else ''}.mcap"

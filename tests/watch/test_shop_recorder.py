@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from compensator import durable
 from compensator.cli import main
 from compensator.clock import NS
 from compensator.errors import DataError
@@ -135,7 +136,7 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path, monkeypatch
             raise OSError(28, "No space left on device")
         sync(descriptor)
 
-    monkeypatch.setattr(shop_recorder.os, "fsync", fsync)
+    monkeypatch.setattr(durable.os, "fsync", fsync)
     monkeypatch.setattr(shop_recorder, "SYNC_S", 0.02)
     with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
         recorder.take(KEY + "y/offset", offset(1))

@@ -1,0 +1,113 @@
+"""Files that a kill or a power cut cannot take back: live MCAP files, synced as a whole, and names that stay."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+
+@dataclass(slots=True)
+class _Sink:
+    """What the writer wrote since the last sync; the file gets it in one piece."""
+
+    data: bytearray = field(default_factory=bytearray)
+    size: int = 0
+
+    def write(self, data: bytes) -> None:
+        self.data += data
+        self.size += len(data)
+
+    def tell(self) -> int:
+        return self.size
+
+    def flush(self) -> None:
+        return
+
+
+class LiveFile:
+    """An MCAP file that is being written.
+
+    Without chunks a message is in the file as soon as it is synced; the CRC over the data covers a finished one.
+
+    Parameters
+    ----------
+    paths : iterable of pathlib.Path
+        Names to try; the first that nobody has is taken.
+
+    Raises
+    ------
+    OSError
+        If the disk does not take it, or every name is taken.
+    """
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        self.path, self._descriptor = _create(paths)
+        self._sink = _Sink()
+        self.writer = Writer(self._sink, use_chunking=False, compression=CompressionType.NONE, enable_data_crcs=True)  # type: ignore[arg-type]
+        #: Bytes that are on disk.
+        self.synced = 0
+
+    def sync(self) -> None:
+        """Bring everything to disk."""
+        self.writer.flush()  # type: ignore[no-untyped-call]
+        view = memoryview(bytes(self._sink.data))
+        while view:
+            view = view[os.write(self._descriptor, view) :]
+        self._sink.data.clear()
+        os.fsync(self._descriptor)
+        self.synced = self._sink.size
+
+    def finish(self) -> None:
+        """Write the end and close the file; from here on others may take it over."""
+        self.writer.finish()  # type: ignore[no-untyped-call]
+        self.sync()
+        os.close(self._descriptor)
+
+    def give_up(self) -> bool:
+        """Cut off what is not whole and close the file; tell whether the disk took that."""
+        cut = True
+        try:
+            os.ftruncate(self._descriptor, self.synced)
+        except OSError:
+            cut = False
+        with suppress(OSError):
+            os.close(self._descriptor)
+        if not self.synced:
+            with suppress(OSError):
+                self.path.unlink()
+                cut = True
+        return cut
+
+
+def _create(paths: Iterable[Path]) -> tuple[Path, int]:
+    path = None
+    for path in paths:
+        try:
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except FileExistsError:
+            continue
+        # Held until the file is finished, so that nobody takes it for one that was left behind.
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return path, descriptor
+    raise OSError(f"{path}: it and every name before it is taken")
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to disk: a new file's, too, must outlive a power cut.
+
+    Raises
+    ------
+    OSError
+        If the disk does not take it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
