@@ -29,7 +29,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     machine = loaded.config.machine.name
     text = (
         f"{arguments.config}: good. Machine {machine}, model {model.name} ({model.kind}), "
-        f"{len(fleet.devices)} device(s), {len(loaded.config.channel)} channel(s). Nothing was opened.\n{checks}"
+        f"{len(fleet.devices)} device(s), {len(loaded.config.channel)} channel(s). Nothing was opened.\n"
+        f"plausibility: {checks}"
     )
     result = {"ok": True, "machine": machine, "model": model.name, "model_sha256": model.sha256,
               "devices": list(fleet.devices), "warnings": warnings, "checks": checks}  # fmt: skip

@@ -185,7 +185,7 @@ class PlausibilityCheck:
             if self._watched
             else f"residual off ({why})"
         )
-        return "plausibility: " + "; ".join(parts)
+        return "; ".join(parts)
 
     # ------------------------------------------------------------------ one sample
 
