@@ -22,8 +22,12 @@ def main(chosen):
         sys.exit(f"unknown: {', '.join(sorted(unknown))}; expected some of: {', '.join(AREAS)}")
     where = surroundings()
     print(where + "\n", flush=True)
-    figures = [figure for name in chosen or AREAS for figure in AREAS[name]()]
-    print(f"\n{where}\n\n{table(figures)}")
+    figures = []
+    try:
+        for name in chosen or AREAS:
+            figures.extend(AREAS[name]())
+    finally:  # what was measured in an hour is not lost with what goes wrong after it
+        print(f"\n{where}\n\n{table(figures)}")
 
 
 if __name__ == "__main__":

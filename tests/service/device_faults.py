@@ -235,7 +235,7 @@ def _check(
     for i in range(begin, end):
         context = (course.layout, episode, i - begin, offsets[i])
         for role in ROLES:
-            true = _true(samples, role, truth, i)
+            true = _true(samples, role, truth, i, late=kinds.get(role) == "late")
             _check_channel(samples[i], role, kinds, carriers, course, true, held[role], seen, context)
         missing = [role for role in ROLES[:2] if samples[i].channels[role].quality != "good"]
         lost = lost + 1 if missing else 0
@@ -257,16 +257,19 @@ def _check(
     return seen
 
 
-def _true(samples: Sequence[Sample], role: str, truth: Sequence[dict[str, float]], i: int) -> float:
+def _true(
+    samples: Sequence[Sample], role: str, truth: Sequence[dict[str, float]], i: int, *, late: bool = False
+) -> float:
     """Return what a channel should have given.
 
     A device that was slow gives its value to the next poll, which in real time is the one after; and the controller's
     mean is that of the blocks since the last read, of 10 s at most. Where simulated minutes take milliseconds both may
-    reach back over several of them: not so a serial or Modbus device that answered in the sample before.
+    reach back over several of them: not so a serial or Modbus device that answered in the sample before. One that is a
+    second late is late by dozens.
     """
-    answered = role != "y_um" and samples[i - 1].channels[role].quality == "good"
+    answered = role != "y_um" and not late and samples[i - 1].channels[role].quality == "good"
     zero = 250.0 if role == "y_um" else 0.0
-    recent = [one[role] + zero for one in truth[i - (1 if answered else 12) : i + 1]]
+    recent = [one[role] + zero for one in truth[max(i - (1 if answered else 60 if late else 12), 0) : i + 1]]
     mean = number(samples[i].channels[role].mean)
     return mean if min(recent) <= mean <= max(recent) else recent[-1]
 
