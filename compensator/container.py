@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
@@ -178,6 +179,25 @@ class Container:
     def position(self) -> int:
         """How far the file was read, bytes."""
         return self._base + self._at
+
+    def survey(self, *, whole: bool) -> Contents:
+        """Read for what stands beside the messages, as far as the file goes, and return it.
+
+        Parameters
+        ----------
+        whole : bool
+            Whether to its end; else no further than the first message.
+
+        Raises
+        ------
+        DataError
+            If it is not an MCAP file.
+        """
+        with suppress(Damaged):
+            for _ in self.messages():
+                if not whole:
+                    break
+        return self.contents
 
     # ------------------------------------------------------------------ messages
 

@@ -78,12 +78,7 @@ def machines_in(path: Path) -> list[str]:
         If it is not an MCAP file.
     """
     with Container(path) as container:
-        try:
-            for _ in container.messages():
-                pass
-        except Damaged:
-            pass
-        topics = [channel.topic.strip("/") for channel in container.contents.channels.values()]
+        topics = [channel.topic.strip("/") for channel in container.survey(whole=True).channels.values()]
     known = {topic.rpartition("/thermal/")[0] for topic in topics if not topic.startswith("other/")}
     return sorted(known - {""})
 

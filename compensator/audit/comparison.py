@@ -14,11 +14,13 @@ from compensator.audit.findings import utc
 from compensator.audit.recomputation import act, model_of, raw_of
 from compensator.audit.recording_audit import recorded_groups
 from compensator.audit.verification import Record
+from compensator.clock import NS
 from compensator.config import Config
 from compensator.container import PAYLOAD, Container
 from compensator.errors import DataError, ServiceError
 from compensator.messages import Event, Sample, number
 from compensator.model.thermal_model import ThermalModel
+from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome
 
 #: Columns of the table of both offsets.
@@ -47,47 +49,6 @@ class _Offset(msgspec.Struct):
 
 _SAMPLE, _EVENT = msgspec.json.Decoder(Sample), msgspec.json.Decoder(Event)
 _ESTIMATE, _OFFSET = msgspec.json.Decoder(_Estimate), msgspec.json.Decoder(_Offset)
-
-
-@dataclass(slots=True)
-class Spread:
-    """Root mean square and largest amount of a quantity, with its time.
-
-    Parameters
-    ----------
-    samples : int
-        Number of values.
-    rms_um, peak_um : float
-        Root mean square and largest amount, µm; NaN where there are none.
-    worst_ns : int
-        Time of the largest, ns since 1970 UTC.
-    """
-
-    samples: int = 0
-    peak_um: float = 0.0
-    worst_ns: int = 0
-    _squares: float = 0.0
-
-    def add(self, value: float, time_ns: int) -> None:
-        """Take a value in; one that is missing counts nowhere."""
-        if math.isnan(value):
-            return
-        self.samples += 1
-        self._squares += value * value
-        if abs(value) > self.peak_um or not self.worst_ns:
-            self.peak_um, self.worst_ns = abs(value), time_ns
-
-    @property
-    def rms_um(self) -> float:
-        """Root mean square, µm."""
-        return math.sqrt(self._squares / self.samples) if self.samples else math.nan
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
-        there = self.samples > 0
-        return {"samples": self.samples, "rms_um": self.rms_um if there else None,
-                "peak_um": self.peak_um if there else None,
-                "worst_time_utc": utc(self.worst_ns) if there else None}  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -124,9 +85,9 @@ class Comparison:
         """Return it as it stands in the result of `--json`."""
         return {
             "recorded_model": self.recorded, "other_model": self.other, "samples": self.samples,
-            "residual_um": {"before": self.residual_before.as_json(), "after": self.residual_after.as_json()},
-            "left_um": {"before": self.left_before.as_json(), "after": self.left_after.as_json()},
-            "offset_difference_um": self.offsets.as_json(), "remarks": self.remarks,
+            "residual_um": {"before": _spread_json(self.residual_before), "after": _spread_json(self.residual_after)},
+            "left_um": {"before": _spread_json(self.left_before), "after": _spread_json(self.left_after)},
+            "offset_difference_um": _spread_json(self.offsets), "remarks": self.remarks,
         }  # fmt: skip
 
     def text(self) -> str:
@@ -142,8 +103,8 @@ class Comparison:
         lines = [f"{self.samples} samples; y_um was measured in {self.residual_before.samples} of them",
                  f"{'':<{width}} {'rms µm':>9} {'peak µm':>9} {'samples':>9}  worst at"]  # fmt: skip
         for name, spread in rows:
-            figures = f"{spread.rms_um:9.3f} {spread.peak_um:9.3f}" if spread.samples else f"{'–':>9} {'–':>9}"
-            worst = utc(spread.worst_ns) if spread.samples else "–"
+            figures = f"{spread.rms:9.3f} {abs(spread.peak):9.3f}" if spread.samples else f"{'–':>9} {'–':>9}"
+            worst = worst_utc(spread) if spread.samples else "–"
             lines.append(f"{name:<{width}} {figures} {spread.samples:9d}  {worst}")
         return "\n".join([*lines, *(f"remark: {remark}" for remark in self.remarks)])
 
@@ -270,17 +231,18 @@ class _Run:
 
     def _add(self, sample: Sample, estimate: _Estimate, offset: _Offset, outcome: Outcome) -> None:
         result, time_ns = self._result, sample.time_utc_ns
+        at_s = time_ns / NS
         y, other_y = number(estimate.y_um), number(outcome.estimate.y_um)
         before, after = number(estimate.residual_um), number(outcome.estimate.residual_um)
         recorded, other = number(offset.y_offset_um), number(outcome.offset.y_offset_um)
         result.samples += 1
         if not math.isnan(before) and not math.isnan(after):
-            result.residual_before.add(before, time_ns)
-            result.residual_after.add(after, time_ns)
+            result.residual_before.add(before, at_s)
+            result.residual_after.add(after, at_s)
         if not math.isnan(y + recorded) and not math.isnan(other_y + other):
-            result.left_before.add(y + recorded, time_ns)
-            result.left_after.add(other_y + other, time_ns)
-        result.offsets.add(other - recorded, time_ns)
+            result.left_before.add(y + recorded, at_s)
+            result.left_after.add(other_y + other, at_s)
+        result.offsets.add(other - recorded, at_s)
         if self._point is not None:
             self._point(time_ns, y, recorded, other_y, other)
         if self._row is not None:
@@ -294,3 +256,15 @@ class _Run:
             raise DataError("no samples in the recordings")
         self._result.recorded = ", ".join(self._names)
         return self._result
+
+
+def worst_utc(spread: Spread) -> str:
+    """Return when the largest amount of something was, as ISO 8601."""
+    return utc(round(spread.at_s * NS))
+
+
+def _spread_json(spread: Spread) -> dict[str, Any]:
+    there = spread.samples > 0
+    return {"samples": spread.samples, "rms_um": spread.rms if there else None,
+            "peak_um": abs(spread.peak) if there else None,
+            "worst_time_utc": worst_utc(spread) if there else None}  # fmt: skip

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from compensator import __version__
-from compensator.audit.comparison import Comparison, Spread
+from compensator.audit.comparison import Comparison, worst_utc
 from compensator.audit.findings import Difference, Finding, utc
 from compensator.audit.recording_audit import RecordingAudit
 from compensator.audit.series import Audit
 from compensator.chain import NOTHING
 from compensator.report.envelope import Envelope, line_of
+from compensator.report.history import Spread
 from compensator.report.page import (
     Block,
     Cell,
@@ -275,7 +276,7 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
     offsets = Figure(
         title="Offset of both models", x_label=_TIME, y_label="Y offset, µm", clock=True, x_limits=ends,
         lines=(curves.line(recorded, "recorded"), curves.line(other, "other")),
-        note=f"They differ by {_um(found.offsets.rms_um)} µm rms, at most {_um(found.offsets.peak_um)} µm.",
+        note=f"They differ by {_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
     )  # fmt: skip
     blocks: list[Block] = [offsets]
     if found.left_before.samples:
@@ -290,11 +291,11 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
 
 
 def _better(found: Comparison) -> tuple[str, Tone]:
-    before, after = found.left_before.rms_um, found.left_after.rms_um
+    before, after = found.left_before.rms, found.left_after.rms
     if not found.left_before.samples:
         return (
             f"Y was not measured, so neither is known to be better: the offset of {found.other} differs by "
-            f"{_um(found.offsets.rms_um)} µm rms, at most {_um(found.offsets.peak_um)} µm.",
+            f"{_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
             "warn",
         )
     words = (
@@ -306,9 +307,8 @@ def _better(found: Comparison) -> tuple[str, Tone]:
 
 def _before_and_after(found: Comparison) -> Table:
     def row(name: str, spread: Spread) -> list[Cell]:
-        there = spread.samples > 0
-        return [name, _um(spread.rms_um), _um(spread.peak_um if there else math.nan), str(spread.samples),
-                utc(spread.worst_ns) if there else "–"]  # fmt: skip
+        worst = worst_utc(spread) if spread.samples else "–"
+        return [name, _um(spread.rms), _um(abs(spread.peak)), str(spread.samples), worst]
 
     return Table(
         title="Before and after", head=["", "rms µm", "largest µm", "samples", "largest at"],

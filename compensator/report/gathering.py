@@ -6,7 +6,6 @@ import heapq
 import math
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import count
@@ -113,9 +112,7 @@ def _in_order(paths: Sequence[Path]) -> list[Path]:
     began: dict[Path, tuple[str, str]] = {}
     for path in dict.fromkeys(paths):
         with Container(path) as container:
-            with suppress(Damaged):
-                next(container.messages(), None)
-            run = container.contents.metadata.get("run", {})
+            run = container.survey(whole=False).metadata.get("run", {})
         began[path] = (run.get("machine", ""), run.get("file", path.name).removesuffix(".mcap"))
     machines = sorted({machine for machine, _ in began.values() if machine})
     if len(machines) > 1:

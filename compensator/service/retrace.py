@@ -15,7 +15,7 @@ import msgspec
 
 from compensator.clock import NS
 from compensator.config import Config
-from compensator.container import Container, Damaged
+from compensator.container import Container
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Event, Offset, Sample, number
 from compensator.model.thermal_model import ThermalModel
@@ -69,12 +69,7 @@ def opening_of(path: Path) -> dict[str, bytes]:
         If it is not an MCAP file.
     """
     with Container(path) as container:
-        try:
-            for _ in container.messages():
-                break
-        except Damaged:
-            pass
-        return {name: attachment.data for name, attachment in container.contents.attachments.items()}
+        return {name: attachment.data for name, attachment in container.survey(whole=False).attachments.items()}
 
 
 def state_of(path: Path) -> CompensationState | None:
