@@ -45,7 +45,7 @@ class Command(NamedTuple):
 
 COMMANDS = (
     Command("demo", "the whole loop on simulated hardware", "demo --out demo-out",
-            arguments.demo, "compensator.demo:run"),
+            arguments.demo, "compensator.demo.command:run"),
     Command("run", "the service", "run --config machine.toml",
             arguments.of_service, "compensator.commands.run:run"),
     Command("check", "validate a configuration; opens nothing", "check --config machine.toml",

@@ -20,6 +20,8 @@ def demo(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder for the results")
     add("--hours", type=float, default=24.0, help="length of the simulated run, h (default 24)")
     add("--seed", type=int, default=1, help="seed of the simulated day (default 1)")
+    add("--live", action="store_true", help="one machine that runs on in real time after these hours, to try things on")
+    add("--port", type=int, default=7447, help="where it listens on loopback, with --live (default 7447)")
     _page(parser)
 
 

@@ -19,7 +19,8 @@ import numpy as np
 from scipy import signal as filters
 
 from compensator.clock import VirtualClock
-from compensator.demo import START_NS, configuration, hardware
+from compensator.demo.day import START_NS
+from compensator.demo.machine import configuration, hardware
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model
 from compensator.service.composition import run_service
@@ -66,7 +67,7 @@ def machine(hours: float) -> Iterator[tuple[Path, VirtualClock, World]]:
     """A simulated machine on its devices, its configuration, and a clock that drives it."""
     duty = Duty.working_day(1, hours=hours + 0.1)
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
-    with tempfile.TemporaryDirectory() as folder, hardware(world) as (lines, capa):
+    with tempfile.TemporaryDirectory() as folder, hardware(world) as (lines, capa, _):
         config = Path(folder) / "config.toml"
         config.write_text(configuration("bench", lines, PORT), encoding="utf-8")
 
@@ -103,7 +104,7 @@ def service_process() -> Iterator[Figure]:
     """The service as a process of its own at one poll a second: processor time and memory."""
     duty = Duty.working_day(1, hours=1.0)
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
-    with tempfile.TemporaryDirectory() as folder, hardware(world) as (lines, capa):
+    with tempfile.TemporaryDirectory() as folder, hardware(world) as (lines, capa, _):
         config = Path(folder) / "config.toml"
         text = configuration("bench", lines, PORT)
         config.write_text(text.replace("poll_interval_s = 10.0", "poll_interval_s = 1.0"), encoding="utf-8")

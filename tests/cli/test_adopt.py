@@ -16,7 +16,7 @@ import pytest
 import zenoh
 
 from compensator.cli import main
-from compensator.demo import configuration, hardware
+from compensator.demo.machine import configuration, hardware
 from compensator.recording import read_messages, recordings
 from compensator.service.model_store import sha256_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
@@ -169,7 +169,7 @@ def test_killed_restarted_and_given_another_model(tmp_path: Path, capsys: pytest
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
     world.advance_to(1200.0)
     port = free_port()
-    with hardware(world) as (lines, _capa):
+    with hardware(world) as (lines, _capa, _):
         fast = load_fast_model(tmp_path)
         text = configuration("vmc-07", lines, port).replace('file = "quill"', f'file = "{fast.name}"')
         config = tmp_path / "machine.toml"

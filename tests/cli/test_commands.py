@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from compensator.cli import COMMANDS, load, main
-from compensator.demo import START_NS, configuration, hardware, run_day
+from compensator.demo.day import START_NS, run_day
+from compensator.demo.machine import configuration, hardware
 from compensator.model.model_file import load_model
 from compensator.recording import read_messages, recordings
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
@@ -82,7 +83,7 @@ def test_check_and_run_on_hardware_with_sigterm(tmp_path: Path) -> None:
     """The service as a process of its own, in real time, ended by SIGTERM with a finished recording."""
     duty = Duty.working_day(1, hours=1)
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
-    with hardware(world) as (lines, _capa), socket.socket() as free:
+    with hardware(world) as (lines, _capa, _), socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
         free.close()
@@ -153,7 +154,7 @@ def test_probe_reads_every_device_once(tmp_path: Path, capsys: pytest.CaptureFix
     duty = Duty.working_day(1, hours=1)
     world = World(PublishedQuill(), duty, None, 1)
     world.advance_to(60.0)
-    with hardware(world) as (lines, _capa):
+    with hardware(world) as (lines, _capa, _):
         # A controller in push mode streams only when the simulated time moves: the probe's first frame.
         config = tmp_path / "machine.toml"
         config.write_text(configuration("vmc-07", lines, 7447), encoding="utf-8")

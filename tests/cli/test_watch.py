@@ -15,7 +15,7 @@ import pytest
 from mcap.reader import make_reader
 
 from compensator.cli import main
-from compensator.demo import configuration, hardware
+from compensator.demo.machine import configuration, hardware
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.cli.test_adopt import Receiver, free_port, service
 from tests.cli.test_commands import load_fast_model
@@ -29,7 +29,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, in
     world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
     world.advance_to(1200.0)
     port = free_port()
-    with hardware(world) as (lines, capa):
+    with hardware(world) as (lines, capa, _):
         fast = load_fast_model(folder)
         text = configuration("vmc-07", lines, port, fast.name).replace(
             "poll_interval_s = 10.0", "poll_interval_s = 0.25"

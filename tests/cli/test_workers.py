@@ -15,7 +15,7 @@ import pytest
 
 from compensator.cli import main
 from compensator.commands import diagnose as diagnose_command
-from compensator.demo import write_table
+from compensator.demo.calibration import write_table
 from tests.audit.made import START_NS, Service
 from tests.diagnose.scenarios import draw, record
 

@@ -23,7 +23,7 @@ import pytest
 
 from compensator.clock import NS
 from compensator.commands.run import Voice, level, status
-from compensator.demo import configuration
+from compensator.demo.machine import configuration
 from compensator.messages import Event, Offset
 from compensator.recording import recordings
 from compensator.service import journald

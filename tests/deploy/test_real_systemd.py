@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from compensator.cli import main
-from compensator.demo import configuration
+from compensator.demo.machine import configuration
 from compensator.recording import read_messages, recordings
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire.icpdas import IcpDas

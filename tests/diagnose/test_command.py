@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from compensator.cli import main
-from compensator.demo import write_table
+from compensator.demo.calibration import write_table
 from compensator.model.model_file import load_model
 from tests.diagnose.scenarios import draw, record
 

@@ -18,7 +18,7 @@ import pytest
 import zenoh
 
 from compensator.config import Zenoh
-from compensator.demo import run_day
+from compensator.demo.day import run_day
 from compensator.messages import SCHEMA, Offset, encode
 from compensator.recording import read_messages, recordings
 from compensator.service.publisher import session_config

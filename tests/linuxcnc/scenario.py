@@ -21,7 +21,7 @@ from typing import Any
 
 import zenoh
 
-from compensator.demo import configuration, hardware
+from compensator.demo.machine import configuration, hardware
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.linuxcnc.control import SHIPPED, Control, Period, changed, linuxcnc
 from tests.receiver.wire import ScriptedService, router, until
@@ -285,7 +285,7 @@ def machine(folder: Path) -> Iterator[Path]:
             at_s += 1.0
             world.advance_to(at_s)
 
-    with hardware(world) as (lines, _):
+    with hardware(world) as (lines, _, _):
         quill = (Path(__file__).parents[2] / "compensator/model/quill.toml").read_text(encoding="utf-8")
         # A day in minutes: what warms up that fast takes more heat than the machine has.
         fast = changed(quill, {"sample_period_s = 60.0": "sample_period_s = 1.0", "[-20.0, 120.0]": "[-9e3, 9e3]"})

@@ -12,7 +12,7 @@ import pytest
 from compensator.certificates import check_files, remarks
 from compensator.cli import main
 from compensator.config import load_config
-from compensator.demo import configuration
+from compensator.demo.machine import configuration
 from compensator.service.session import tls_files
 from tests.security.shop import script
 

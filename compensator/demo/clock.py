@@ -1,0 +1,76 @@
+"""A clock that makes up for the past, and then goes with the wall."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Collection
+from typing import Any
+
+from compensator.clock import NS, Clock, SystemClock
+
+
+class LateClock:
+    """A clock that begins in the past, leaps until it has caught up with another one, and then goes with that.
+
+    Like `VirtualClock` it is for one task that sleeps.
+
+    Parameters
+    ----------
+    behind_s : float
+        How far in the past it begins, s.
+    on_advance : callable
+        Awaited with the seconds since the start whenever the time has moved.
+    on_time : callable
+        Called once, when it has caught up.
+    wall : Clock, optional
+        What it catches up with; the machine's own where none is given.
+    """
+
+    def __init__(
+        self, behind_s: float, on_advance: Callable[[float], Awaitable[None]], on_time: Callable[[], None],
+        wall: Clock | None = None,
+    ) -> None:  # fmt: skip
+        self._wall: Clock = wall or SystemClock()
+        self._start_ns = self._now_ns = self._wall.monotonic_ns() - round(behind_s * NS)
+        # Kept, so that time stands still while work is done.
+        self._utc_ns = self._wall.utc_ns() - self._wall.monotonic_ns()
+        self._late = behind_s > 0
+        self._on_advance = on_advance
+        self._on_time = on_time
+        self._woken = asyncio.Event()
+
+    def utc_ns(self) -> int:
+        """Return the wall clock, or how far it has been made up for, ns since 1970 UTC."""
+        return self._utc_ns + self._now_ns if self._late else self._wall.utc_ns()
+
+    def monotonic_ns(self) -> int:
+        """Return the time since the start, ns."""
+        return (self._now_ns if self._late else self._wall.monotonic_ns()) - self._start_ns
+
+    def wake(self) -> None:
+        """End the sleep, and every later one at once: somebody wants to stop."""
+        self._woken.set()
+
+    async def sleep(self, seconds: float) -> None:
+        """Leap ahead, or wait where there is nothing left to make up for."""
+        ahead_ns = round(max(seconds, 0.0) * NS)
+        if self._late:
+            now_ns = self._wall.monotonic_ns()
+            if self._now_ns + ahead_ns <= now_ns:
+                self._now_ns += ahead_ns
+                await self._on_advance(self.monotonic_ns() / NS)
+                await asyncio.sleep(0)
+                return
+            ahead_ns -= now_ns - self._now_ns
+            self._late = False
+            self._on_time()
+        waits = [asyncio.ensure_future(self._wall.sleep(ahead_ns / NS)), asyncio.ensure_future(self._woken.wait())]
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        for wait in waits:
+            wait.cancel()
+        await self._on_advance(self.monotonic_ns() / NS)
+
+    async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
+        """Wait until the tasks are done; no longer than `timeout_s` once it goes with the wall."""
+        if tasks:
+            await asyncio.wait(tasks, timeout=None if self._late else timeout_s)

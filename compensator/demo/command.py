@@ -1,0 +1,76 @@
+"""`compensator demo`: the whole loop on simulated hardware, or a simulated machine that runs on."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from compensator.commands import Answer
+from compensator.demo.calibration import calibrate, paper_case
+from compensator.demo.day import run_day
+from compensator.demo.figures import as_text, shown
+from compensator.demo.figures import table as table_of
+from compensator.demo.live import run_live
+from compensator.demo.loop import close_the_loop
+from compensator.demo.machine import MACHINES
+from compensator.report.demonstration import page_of, verdict
+from compensator.report.formats import checked, write
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command `demo`.
+
+    Raises
+    ------
+    CompensatorError
+        If the page cannot be made of that kind, or the machine that runs on cannot begin.
+    """
+    if arguments.live:
+        recordings = run_live(arguments.out, hours=arguments.hours, seed=arguments.seed, port=arguments.port)
+        text = f"ended; the recordings: compensator replay {recordings}, compensator report {recordings}"
+        return Answer({"recordings": str(recordings)}, text)
+    also = checked(arguments.page, option="--page") if arguments.page else None
+    return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed, also=also))
+
+
+def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) -> tuple[dict[str, Any], str]:
+    """Run the demo and write its results.
+
+    Parameters
+    ----------
+    out : pathlib.Path
+        Folder; a configuration, recordings and `report.html` of each machine come there.
+    hours : float
+        Length of the simulated run, h.
+    seed : int
+        Seed of the simulated day.
+    also : pathlib.Path, optional
+        Another file that the page goes into, such as a PDF.
+
+    Returns
+    -------
+    (dict, str)
+        Figures, and the table as text.
+    """
+    days = []
+    for name in MACHINES:
+        calibrate(out / name, machine=name, seed=seed)
+        day = run_day(out / name, machine=name, hours=hours, seed=seed, model="calibration/model.toml")
+        days.append(shown(name, day))
+    results = {day.name: day.figures for day in days}
+    page = out / "report.html"
+    table = table_of(results)
+    loop, second_day = close_the_loop(out / "conduction", hours=hours, seed=seed)
+    made = page_of(days, table, loop, second_day, paper_case(out / "paper", seed=seed))
+    for path in (page, *([also] if also is not None else [])):
+        write(path, made)
+    rms = loop["second_day_rms_um"]
+    said = (
+        f"The loop, on the conduction machine with an effect drawn by the seed ({loop['drawn']}): found "
+        f"{', '.join(loop['found']) or 'nothing'} in the first day's recordings.\n"
+        f"Second day, rms: {rms['without']:.2f} µm without compensation, {rms['first']:.2f} with the first model, "
+        f"{rms['extended']:.2f} with the extended one."
+    )
+    result = {"machines": results, "loop": loop, "report": str(page)}
+    return result, f"{as_text(table)}\n\n{verdict(days)}\n{said}\npage: {page}"

@@ -1,0 +1,88 @@
+"""Figures of a simulated day, judged by what the simulated machine itself knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.clock import NS
+from compensator.demo.day import START_NS, Day
+from compensator.messages import number
+from compensator.report.demonstration import MachineDay
+from compensator.simulation import scores
+
+Vector = npt.NDArray[np.float64]
+
+
+def errors_of(day: Day) -> dict[str, Vector]:
+    """Return true deformation and what is left of it with the offset held and with its rate followed, µm."""
+    t = day.truth["t_s"]
+    y = day.truth["y_um"]
+    offsets = [(o.offset.time_utc_ns - START_NS) / NS for o in day.outcomes]
+    start = int(np.searchsorted(t, offsets[0]))
+    t, y = t[start:], y[start:] - y[start]
+    index = np.clip(np.searchsorted(offsets, t, side="right") - 1, 0, None)
+    value = np.array([number(o.offset.y_offset_um) for o in day.outcomes])[index]
+    rate = np.array([number(o.offset.y_offset_rate_um_per_min) for o in day.outcomes])[index]
+    return {
+        "t_h": t / 3600.0, "without": y, "held": y + value,
+        "followed": y + value + rate * (t - np.array(offsets)[index]) / 60.0,
+    }  # fmt: skip
+
+
+def figures_of(day: Day) -> dict[str, Any]:
+    """Return errors without and with compensation, fit, and what else the table shows of a day."""
+    errors = errors_of(day)
+    estimate = [outcome.estimate for outcome in day.outcomes]
+    fit = scores(np.array([number(e.y_um) for e in estimate]), np.array([number(e.y_pred_um) for e in estimate]))
+    still = errors["followed"]
+    part: dict[str, Any] = {
+        name: {
+            "rms_um": float(np.sqrt(np.mean(errors[name] ** 2))),
+            "peak_to_peak_um": float(np.ptp(errors[name])),
+        }
+        for name in ("without", "held", "followed")
+    }
+    part |= {
+        "samples": len(day.outcomes), "received": len(day.received), "seconds": round(day.seconds, 1),
+        "fit_pct": fit.fit_pct, "removed_pct": 100.0 * (1.0 - float(np.std(still)) / float(np.std(errors["without"]))),
+        "states": {s: sum(o.offset.state == s for o in day.outcomes) for s in {o.offset.state for o in day.outcomes}},
+    }  # fmt: skip
+    return part
+
+
+def shown(name: str, day: Day) -> MachineDay:
+    """Return what the page shows of a day."""
+    hours = [(o.estimate.time_utc_ns - START_NS) / NS / 3600 for o in day.outcomes]
+    heat = [number(o.estimate.heat_w) for o in day.outcomes]
+    return MachineDay(
+        name=name, figures=figures_of(day), errors=errors_of(day),
+        heat=(day.truth["t_s"] / 3600.0, day.truth["heat_w"], np.array(hours), np.array(heat)),
+    )  # fmt: skip
+
+
+def table(results: Mapping[str, Any]) -> list[list[str]]:
+    """Return the table of errors of all machines, the head first."""
+    rows = [["simulated machine", "", "rms µm", "peak-to-peak µm", "fit %", "samples", "seconds"]]
+    for machine, figures in results.items():
+        for key, words in (
+            ("without", "no compensation"),
+            ("held", "offset held 60 s"),
+            ("followed", "rate followed"),
+        ):
+            first = key == "without"
+            rows.append([
+                machine if first else "", words, f"{figures[key]['rms_um']:.2f}",
+                f"{figures[key]['peak_to_peak_um']:.2f}", f"{figures['fit_pct']:.1f}" if key == "followed" else "",
+                str(figures["samples"]) if first else "", f"{figures['seconds']:.1f}" if first else "",
+            ])  # fmt: skip
+    return rows
+
+
+def as_text(rows: list[list[str]]) -> str:
+    """Return a table with its columns one below the other."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)

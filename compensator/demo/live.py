@@ -1,0 +1,176 @@
+"""A simulated machine that runs on: a day of it on record, then the real service in real time, to try things on.
+
+What a person at the machine, a control's program or an auditor would meet is all there: devices behind their
+protocols, the service on loopback, recordings that grow. Sensors are broken by typing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import signal
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO
+
+from rich.console import Console
+from rich.progress import Progress
+
+from compensator.demo.calibration import calibrate
+from compensator.demo.clock import LateClock
+from compensator.demo.loop import EFFECT_UM
+from compensator.demo.machine import MACHINES, Hardware, configuration, hardware
+from compensator.errors import UsageError
+from compensator.service.composition import run_service
+from compensator.service.daemon import Daemon
+from compensator.service.presence import sole_user
+from sim_hardware.physics import Duty, World, draw_effect, usual_sensors
+from sim_hardware.wire import Faults
+
+#: What can be broken, by the name that is typed: the faults of its device, and its input there.
+Breakable = Mapping[str, tuple[Faults, int]]
+
+MACHINE, PREFIX = "vmc-07", "shop/vmc-07"
+#: Length of the duty after the history; then its last inputs go on, h.
+AFTER_H = 7 * 24.0
+#: What is typed, and the fault of an input or of a whole device that it stands for.
+INPUT_FAULTS = {"break": "open", "freeze": "frozen"}
+UNPLUG = {"t_q": "silence", "at": "silence", "y": "disconnect"}
+
+
+def run_live(out: Path, *, hours: float, seed: int, port: int, typed: IO[str] | None = None) -> Path:
+    """Run a simulated machine and its service until SIGTERM or SIGINT.
+
+    Parameters
+    ----------
+    out : pathlib.Path
+        Folder of the demo. The machine's own files come to `live` in it; its model is the one of `conduction`, which
+        is calibrated first where it is not there yet.
+    hours : float
+        How much of the past is simulated before real time begins, h.
+    seed : int
+        Seed of duty, sensors and the undeclared effect: the effect of the demo with the same seed.
+    port : int
+        TCP port of loopback on which the service listens.
+    typed : file, optional
+        Where what is typed comes from; stdin where none is given.
+
+    Returns
+    -------
+    pathlib.Path
+        The folder of the recordings.
+
+    Raises
+    ------
+    UsageError
+        If the length is negative.
+    ServiceError
+        If one of these runs already, or the port is taken.
+    """
+    if hours < 0:
+        raise UsageError(f"--hours {hours:g}: expected 0 or more")
+    folder = out / "live"
+    recordings = folder / "recordings"
+    recordings.mkdir(parents=True, exist_ok=True)
+    with sole_user(recordings, MACHINE):
+        _clear(recordings)
+    if not (out / "conduction" / "calibration" / "model.toml").exists():
+        sys.stderr.write("calibrates the machine first\n")
+        calibrate(out / "conduction", machine="conduction", seed=seed)
+    duty = Duty.working_day(seed + 3, hours=hours + AFTER_H)
+    effect = draw_effect(seed, EFFECT_UM, hours or 24.0)
+    world = World(MACHINES["conduction"](effects=[effect]), duty, usual_sensors(duty.extra_names), seed)
+    with hardware(world) as devices:
+        config = folder / "config.toml"
+        model = "../conduction/calibration/model.toml"
+        text = configuration(MACHINE, devices.lines, port, model, prefix=PREFIX)
+        config.write_text(text, encoding="utf-8")
+        asyncio.run(_serve(config, world, devices, hours, lambda: _explain(config, port), typed or sys.stdin))
+    return recordings
+
+
+def _clear(recordings: Path) -> None:
+    """Remove what an earlier machine left: this one's day ends now, and is not the continuation of that."""
+    for path in recordings.iterdir():
+        if path.suffix != ".lock":
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+async def _serve(
+    config: Path, world: World, devices: Hardware, hours: float, explain: Callable[[], None], typed: IO[str]
+) -> None:  # fmt: skip
+    loop = asyncio.get_running_loop()
+    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
+        bar = progress.add_task("the hours before now", total=hours * 3600.0)
+
+        async def advance(t_s: float) -> None:
+            world.advance_to(t_s)
+            devices.capa.push(1)
+            progress.update(bar, completed=t_s)
+
+        def on_time() -> None:
+            progress.stop()
+            explain()
+            threading.Thread(target=_obey, args=(typed, devices.faults), daemon=True).start()
+
+        clock = LateClock(hours * 3600.0, advance, on_time)
+
+        def ready(daemon: Daemon) -> None:
+            def stop() -> None:
+                daemon.stop()
+                clock.wake()
+
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.add_signal_handler(number, stop)
+
+        await run_service(str(config), clock=clock, on_ready=ready)
+
+
+def _explain(config: Path, port: int) -> None:
+    sys.stdout.write(f"""
+{MACHINE} runs, and its hours before now are on record. An offset goes out every minute. In another terminal:
+  compensator watch --config {config}
+  compensator watch --config {config} --page       a live page
+  python deploy/examples/subscriber.py tcp/127.0.0.1:{port} {PREFIX}
+  compensator hold --config {config}               and: resume, zero, adopt, back
+Type here:  break t_q | at | y    its wire is broken        freeze …    its value stands still
+            unplug t_q | at | y   its device is gone        mend        all is well again
+Ctrl-C ends it.
+""")
+    sys.stdout.flush()
+
+
+def _obey(typed: IO[str], faults: Breakable) -> None:
+    """Do what is typed, until there is no more."""
+    for line in typed:
+        sys.stdout.write(obey(line, faults) + "\n")
+        sys.stdout.flush()
+
+
+def obey(line: str, breakable: Breakable) -> str:
+    """Break a sensor or mend all, as a typed line says, and return what was done.
+
+    Parameters
+    ----------
+    line : str
+        Such as `break t_q`.
+    breakable : mapping of str to (Faults, int)
+        What there is to break, as in `Hardware`.
+    """
+    word, _, name = line.strip().partition(" ")
+    if line.strip() == "mend":
+        for faults, number in breakable.values():
+            faults.clear()
+            faults.clear(input=number)
+        return "all is well again"
+    if name in breakable and (word in INPUT_FAULTS or word == "unplug"):
+        faults, number = breakable[name]
+        if word == "unplug":
+            faults.set(UNPLUG[name])
+        else:
+            faults.set(INPUT_FAULTS[word], input=number)
+        return f"{word} {name}: done; the next sample shows it"
+    words = ", ".join([*INPUT_FAULTS, "unplug"])
+    return f"{line.strip()!r}: expected one of {words} with one of {', '.join(breakable)}; or mend"

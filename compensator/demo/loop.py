@@ -1,0 +1,78 @@
+"""The loop closed: an effect that the calibration never saw, found in the service's own recordings, taken over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from compensator.commands.diagnose import diagnose_files
+from compensator.demo.calibration import PERIOD_S
+from compensator.demo.day import run_day
+from compensator.demo.figures import errors_of
+from compensator.service.model_store import sha256_of
+from sim_hardware.physics import draw_effect
+
+Vector = npt.NDArray[np.float64]
+
+#: About how much the undeclared effect moves Y, µm standard deviation.
+EFFECT_UM = 5.0
+
+
+def close_the_loop(
+    folder: Path, *, hours: float, seed: int
+) -> tuple[dict[str, Any], dict[str, tuple[Vector, Vector]]]:  # fmt: skip
+    """Let an effect act that the calibration never saw, find it in the service's own recordings, and run with it.
+
+    The effect is drawn by the seed and sealed: nothing here knows what it is until the table is written.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Folder of the conduction machine, with its calibration.
+    hours : float
+        Length of each of the two days, h.
+    seed : int
+        Seed of the effect and of the duties.
+
+    Returns
+    -------
+    (dict, dict)
+        What was drawn, what was found, and the error on the second day; that error over time, h and µm.
+    """
+    effect = draw_effect(seed, EFFECT_UM, hours)
+    first = "../calibration/model.toml"
+    before = folder / "with-effect"
+    run_day(before, machine="conduction", hours=hours, seed=seed + 1, model=first, effects=[effect])
+    recordings = sorted((before / "recordings").glob("*.mcap"))
+    found = diagnose_files(recordings, folder / "calibration" / "model.toml", folder / "diagnosis").result
+    # An adequate model is left as it was: there is nothing to take over.
+    adopt = (
+        folder / "diagnosis" / "model.toml"
+        if found["model_sha256"] != sha256_of((folder / "calibration" / "model.toml").read_bytes())
+        else None
+    )
+    days = {
+        name: run_day(folder / f"second-day-{name}", machine="conduction", hours=hours, seed=seed + 2, model=first,
+                      effects=[effect], adopt=model)
+        for name, model in (("first", None), ("extended", adopt))
+    }  # fmt: skip
+    adopted_h = days["extended"].adopted_at * PERIOD_S / 3600.0
+    errors, curves = {}, {}
+    for name, day in days.items():
+        values = errors_of(day)
+        curves[name] = (values["t_h"], values["followed"])
+        judged = values["t_h"] >= adopted_h + values["t_h"][0]
+        errors[name], errors["without"] = values["followed"][judged], values["without"][judged]
+    drawn = effect.reveal().describe()
+    return {
+        "drawn": " ".join(str(drawn[key]) for key in ("kind", "path", "channel") if drawn.get(key)),
+        "found": [" ".join(filter(None, (e["kind"], e["path"], e["channel"]))) for e in found["effects"]],
+        "verdict": found["verdict"], "report": found["report"],
+        "explanation": [e["explanation"] for e in found["effects"]],
+        "held_out_rms_um": {"before": found["before"]["rms_um"], "after": found["after"]["rms_um"]},
+        "adopted_after_h": adopted_h,
+        "second_day_rms_um": {name: float(np.std(values)) for name, values in errors.items()},
+    }, curves  # fmt: skip

@@ -1,0 +1,205 @@
+"""A simulated machine on simulated devices, one for each protocol, and its configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from sim_hardware.physics import PublishedQuill, QuillMachine, World
+from sim_hardware.wire import (
+    CapaNcdt,
+    DconLine,
+    Faults,
+    IcpDas,
+    ModbusRtuLine,
+    ModbusTcpServer,
+    Rack,
+    Register,
+    RegisterMap,
+)
+
+MACHINES = {"conduction": QuillMachine, "published": PublishedQuill}
+POLL_INTERVAL_S = 10.0
+PROBE_RANGE_UM = 500.0
+
+
+class Hardware(NamedTuple):
+    """A simulated machine's devices.
+
+    Parameters
+    ----------
+    lines : dict
+        Addresses of the lines by protocol.
+    capa : CapaNcdt
+        The displacement controller, whose stream the clock drives.
+    faults : dict of str to (Faults, int)
+        What can be made to fail: for each channel the faults of its device, and its input there.
+    """
+
+    lines: dict[str, Any]
+    capa: CapaNcdt
+    faults: dict[str, tuple[Faults, int]]
+
+
+@contextmanager
+def hardware(world: World) -> Iterator[Hardware]:
+    """Put the simulated machine's sensors on simulated devices, one for each protocol.
+
+    Yields
+    ------
+    Hardware
+        The devices; they are there until the block ends.
+    """
+    source = world.source
+    with Rack() as rack:
+        spindle = IcpDas("m-7018r", couples="K", sources={0: source("t_q_degc")})
+        cabinet = IcpDas("et-7018z", couples="T", sources={0: source("at_degc")})
+        rtu = rack.add(ModbusRtuLine({1: spindle}))
+        tcp = rack.add(ModbusTcpServer({1: cabinet}))
+        plc = rack.add(ModbusTcpServer({1: RegisterMap({
+            0: Register(source=source("spindle_rpm")),
+            1: Register(source=source("coolant_degc"), per_unit=100.0),
+        })}))  # fmt: skip
+        dcon = rack.add(DconLine({2: IcpDas("m-7018r", couples="K", sources={0: source("base_degc")})}))
+        capa = rack.add(CapaNcdt({1: lambda: PROBE_RANGE_UM / 2 + source("y_um")()}, PROBE_RANGE_UM))
+        lines = {
+            "rtu": rtu.port, "tcp": tcp.port, "plc": plc.port, "dcon": dcon.port,
+            "data": capa.data_port, "command": capa.command_port,
+        }  # fmt: skip
+        faults = {"t_q": (spindle.faults, 0), "at": (cabinet.faults, 0), "y": (capa.faults, 1)}
+        yield Hardware(lines, capa, faults)
+
+
+def configuration(
+    machine: str, lines: Mapping[str, Any], zenoh_port: int, model: str = "quill", *, prefix: str = "shop/sim"
+) -> str:  # fmt: skip
+    """Write the configuration of the simulated machine, as an engineer would write it."""
+    return f"""# Configuration of a simulated machine.
+[machine]
+name = "{machine}"
+
+[model]
+file = "{model}"
+
+[sampling]
+poll_interval_s = {POLL_INTERVAL_S}
+
+[limits]
+offset_max_um = 200.0
+offset_rate_max_um_per_min = 8.0
+[limits.validity]
+t_q_degc = [10.0, 60.0]
+at_degc = [12.0, 32.0]
+
+[loss]
+predict_for_min = 30.0
+
+[zero]
+rest_rate_um_per_min = 0.2
+
+[guards]
+t_q_below_at_max_k = 2.0
+
+[zenoh]
+prefix = "{prefix}"
+mode = "peer"
+listen = ["tcp/127.0.0.1:{zenoh_port}"]
+
+[recording]
+folder = "recordings"
+
+[[line]]
+name = "rs485"
+protocol = "modbus-rtu"
+port = "{lines["rtu"]}"
+[[line]]
+name = "cabinet"
+protocol = "modbus-tcp"
+host = "127.0.0.1"
+tcp_port = {lines["tcp"]}
+[[line]]
+name = "plc"
+protocol = "modbus-tcp"
+host = "127.0.0.1"
+tcp_port = {lines["plc"]}
+[[line]]
+name = "base-line"
+protocol = "dcon"
+port = "{lines["dcon"]}"
+[[line]]
+name = "probe-line"
+protocol = "capancdt"
+host = "127.0.0.1"
+data_port = {lines["data"]}
+command_port = {lines["command"]}
+
+[[device]]
+name = "spindle-couples"
+line = "rs485"
+model = "icpdas-m7018r"
+address = 1
+format = "hex"
+inputs = [{{ input = 0, couple = "K" }}]
+[[device]]
+name = "cabinet-couples"
+line = "cabinet"
+model = "icpdas-et7018z"
+address = 1
+format = "hex"
+inputs = [{{ input = 0, couple = "T" }}]
+[[device]]
+name = "control"
+line = "plc"
+model = "modbus-map"
+address = 1
+inputs = [
+  {{ input = 0, unit = "rpm", function = 4, address = 0, type = "int16" }},
+  {{ input = 1, unit = "degc", function = 4, address = 1, type = "int16", scale = 0.01 }},
+]
+[[device]]
+name = "base-couples"
+line = "base-line"
+model = "dcon"
+address = 2
+inputs = [{{ input = 0, couple = "K" }}]
+[[device]]
+name = "probe"
+line = "probe-line"
+model = "capancdt-6200"
+inputs = [{{ input = 0 }}]
+
+[[channel]]
+name = "t_q_degc"
+device = "spindle-couples"
+input = 0
+range = [0.0, 80.0]
+rate_max_per_min = 5.0
+stuck_after_min = 120.0
+[[channel]]
+name = "at_degc"
+device = "cabinet-couples"
+input = 0
+range = [5.0, 45.0]
+rate_max_per_min = 2.0
+stuck_after_min = 240.0
+[[channel]]
+name = "y_um"
+device = "probe"
+input = 0
+range = [10.0, 490.0]
+rate_max_per_min = 30.0
+stuck_after_min = 60.0
+[[channel]]
+name = "base_degc"
+device = "base-couples"
+input = 0
+[[channel]]
+name = "spindle_rpm"
+device = "control"
+input = 0
+[[channel]]
+name = "coolant_degc"
+device = "control"
+input = 1
+"""

@@ -1,0 +1,133 @@
+"""A machine to try things on: its day is on record, its sensors break by typing, a second one is refused."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from compensator.cli import main
+from compensator.clock import NS
+from compensator.demo.live import obey
+from compensator.demo.machine import CapaNcdt, configuration, hardware
+from compensator.messages import Offset
+from compensator.recording import read_messages, recordings
+from compensator.service.composition import load, read_once
+from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
+from sim_hardware.wire import Faults
+from tests.cli.test_adopt import free_port
+
+QUILL = Path(__file__).parents[2] / "compensator/model/quill.toml"
+
+
+@contextmanager
+def streaming(capa: CapaNcdt) -> Iterator[None]:
+    """The probe sends what it measures, as it does while the clock of a service goes on."""
+    ended = threading.Event()
+
+    def stream() -> None:
+        while not ended.wait(0.05):
+            capa.push(1)
+
+    thread = threading.Thread(target=stream)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def readings(config: Path) -> list[str]:
+    """The qualities of T_Q, AT and Y as a service would read them now; what its device says where that fails."""
+    loaded, _, _, fleet = load(str(config))
+    answers = asyncio.run(read_once(fleet))
+    found = []
+    for channel in loaded.config.channel[:3]:
+        answer = answers[channel.device]
+        found.append(str(answer[channel.input].quality) if isinstance(answer, dict) else answer.code)
+    return found
+
+
+def test_typing_breaks_a_sensor_and_mends_it(tmp_path: Path) -> None:
+    duty = Duty.working_day(1, hours=1)
+    world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
+    with hardware(world) as (lines, capa, faults), streaming(capa):
+        config = tmp_path / "machine.toml"
+        config.write_text(configuration("vmc-07", lines, 7447), encoding="utf-8")
+        sound = readings(config)
+        assert sound == ["good", "good", "good"]
+        for line, number, expected in (
+            ("break t_q", 0, "open_circuit"), ("unplug at", 1, "device_timeout"), ("break y", 2, "over_range"),
+            ("unplug y", 2, "device_disconnected"),
+        ):  # fmt: skip
+            assert obey(line + "\n", faults).startswith(f"{line}: done")
+            assert readings(config) == [*sound[:number], expected, *sound[number + 1 :]]
+            assert obey("mend\n", faults) == "all is well again"
+            assert readings(config) == sound, line
+
+
+def test_a_value_can_be_made_to_stand_still() -> None:
+    faults = {"t_q": (Faults(), 0)}
+    obey("freeze t_q", faults)
+    assert "frozen" in faults["t_q"][0].of_input(0)
+    obey("mend", faults)
+    assert not faults["t_q"][0].of_input(0)
+
+
+@pytest.mark.parametrize("line", ["break", "break oil", "smash t_q", "", "mend t_q", "unplug t_q now"])
+def test_what_is_mistyped_is_answered_with_what_can_be_typed(line: str) -> None:
+    faults = {name: (Faults(), 0) for name in ("t_q", "at", "y")}
+    assert obey(line, faults).endswith("expected one of break, freeze, unplug with one of t_q, at, y; or mend")
+    assert not any(fault.of_input(0) for fault, _ in faults.values())
+
+
+def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """As its user starts it: an hour on record up to now, a sensor broken by typing, Ctrl-C; the audit is clean."""
+    calibrated = tmp_path / "conduction/calibration"
+    calibrated.mkdir(parents=True)
+    shutil.copy(QUILL, calibrated / "model.toml")
+    command = ["demo", "--live", "--hours", "1", "--out", str(tmp_path), "--port", str(free_port())]
+    folder = tmp_path / "live/recordings"
+    began_ns = time.time_ns()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "compensator", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdin is not None and process.stdout is not None
+        for line in process.stdout:
+            if "Ctrl-C ends it" in line:
+                break
+        process.stdin.write("break t_q\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == "break t_q: done; the next sample shows it\n"
+        assert main(command) == 1, "a second one in the same folder is refused, and leaves alone what is there"
+        assert "held by another service of vmc-07" in capfd.readouterr().err
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=60)
+        assert process.returncode == 0 and f"compensator replay {folder}" in said
+    finally:
+        process.kill()
+        process.wait()
+        process.stdin.close()
+        process.stdout.close()
+    offsets = [
+        msgspec.json.decode(record.data, type=Offset)
+        for path in recordings(folder, "vmc-07") for record in read_messages(path, ("offset",))
+    ]  # fmt: skip
+    assert 59 <= len(offsets) <= 62
+    assert abs(offsets[-1].time_utc_ns - began_ns) < 300 * NS and offsets[-1].state in ("ok", "degraded")
+    steps = {b.time_utc_ns - a.time_utc_ns for a, b in itertools.pairwise(offsets)}
+    assert steps == {60 * NS}, "no gap where the past ends and real time begins"
+    assert main(["replay", str(folder)]) == 0
