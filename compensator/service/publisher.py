@@ -12,6 +12,7 @@ import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import ExitStack
 from typing import Any, Literal, NamedTuple
 
 import zenoh
@@ -114,28 +115,33 @@ class Publisher:
             self._waiting.start()
 
     def _begin(self) -> None:
-        # First of all: nothing may be said or answered in the name of a machine that has its service.
-        with sole_voice(self._settings):
-            session = zenoh.open(session_config(self._settings))
-            token = f"{self._settings.prefix}/thermal/alive"
-            self._declared.append(session.liveliness().declare_token(token))
-        for name in _KEYS:
-            self._publishers[name] = session.declare_publisher(
-                self.key(name),
-                encoding=zenoh.Encoding.APPLICATION_JSON,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=zenoh.Priority.INTERACTIVE_HIGH if name == "offset" else zenoh.Priority.DATA,
-                # Express messages take a packet each, and a router has room for a few packets only: of what a shop of
-                # machines says at one instant it would drop offsets. They save no time that can be measured.
-                express=False,
-            )
-        for name in ("offset", "status", "sample", "estimate"):
-            self._declared.append(session.declare_queryable(self.key(name), self._answer_latest(name)))
-        for name in COMMANDS:
-            for key in (self.key(name), f"{self.key(name)}/*"):
-                self._declared.append(session.declare_queryable(key, self._answer_command(name)))
-        tell_links(session, self._settings.connect)
+        with ExitStack() as half_made:  # whatever fails on the way: nothing of it stays, and all of it is tried again
+            # First of all: nothing may be said or answered in the name of a machine that has its service.
+            with sole_voice(self._settings):
+                session = zenoh.open(session_config(self._settings))
+                half_made.callback(session.close)
+                declared: list[Any] = [session.liveliness().declare_token(f"{self._settings.prefix}/thermal/alive")]
+            publishers = {name: self._publisher(session, name) for name in _KEYS}
+            for name in ("offset", "status", "sample", "estimate"):
+                declared.append(session.declare_queryable(self.key(name), self._answer_latest(name)))
+            for name in COMMANDS:
+                for key in (self.key(name), f"{self.key(name)}/*"):
+                    declared.append(session.declare_queryable(key, self._answer_command(name)))
+            tell_links(session, self._settings.connect)
+            half_made.pop_all()
+        self._publishers, self._declared = publishers, declared
         self._session = session  # last: from here on other threads publish
+
+    def _publisher(self, session: Any, name: str) -> Any:
+        return session.declare_publisher(
+            self.key(name),
+            encoding=zenoh.Encoding.APPLICATION_JSON,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_HIGH if name == "offset" else zenoh.Priority.DATA,
+            # Express messages take a packet each, and a router has room for a few packets only: of what a shop of
+            # machines says at one instant it would drop offsets. They save no time that can be measured.
+            express=False,
+        )
 
     def _begin_later(self) -> None:
         """Try until the router is there, or the service ends."""
