@@ -5,11 +5,14 @@ from __future__ import annotations
 import doctest
 import importlib
 import re
+import typing
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
+from compensator.config import Config
 from compensator.identify.settings import Settings
 from compensator.model.effects import kinds
 from compensator.model.effects.hypothesis import Hypothesis
@@ -143,3 +146,36 @@ def test_the_reader_of_tables_sees_what_is_there_and_what_is_not() -> None:
     text = "| file | what |\n| --- | --- |\n| `a.py`, `b` | x |\n\n| key | what |\n| --- | --- |\n| `c.py` | x |\n"
     assert named_files(text) == ["a.py", "b"]
     assert len(named_files((TOP / "compensator/README.md").read_text(encoding="utf-8"))) > 10
+
+
+# ---------------------------------------------------------------------------- the configuration
+
+
+def test_every_table_and_key_of_the_configuration_is_on_its_page() -> None:
+    rows = re.findall(
+        r"^\| `\[+([\w.]+)\]+`(.*)$", (TOP / "deploy/CONFIGURATION.md").read_text("utf-8"), flags=re.MULTILINE
+    )
+    text = (TOP / "deploy/CONFIGURATION.md").read_text("utf-8")
+    for field in msgspec.structs.fields(Config):
+        if field.name in ("line", "device"):  # what the drivers say of them stands on their page
+            assert f"`[[{field.name}]]`" in text
+            continue
+        table = table_of(field.type)
+        (cells,) = [cells for name, cells in rows if name == field.name]
+        named = set(re.findall(r"`(\w+)`", cells))
+        nested = {f.name: table_of(f.type) for f in msgspec.structs.fields(table) if is_table(f.type)}
+        keys = {f.name for f in msgspec.structs.fields(table)} - set(nested)
+        assert keys <= named, f"[{field.name}]: {sorted(keys - named)}"
+        for name, inner in nested.items():
+            assert f"[{field.name}.{name}]" in text
+            for key in (f.name for f in msgspec.structs.fields(inner)):
+                assert f"`{key}`" in text, f"[{field.name}.{name}]: {key}"
+
+
+def is_table(kind: Any) -> bool:
+    return any(isinstance(c, type) and issubclass(c, msgspec.Struct) for c in (kind, *typing.get_args(kind)))
+
+
+def table_of(kind: Any) -> type[msgspec.Struct]:
+    """The struct that a field holds, alone, in a list, or where it may be left out."""
+    return next(c for c in (kind, *typing.get_args(kind)) if isinstance(c, type) and issubclass(c, msgspec.Struct))
