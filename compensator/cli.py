@@ -101,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (CompensatorError, DriverError, OSError) as error:
         if given.debug:
             raise
-        log.error("compensator: %s", error)
+        log.error("compensator: %s", _in_words(error))
         return getattr(error, "exit_code", 1)
     except KeyboardInterrupt:
         return 130
@@ -116,6 +116,13 @@ def load(command: Command) -> Callable[[argparse.Namespace], Answer | None]:
     module, _, function = command.run.partition(":")
     loaded: Callable[[argparse.Namespace], Answer | None] = getattr(importlib.import_module(module), function)
     return loaded
+
+
+def _in_words(error: Exception) -> str:
+    """Say what went wrong in one line: "FILE: No such file or directory", not "[Errno 2] …"."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename2 or error.filename}: {error.strerror or error}"
+    return str(error)
 
 
 def _parser() -> argparse.ArgumentParser:

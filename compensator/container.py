@@ -218,7 +218,7 @@ class Container:
         if start != MAGIC:
             if MAGIC.startswith(start):
                 raise Torn(self.path, 0)
-            raise DataError(f"{self.path}: not an MCAP file")
+            raise DataError(f"{self.path}: not an MCAP file, expected a recording")
         self._at = len(MAGIC)
         unpack = _HEAD.unpack_from
         contents, channels = self.contents, self.contents.channels

@@ -54,6 +54,7 @@ def export(recording: Path, out: Path, machine: str = "") -> int:
         row["t_s"] = (row.pop("_ns") - start) / 1e9
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     names.sort(key=lambda name: ("time_utc", "t_s", "seq").index(name) if name in ("time_utc", "t_s", "seq") else 3)
+    out.parent.mkdir(parents=True, exist_ok=True)
     with out.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names, restval="", lineterminator="\n")
         writer.writeheader()

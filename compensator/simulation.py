@@ -34,7 +34,7 @@ class Scores:
     peak_to_peak_um: float
 
 
-def simulate(model: ThermalModel, record: Record) -> dict[str, Vector]:
+def simulate(model: ThermalModel, record: Record, *, source: str = "") -> dict[str, Vector]:
     """Run a model over a record.
 
     The first sample with both temperatures is the reference; the deformation, where it was measured, counts
@@ -46,6 +46,8 @@ def simulate(model: ThermalModel, record: Record) -> dict[str, Vector]:
         What to run.
     record : Record
         Needs `t_q_degc` and `at_degc`.
+    source : str
+        Name of the data, for the message.
 
     Returns
     -------
@@ -60,7 +62,7 @@ def simulate(model: ThermalModel, record: Record) -> dict[str, Vector]:
     t_q, at = record.columns["t_q_degc"], record.columns["at_degc"]
     complete = np.flatnonzero(~(np.isnan(t_q) | np.isnan(at)))
     if complete.size == 0:
-        raise DataError("no row has both t_q_degc and at_degc")
+        raise DataError(f"{source or model.name}: no row has both t_q_degc and at_degc, expected one at least")
     first = int(complete[0])
     engine = Engine(model)
     engine.set_reference(float(t_q[first]), float(at[first]))

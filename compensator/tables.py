@@ -23,6 +23,16 @@ ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 SHORT_GAP_SAMPLES = 60
 
 
+#: How files begin that somebody may take for a table, and what to do with them.
+_OTHER_FILES = (
+    (b"PK\x03\x04", "a workbook (XLSX, ODS) or ZIP archive, expected a table; save it as CSV in UTF-8"),
+    (b"\xd0\xcf\x11\xe0", "an old workbook (XLS), expected a table; save it as CSV in UTF-8"),
+    (b"\x1f\x8b", "compressed (gzip), expected a table; unpack it first"),
+    (b"\x89MCAP0\r\n", "a recording by its content, expected a table; name it FILE.mcap"),
+    (b"\xff\xfe", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
+    (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
+)
+
 #: Larger numbers are no measurements, and their powers overflow.
 LARGEST = 1e30
 #: Longest table, in samples of the model: eleven years of minutes.
@@ -147,11 +157,20 @@ def _with_roles(path: Path, columns: dict[str, Vector], roles: Mapping[str, str]
 
 def _read_csv(path: Path) -> tuple[Vector, dict[str, Vector]]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
+        data = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: {error.strerror or error}; expected a table or a recording") from error
+    if not data:
+        raise DataError(f"{path}: the file is empty, expected a header and data")
+    for begin, kind in _OTHER_FILES:
+        if data.startswith(begin):
+            raise DataError(f"{path}: {kind}")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(
+            f"{path}: not UTF-8 text ({error.reason} at byte {error.start}), expected a table: CSV in UTF-8"
+        ) from error
     try:
         rows = list(csv.reader(text.splitlines()))
     except csv.Error as error:
@@ -159,9 +178,13 @@ def _read_csv(path: Path) -> tuple[Vector, dict[str, Vector]]:
     if len(rows) < 2:
         raise DataError(f"{path}: {len(rows)} row(s), expected a header and data")
     header = [name.strip() for name in rows[0]]
-    if len(set(header)) != len(header):
-        raise DataError(f"{path}: the header names a column twice")
+    for name in header:
+        if header.count(name) > 1:
+            raise DataError(f"{path}: the header names column {name!r} twice, expected each name once")
     if "t_s" not in header and "time_utc" not in header:
+        for separator, word in ((";", "semicolons"), ("\t", "tabs")):
+            if rows[0] and separator in rows[0][0]:
+                raise DataError(f"{path}: {word} between its cells, expected commas, and a dot in numbers: 20.5")
         raise DataError(f"{path}: no column t_s or time_utc; the header has: {', '.join(header)[:100]}")
     cells: dict[str, list[float]] = {name: [] for name in header}
     text_columns: set[str] = set()
@@ -263,6 +286,11 @@ def _check_size(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: f
         if large.any():
             row = int(np.argmax(large))
             raise DataError(f"{path}: row {row + 2}: {name} = {values[row]:g}, expected a number below {LARGEST:g}")
+    apart_s = float(np.median(np.abs(np.diff(t_s)))) if t_s.size > 1 else 0.0
+    if apart_s > SHORT_GAP_SAMPLES * period_s:
+        raise DataError(
+            f"{path}: its rows are {apart_s:g} s apart, expected at most {period_s:g} s: is the time in seconds?"
+        )
     samples = float(t_s.max() - t_s.min()) / period_s
     if samples > MOST_SAMPLES:
         row = int(np.argmax(np.abs(t_s - np.median(t_s)))) + 2

@@ -12,16 +12,20 @@ from pathlib import Path
 from compensator import __version__
 from compensator.commands import Answer
 from compensator.commands.identify import progress, read_runs
+from compensator.commands.outputs import checked_folder
 from compensator.commands.workers import workers
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.outcome import FOLDS, Diagnosis
 from compensator.diagnose.summary import figures, text
+from compensator.identify.screening import screen_temperatures
 from compensator.model.model_file import load_model
 from compensator.model.model_writer import write_model
 from compensator.report.diagnosis import write_report
 from compensator.report.formats import checked
 from compensator.tables import roles_of
 
+#: What is written into the folder.
+FILES = ("model.toml", "diagnosis.json", "report.html")
 #: So few values are searched in this process; starting others takes as long.
 ALONE = 30_000
 
@@ -46,9 +50,12 @@ def diagnose_files(
     also: Path | None = None,
 ) -> Answer:  # fmt: skip
     """Diagnose files and write `diagnosis.json`, `model.toml` and `report.html` into a folder."""
+    checked_folder(out, "--out", read=(*data, Path(model)), names=FILES)
     base = load_model(model)
     remarks: list[str] = []
     runs = read_runs(data, roles_of(columns), remarks, period_s=base.period_s)
+    names = ", ".join(dict.fromkeys(run.name for run in runs))
+    screen_temperatures(names, runs, quiet_air=True)
     values = sum(run.t_s.size * (len(run.channels) + 2) for run in runs)
     with progress("searching") as told, workers(FOLDS if values > ALONE else 1, scheduler) as executor:
         diagnosis = diagnose(base, runs, told=told, mapped=executor.map if executor else map)

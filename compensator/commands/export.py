@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from compensator.commands import Answer
+from compensator.commands.outputs import checked_file
 from compensator.export import export
 
 
@@ -14,7 +15,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     Raises
     ------
     CompensatorError
-        If the recording cannot be read.
+        If the recording cannot be read, or the table cannot be written there.
     """
-    samples = export(arguments.recording, arguments.out, arguments.machine)
-    return Answer({"samples": samples, "out": str(arguments.out)}, f"{samples} samples → {arguments.out}")
+    out = checked_file(arguments.out, "--out", read=(arguments.recording,), ending=".csv")
+    samples = export(arguments.recording, out, arguments.machine)
+    return Answer({"samples": samples, "out": str(out)}, f"{samples} samples → {out}")

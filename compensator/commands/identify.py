@@ -11,20 +11,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from compensator import __version__
 from compensator.commands import Answer
+from compensator.commands.outputs import checked_file
 from compensator.commands.progress import progress
-from compensator.errors import UsageError
+from compensator.errors import DataError, UsageError
 from compensator.identify.calibration import Calibration, calibrate
 from compensator.identify.comparison import Row, compare
 from compensator.identify.criticism import Criticism, criticise
-from compensator.identify.runs import Run, runs_of
+from compensator.identify.runs import SHORTEST_RUN, Run, runs_of
+from compensator.identify.screening import screen_temperatures
 from compensator.identify.settings import Settings
 from compensator.identify.summary import figures, text
-from compensator.model.model_file import load_model
+from compensator.model.model_file import BUILT_IN, load_model
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.tables import load_data, load_recordings, require, roles_of
+from compensator.tables import Data, load_data, load_recordings, require, roles_of
 
 #: `progress` is used from here by the other commands, too.
 __all__ = ["Request", "finished", "identify", "progress", "provenance", "read_runs", "run", "write"]
@@ -76,6 +80,9 @@ class Request:
         for path in self.validate:
             if path.resolve() in taken:
                 raise UsageError(f"--validate {path}: takes part in the fit, expected a run that does not")
+        if str(self.out) in BUILT_IN:
+            raise UsageError(f"--out {self.out}: is the name of the published model, expected one that ends in .toml")
+        checked_file(self.out, "--out", read=(*self.data, *self.etve, *self.validate), ending=".toml")
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -112,6 +119,8 @@ def identify(request: Request) -> Answer:
     remarks: list[str] = []
     runs = read_runs(request.data, roles, remarks)
     etve, validation = (read_runs(paths, roles, remarks) for paths in (request.etve, request.validate))
+    for run in validation:
+        screen_temperatures(run.name, [run], quiet_air=True)
     with progress("fitting") as told:
         calibration = calibrate(
             runs, request.settings, period_s=PERIOD_S, name=request.name, etve=etve, validation=validation,
@@ -173,7 +182,22 @@ def read_runs(
             for one, said in runs_of(path.name, record):
                 runs.append(one)
                 remarks += said
+    if not runs and tables:
+        raise DataError(_without_runs(*tables[0], period_s))
     return runs
+
+
+def _without_runs(path: Path, data: Data, period_s: float) -> str:
+    """Say why a file holds nothing to work with."""
+    size = sum(record.t_s.size for record in data.records)
+    for name in ("t_q_degc", "at_degc", "heat_w"):
+        missing = sum(int(np.isnan(r.columns[name]).sum()) for r in data.records if name in r.columns)
+        if missing > size // 2:
+            return f"{path}: {name} is missing in {missing} of {size} samples, expected it in most of them"
+    return (
+        f"{path}: {size * period_s / 60.0:.0f} min of data in {len(data.records)} part(s), expected at least one of "
+        f"{SHORTEST_RUN * period_s / 60.0:.0f} min without a long gap, and 120 min in all for a model"
+    )
 
 
 def provenance(request: Request) -> dict[str, Any]:

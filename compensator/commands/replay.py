@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
 from compensator.commands import Answer
+from compensator.commands.outputs import checked_file
 from compensator.commands.progress import progress
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
@@ -41,6 +42,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.model is not None:
         if arguments.public_key is not None:
             raise UsageError("--public-key: belongs to the audit, which --model does not make")
+        if arguments.out is not None:
+            checked_file(arguments.out, "--out", read=(*paths, Path(arguments.model)), ending=".csv")
         return _compare(paths, arguments.model, arguments.out, page)
     if arguments.out is not None:
         raise UsageError("--out: is for --model, which is not given")

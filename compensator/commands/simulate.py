@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from compensator.commands import Answer
+from compensator.commands.outputs import checked_file
 from compensator.model.model_file import load_model
 from compensator.simulation import csv_rows, scores, simulate
 from compensator.tables import load_data, require, roles_of
@@ -27,22 +29,24 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the data or the model cannot be read.
     """
+    out = checked_file(arguments.out, "--out", read=(arguments.data, Path(arguments.model)), ending=".csv")
     model = load_model(arguments.model)
     data = load_data(arguments.data, model.period_s, roles_of(arguments.column))
     for remark in data.remarks:
         log.warning("%s", remark)
     for record in data.records:
         require(arguments.data, record, ("t_q_degc", "at_degc"))
-    parts = [simulate(model, record) for record in data.records]
+    parts = [simulate(model, record, source=str(arguments.data)) for record in data.records]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    with arguments.out.open("w", newline="", encoding="utf-8") as file:
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with out.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(csv_rows(columns, COLUMNS))
     result: dict[str, Any] = {
         "samples": int(columns["t_s"].size),
         "records": len(parts),
-        "out": str(arguments.out),
+        "out": str(out),
     }
-    text = f"{result['samples']} samples in {len(parts)} record(s) → {arguments.out}"
+    text = f"{result['samples']} samples in {len(parts)} record(s) → {out}"
     if "y_um" in columns:
         score = scores(columns["y_um"], columns["y_pred_um"])
         result |= {"fit_pct": score.fit_pct, "rms_um": score.rms_um, "peak_to_peak_um": score.peak_to_peak_um}

@@ -215,7 +215,8 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     residual = np.concatenate(parts)
     used = np.isfinite(residual)
     if used.sum() < 60:
-        raise DataError(f"{int(used.sum())} samples with y_um, expected at least 60")
+        names = ", ".join(dict.fromkeys(run.name for run in runs))
+        raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
     noise_um = noise_floor(model, runs)
     folds = model.provenance.get("folds_rms_um", 0.0)
     own = float(np.sqrt(max(float(folds) ** 2 - noise_um**2, 0.0))) if isinstance(folds, float) else 0.0

@@ -22,6 +22,14 @@ HOTTEST_AIR_DEGC = 50.0
 MACHINE_DEGC = (-30.0, 150.0)
 #: Deformations of a machine tool's spindle lie in here, peak to peak, µm.
 DEFORMATION_UM = (0.5, 3000.0)
+#: Beyond these no thermocouple at a machine shows a temperature, °C.
+POSSIBLE_DEGC = (-273.15, 1500.0)
+#: Shortest stretch of one and the same value by which a sensor that is never still otherwise counts as dead, samples.
+DEAD_SAMPLES = 60
+#: Share of its steps that such a sensor's noise turns round, and share in which its value stays, outside the stretch.
+LIVELY_TURNS, LIVELY_STILL = 0.08, 0.05
+#: T_Q − AT that falls with the heat by more than this correlation: the two are exchanged.
+EXCHANGED_CORRELATION = -0.3
 #: A signal whose standard deviation is less than this times its noise's holds nothing else.
 NOISE_ALONE = 1.5
 #: K per W at rest of anything that is a spindle; a thousandfold beyond is a wrong unit.
@@ -53,26 +61,87 @@ def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool,
             f"{name}: {minutes:.0f} min of complete samples, expected at least {SHORTEST_MIN:.0f} min "
             "(and better three times the slowest time constant)"
         )
-    for label, values in (
-        ("t_q_degc", _joined(run.t_q_degc for run in runs)),
-        ("at_degc", _joined(run.at_degc for run in runs)),
-    ):
-        _check_temperature(name, label, values)
-    _check_pair(name, _joined(run.t_q_degc for run in runs), _joined(run.at_degc for run in runs))
+    screen_temperatures(name, runs)
+    for run in runs:
+        _check_alive(run, "y_um", run.y_um)
     if needs_y:
         _check_deformation(name, _joined(run.y_um for run in runs))
     if needs_heat:
         _check_heat(name, runs)
 
 
+def screen_temperatures(name: str, runs: Sequence[Run], *, quiet_air: bool = False) -> None:
+    """Refuse temperatures that cannot be right.
+
+    Parameters
+    ----------
+    name : str
+        File or files, for the message.
+    runs : sequence of Run
+        What they hold.
+    quiet_air : bool
+        Whether an ambient that never moves is let pass: nothing is fitted to it.
+
+    Raises
+    ------
+    DataError
+        A dead sensor, fault codes among the values, another unit, or one sensor twice.
+    """
+    columns = {"t_q_degc": [run.t_q_degc for run in runs], "at_degc": [run.at_degc for run in runs]}
+    for column, parts in columns.items():
+        for run, values in zip(runs, parts, strict=True):
+            _check_possible(run, column, values)
+        _check_temperature(name, column, _joined(parts), still=quiet_air and column == "at_degc")
+        for run, values in zip(runs, parts, strict=True):
+            _check_alive(run, column, values)
+    _check_pair(name, _joined(columns["t_q_degc"]), _joined(columns["at_degc"]))
+
+
+def _check_possible(run: Run, column: str, values: Vector) -> None:
+    """Refuse numbers that stand for a fault, such as −9999, among temperatures."""
+    low, high = POSSIBLE_DEGC
+    wrong = (values < low) | (values > high)
+    if wrong.any() and wrong.mean() < MISSING_SHARE:
+        at = int(np.argmax(wrong))
+        raise DataError(
+            f"{run.name}: {column} = {values[at]:g} at t_s = {run.t_s[at]:g}, {int(wrong.sum())} sample(s) like it: a "
+            "fault's code? expected °C, and an empty cell where a value is missing"
+        )
+
+
+def _check_alive(run: Run, column: str, values: Vector) -> None:
+    """Refuse a sensor that shows noise in every sample and then one and the same value for an hour and more."""
+    steps = np.diff(values)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], (steps == 0.0).astype(int), [0]))))
+    if edges.size == 0:
+        return
+    starts, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - starts))
+    first, last = int(starts[longest]), int(ends[longest])
+    others = np.concatenate((steps[:first], steps[last:]))
+    others = others[np.isfinite(others)]
+    # A rest before anything happens is the same in every sample where the data comes from a calculation.
+    if first == 0 or last - first < DEAD_SAMPLES or others.size < DEAD_SAMPLES:
+        return
+    turns = float(np.mean(others[1:] * others[:-1] < 0.0))
+    if turns > LIVELY_TURNS and float(np.mean(others == 0.0)) < LIVELY_STILL:
+        raise DataError(
+            f"{run.name}: {column} = {values[first]:g} in every sample from t_s = {run.t_s[first]:g} to "
+            f"{run.t_s[last]:g}, and never still otherwise: a dead sensor? leave its cells empty there"
+        )
+
+
 def _joined(parts: object) -> Vector:
     return np.concatenate([np.asarray(part) for part in parts])  # type: ignore[attr-defined]
 
 
-def _check_temperature(name: str, column: str, values: Vector) -> None:
+def _check_temperature(name: str, column: str, values: Vector, *, still: bool) -> None:
     middle = float(np.median(values))
-    if np.ptp(values) == 0.0:
-        raise DataError(f"{name}: {column} = {middle:g} in every row: a dead sensor, or a column of another meaning")
+    if np.ptp(values) == 0.0 and not still:
+        raise DataError(
+            f"{name}: {column} = {middle:g} in every row: a dead sensor, or a column of another meaning; expected a "
+            f"temperature that moves. Name the right one with --column {column}=NAME"
+        )
     low, high = float(values.min()), float(values.max())
     air = column == "at_degc"
     if low >= 250.0 and high <= 420.0:
@@ -84,7 +153,7 @@ def _check_temperature(name: str, column: str, values: Vector) -> None:
             f"{name}: {column} is {middle:.1f} in the middle: °F (that would be {(middle - 32) / 1.8:.1f} °C)? "
             "expected an ambient in °C"
         )
-    if air and np.ptp(values) < 0.2 and abs(middle) < 0.2:
+    if air and 0.0 < np.ptp(values) < 0.2 and abs(middle) < 0.2:
         raise DataError(f"{name}: {column} is {middle:.4g} in the middle: thousands of degrees? expected °C")
     if not MACHINE_DEGC[0] <= middle <= MACHINE_DEGC[1]:
         raise DataError(f"{name}: {column} is {middle:.1f} in the middle, expected °C from {MACHINE_DEGC[0]:g} to "
@@ -141,6 +210,9 @@ def _check_heat(name: str, runs: Sequence[Run]) -> None:
     if ratio < low:
         raise DataError(f"{name}: heat_w spans {np.ptp(heat):.4g} while T_Q - AT spans {np.ptp(difference):.3g} K: "
                         "milliwatts? expected W")  # fmt: skip
+    if np.ptp(difference) > 0.0 and float(np.corrcoef(difference, heat)[0, 1]) < EXCHANGED_CORRELATION:
+        raise DataError(f"{name}: T_Q - AT falls while heat_w rises: T_Q and AT exchanged? expected T_Q near the heat "
+                        "source; --column t_q_degc=at_degc --column at_degc=t_q_degc exchanges them")  # fmt: skip
     if float(np.std(difference)) < NOISE_ALONE * noise_std(difference):
         raise DataError(f"{name}: T_Q - AT moves by {np.ptp(difference):.2g} K while the heat changes by "
                         f"{np.ptp(heat):.3g} W: is t_q_degc near the heat source?")  # fmt: skip

@@ -5,7 +5,7 @@ import pytest
 
 from compensator.errors import DataError
 from compensator.identify.runs import noise_std, runs_of, without_wild
-from compensator.identify.screening import screen
+from compensator.identify.screening import screen, screen_temperatures
 from compensator.tables import Record
 from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
 
@@ -39,6 +39,10 @@ def spoil(name):
         "y missing": lambda: c["y_um"].__setitem__(slice(0, 500), np.nan),
         "one sensor twice": lambda: c.update(t_q_degc=c["at_degc"]),
         "y is noise": lambda: c.update(y_um=np.random.default_rng(0).normal(0, 0.5, 720)),
+        "T_Q dead from 400 on": lambda: c["t_q_degc"].__setitem__(slice(400, None), c["t_q_degc"][400]),
+        "y dead for two hours": lambda: c["y_um"].__setitem__(slice(400, 520), c["y_um"][400]),
+        "a fault's code": lambda: c["at_degc"].__setitem__(slice(300, 330), -9999.0),
+        "T_Q and AT exchanged": lambda: c.update(t_q_degc=c["at_degc"], at_degc=c["t_q_degc"]),
         "T_Q far away": lambda: c.update(t_q_degc=c["at_degc"] + np.random.default_rng(1).normal(0, 0.1, 720)),
     }  # fmt: skip
     change[name]()
@@ -53,7 +57,9 @@ def spoil(name):
         ("heat in kW", "kilowatts"), ("heat in mW", "milliwatts"), ("AT in F", "°F"), ("both in F", "°F"),
         ("T_Q in F", "°F"), ("kelvin", "kelvin"), ("millidegrees", "thousandths"), ("kilodegrees", "thousands"),
         ("y missing", "y_um is missing"), ("one sensor twice", "the same in every row"), ("y is noise", "noise"),
-        ("T_Q far away", "near the heat source"),
+        ("T_Q far away", "near the heat source"), ("T_Q dead from 400 on", "from t_s = 24000 to 43140"),
+        ("y dead for two hours", "y_um = .* in every sample from t_s = 24000 to 31140"),
+        ("a fault's code", "at_degc = -9999 at t_s = 18000, 30 sample"), ("T_Q and AT exchanged", "exchanged"),
     ],
 )  # fmt: skip
 def test_bad_data(name, words):
@@ -68,6 +74,22 @@ def test_too_short():
 
 def test_good_data_passes():
     screen("good.csv", runs_from(columns()), 60.0, needs_heat=True)
+
+
+def test_a_rest_without_noise_or_of_a_coarse_converter_is_no_dead_sensor():
+    c = columns()
+    quiet = np.concatenate((np.full(120, 21.0), 21.0 + 2.0 * np.sin(np.arange(600) / 200.0)))
+    warm = np.concatenate((np.zeros(120), 15.0 * (1.0 - np.exp(-np.arange(600) / 90.0))))
+    screen_temperatures("quiet.csv", runs_from(c | {"at_degc": quiet, "t_q_degc": quiet + warm}))
+    coarse = np.round((c["at_degc"] - 21.0) * 0.2 + 21.0, 1)
+    screen_temperatures("coarse.csv", runs_from(c | {"at_degc": coarse}))
+
+
+def test_an_ambient_that_never_moves_is_let_pass_where_nothing_is_fitted_to_it():
+    runs = runs_from(columns() | {"at_degc": np.full(720, 21.0)})
+    screen_temperatures("quiet.csv", runs, quiet_air=True)
+    with pytest.raises(DataError, match="at_degc = 21 in every row"):
+        screen_temperatures("quiet.csv", runs)
 
 
 def test_a_short_gap_is_bridged_and_a_long_one_splits():

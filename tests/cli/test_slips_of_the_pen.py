@@ -1,0 +1,126 @@
+"""Slips of the pen on the command line: one line that says what to do, and nothing that was read is written over."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensator.cli import main
+
+HEADER = "t_s,t_q_degc,at_degc,y_um,heat_w\n"
+
+
+def table(path: Path, minutes: int = 200) -> Path:
+    rng = np.random.default_rng(0)
+    rows = (f"{60 * i},{20 + i % 7 + rng.normal():.4f},{20 + rng.normal():.4f},{i % 5},{i % 2}" for i in range(minutes))
+    path.write_text(HEADER + "\n".join(rows) + "\n")
+    return path
+
+
+def refused(capsys: pytest.CaptureFixture[str], words: list[str], *expected: str) -> None:
+    assert main(words) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1, captured.err
+    for one in expected:
+        assert one in captured.err
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"PK\x03\x04rest", "workbook"), (b"\xd0\xcf\x11\xe0rest", "XLS"), (b"\x89MCAP0\r\n", "name it FILE.mcap"),
+        (HEADER.encode("utf-16"), "UTF-16"), (b"\x1f\x8brest", "gzip"), (b"\x7fELF\xff", "expected a table"),
+        (b"", "empty"), (b"t_s;t_q_degc;at_degc\n0;20,1;20,1\n", "semicolons"), (b"t_s\tt_q_degc\n0\t20\n", "tabs"),
+        (b"t_s,at_degc,at_degc\n0,1,2\n", "'at_degc' twice"),
+        (b"t_s,t_q_degc,at_degc\n0,20,20\n60000,21,20\n120000,21,20\n", "in seconds?"),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_table_says_what_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes, expected: str
+) -> None:
+    (tmp_path / "run.csv").write_bytes(content)
+    out = tmp_path / "out.csv"
+    refused(capsys, ["simulate", str(tmp_path / "run.csv"), "--model", "quill", "--out", str(out)], "run.csv", expected)
+    assert not out.exists()
+
+
+def test_what_is_read_is_never_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, model = table(tmp_path / "run.csv"), tmp_path / "model.toml"
+    model.write_text("the only copy")
+    recording = tmp_path / "day.mcap"
+    recording.write_bytes(b"evidence")
+    there = "would be written over"
+    refused(capsys, ["simulate", str(run), "--model", "quill", "--out", str(run)], there)
+    refused(capsys, ["simulate", str(run), "--model", str(model), "--out", str(model)], there)
+    refused(capsys, ["export", str(recording), "--out", str(recording)], there)
+    refused(capsys, ["export", str(tmp_path / "other.mcap"), "--out", str(recording)], "expected a name that ends in")
+    refused(capsys, ["replay", str(recording), "--model", "quill", "--out", str(recording)], there)
+    refused(capsys, ["identify", str(run), "--out", str(run)], there)
+    refused(capsys, ["identify", str(recording), "--validate", str(model), "--out", str(model)], there)
+    refused(capsys, ["diagnose", str(run), "--model", str(model), "--out", str(tmp_path)], "another folder")
+    assert (model.read_text(), recording.read_bytes()) == ("the only copy", b"evidence")
+    assert run.read_text().startswith(HEADER)
+
+
+def test_where_nothing_can_be_written_is_said_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The data is not there either: what is said first shows what was looked at first.
+    run, file, folder = str(tmp_path / "absent.csv"), tmp_path / "file", tmp_path / "folder"
+    file.write_text("")
+    folder.mkdir()
+    refused(capsys, ["simulate", run, "--model", "quill", "--out", str(folder)], "is a folder")
+    refused(capsys, ["simulate", run, "--model", "quill", "--out", str(file / "o.csv")], "is a file, expected a folder")
+    refused(capsys, ["export", run, "--out", str(folder)], "is a folder")
+    refused(capsys, ["identify", run, "--out", str(folder)], "is a folder")
+    refused(capsys, ["identify", run, "--out", str(tmp_path / "model.csv")], "ends in .toml")
+    refused(capsys, ["identify", run, "--out", "quill"], "published model")
+    refused(capsys, ["diagnose", run, "--model", "quill", "--out", str(file)], "is a file, expected a folder")
+
+
+def test_a_folder_without_permission(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Whoever runs the tests may be allowed everything.
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tmp_path)
+    words = ["simulate", str(tmp_path / "run.csv"), "--model", "quill", "--out", str(tmp_path / "new" / "o.csv")]
+    refused(capsys, words, f"no permission to write in {tmp_path}")
+
+
+def test_data_without_anything_to_work_with_names_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short, out = table(tmp_path / "short.csv", 20), str(tmp_path / "new" / "m.toml")
+    refused(capsys, ["identify", str(short), "--out", out], "short.csv: 20 min of data")
+    refused(capsys, ["diagnose", str(short), "--model", "quill", "--out", str(tmp_path / "d")], "short.csv: 20 min")
+    some = table(tmp_path / "some.csv", 45)
+    refused(capsys, ["diagnose", str(some), "--model", "quill", "--out", str(tmp_path / "d")], "some.csv: 45 samples")
+    lines = table(tmp_path / "without.csv").read_text().splitlines()
+    without = [lines[0], *(",".join([row.split(",")[0], "", *row.split(",")[2:]]) for row in lines[1:])]
+    (tmp_path / "without.csv").write_text("\n".join(without))
+    refused(capsys, ["identify", str(tmp_path / "without.csv"), "--out", out], "t_q_degc is missing in 200 of 200")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["short.csv", "some.csv", "without.csv"]
+
+
+@pytest.mark.parametrize("command", ["diagnose", "identify"])
+def test_a_dead_sensor_makes_no_finding_and_judges_no_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    run, dead = table(tmp_path / "run.csv"), tmp_path / "dead.csv"
+    rows = [row.split(",") for row in run.read_text().splitlines()]
+    dead.write_text("\n".join(",".join([row[0], "20.0" if i else row[1], *row[2:]]) for i, row in enumerate(rows)))
+    words = {
+        "diagnose": ["diagnose", str(dead), "--model", "quill", "--out", str(tmp_path / "d")],
+        "identify": ["identify", str(run), "--validate", str(dead), "--out", str(tmp_path / "m.toml")],
+    }
+    refused(capsys, words[command], "dead.csv: t_q_degc = 20 in every row: a dead sensor")
+
+
+def test_an_error_of_the_system_is_told_without_its_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device", str(tmp_path / "o.csv"))
+
+    monkeypatch.setattr("compensator.commands.export.export", full)
+    assert main(["export", str(tmp_path / "day.mcap"), "--out", str(tmp_path / "o.csv")]) == 1
+    assert capsys.readouterr().err == f"compensator: {tmp_path / 'o.csv'}: No space left on device\n"
