@@ -14,23 +14,18 @@ Data replies carry no address, so a late one could pass for another module's. Wh
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
-from typing import TypeVar
 
-from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, DriverError
-from drivers.lines.patience import Patience
+from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout
 from drivers.lines.serial_port import PortLostError, SerialPort
 from drivers.lines.settings import SerialLine
+from drivers.lines.shared_line import Place, SharedLine
 from drivers.protocols.dcon import BadTextError, Reply, command, reply
 
-ResultT = TypeVar("ResultT")
-
-QUIET_S = 0.02
 # Longer than any module or converter holds a reply back, s.
 LOOSE_S = 10.0
 
 
-class DconMember:
+class DconMember(Place):
     """One module's place on a line.
 
     Parameters
@@ -45,15 +40,11 @@ class DconMember:
         Whether commands and replies carry one.
     """
 
+    line: DconLine
+
     def __init__(self, line: DconLine, name: str, address: int, *, with_checksum: bool) -> None:
-        self.line = line
-        self.name = name
-        self.address = address
+        super().__init__(line, name, address)
         self.with_checksum = with_checksum
-        self.patience = Patience(line.timeout_s)
-        self.unsettled = False
-        self.settlings = 0
-        self.closed = False
 
     async def ask(self, text: str) -> str:
         """Send a `$AA…` or `@AA…` command; return the reply after its address. Only within `serve`."""
@@ -63,22 +54,8 @@ class DconMember:
         """Send a command whose reply is data; return them. Only within `serve`."""
         return await self.line.data(self, f"{text[0]}{self.address:02X}{text[1:]}")
 
-    async def serve(self, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
-        """Run a job of commands with the line to itself; see `DconLine.serve`."""
-        return await self.line.serve(self, job)
 
-    @property
-    def generation(self) -> tuple[int, int]:
-        """Openings and settlings so far; after others the module may be another one."""
-        return self.line.generation, self.settlings
-
-    async def close(self) -> None:
-        """Leave the line; the last one closes it."""
-        self.closed = True
-        self.line.left()
-
-
-class DconLine:
+class DconLine(SharedLine[DconMember]):
     """One serial port and the modules on it.
 
     Parameters
@@ -88,11 +65,8 @@ class DconLine:
     """
 
     def __init__(self, about: SerialLine) -> None:
+        super().__init__(about.timeout_s)
         self.about = about
-        self.timeout_s = about.timeout_s
-        self.generation = 0
-        self._members: list[DconMember] = []
-        self._lock = asyncio.Lock()
         self._port: SerialPort | None = None
         # When a data reply that is still missing may come no more, by address.
         self._loose_until_s: dict[int, float] = {}
@@ -100,13 +74,8 @@ class DconLine:
     def join(self, name: str, address: int, *, with_checksum: bool) -> DconMember:
         """Give a module its place."""
         member = DconMember(self, name, address, with_checksum=with_checksum)
-        self._members.append(member)
+        self._places.append(member)
         return member
-
-    def left(self) -> None:
-        """Close the port when nobody is left."""
-        if all(member.closed for member in self._members):
-            self.close()
 
     def close(self) -> None:
         """Close the port; a waiting command fails at once."""
@@ -114,40 +83,10 @@ class DconLine:
             self._port.close()
             self._port = None
 
-    async def serve(self, member: DconMember, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
-        """Run a job of commands of one module, with the line to itself.
+    def _heard_at_s(self) -> float | None:
+        return self._port.heard_at_s if self._port is not None else None
 
-        The time limit, twice the line's, runs from when the module gets the line.
-
-        Raises
-        ------
-        DriverError
-            Naming the device.
-        """
-        loop = asyncio.get_running_loop()
-        if (hold_s := member.patience.hold_s(loop.time())) > 0.0:
-            text = f"silent {member.patience.failures} times, next try in {hold_s:.1f} s"
-            raise DeviceTimeout(member.name, text)
-        async with self._lock:
-            try:
-                async with asyncio.timeout(2.0 * self.timeout_s):
-                    self._open(member)
-                    await self._settle(member)
-                    result = await job()
-            except TimeoutError:
-                member.patience.failed(loop.time())
-                raise DeviceTimeout(member.name, f"not done within {2.0 * self.timeout_s} s") from None
-            except (DeviceTimeout, DeviceGarbled):
-                member.patience.failed(loop.time())
-                raise
-            except DriverError:
-                member.patience.succeeded()
-                raise
-        member.patience.succeeded()
-        return result
-
-    def _open(self, member: DconMember) -> None:
-        """Open the port if it is not open."""
+    async def _open(self, member: DconMember) -> None:
         if member.closed:
             raise DeviceDisconnected(member.name, "is closed")
         if self._port is not None and not self._port.lost:
@@ -159,16 +98,7 @@ class DconLine:
         self.generation += 1
 
     async def _settle(self, member: DconMember) -> None:
-        """Make sure that no late reply of this module is left on the line."""
-        if not member.unsettled:
-            return
-        loop = asyncio.get_running_loop()
-        give_up_s = loop.time() + self.timeout_s / 2.0
-        while self._port is not None and loop.time() < give_up_s:
-            quiet_s = loop.time() - self._port.heard_at_s
-            if quiet_s >= QUIET_S:
-                break
-            await asyncio.sleep(QUIET_S - quiet_s)
+        await self._be_quiet()
         await self.ask(member, f"${member.address:02X}M", "!")
         member.unsettled = False
         member.settlings += 1

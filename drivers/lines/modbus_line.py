@@ -16,21 +16,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable
-from typing import TypeVar
 
 from pymodbus.pdu import ModbusPDU
 
-from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, DriverError
+from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout
 from drivers.lines.modbus_wire import LostError, ModbusWire, RefusalError
 from drivers.lines.patience import Patience
 from drivers.lines.settings import SerialLine, TcpLine
+from drivers.lines.shared_line import Place, SharedLine
 from drivers.protocols.modbus import Request, WrongAnswerError, exception_text
 
-ResultT = TypeVar("ResultT")
-
-# Silence after which a serial line counts as quiet, s. Adapters deliver in pieces up to 16 ms apart.
-QUIET_S = 0.02
 # A TCP connection that brings nothing this many times in a row is made anew: its other end may be long gone.
 MOST_SILENCES = 2
 
@@ -43,7 +38,7 @@ class ModbusRefused(DeviceRefused):
         self.exception_code = exception_code
 
 
-class Member:
+class Member(Place):
     """One device's place on a line.
 
     Parameters
@@ -58,15 +53,11 @@ class Member:
         Request whose answer can be taken for no other of this device.
     """
 
+    line: ModbusLine
+
     def __init__(self, line: ModbusLine, name: str, address: int, fence: Request) -> None:
-        self.line = line
-        self.name = name
-        self.address = address
+        super().__init__(line, name, address)
         self.fence = fence
-        self.patience = Patience(line.timeout_s)
-        self.unsettled = False
-        self.settlings = 0
-        self.closed = False
 
     async def registers(self, request: Request) -> list[int]:
         """Read registers as unsigned words. Only within `serve`."""
@@ -83,22 +74,8 @@ class Member:
             raise DeviceGarbled(self.name, f"asked {request}, got {len(answer.bits)} bits")
         return list(answer.bits[: request.count])
 
-    async def serve(self, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
-        """Run a job of requests with the line to itself; see `ModbusLine.serve`."""
-        return await self.line.serve(self, job)
 
-    @property
-    def generation(self) -> tuple[int, int]:
-        """Connections and settlings so far; after others the device may be another one."""
-        return self.line.generation, self.settlings
-
-    async def close(self) -> None:
-        """Leave the line; the last one closes it."""
-        self.closed = True
-        self.line.left()
-
-
-class ModbusLine:
+class ModbusLine(SharedLine[Member]):
     """One Modbus connection and the devices on it.
 
     Parameters
@@ -108,13 +85,10 @@ class ModbusLine:
     """
 
     def __init__(self, about: SerialLine | TcpLine) -> None:
+        super().__init__(about.timeout_s)
         self.about = about
-        self.timeout_s = about.timeout_s
-        self.generation = 0
         self._where = about.port if isinstance(about, SerialLine) else f"{about.host}:{about.tcp_port}"
         self._numbered = about.protocol == "modbus-tcp"
-        self._members: list[Member] = []
-        self._lock = asyncio.Lock()
         self._wire: ModbusWire | None = None
         self._patience = Patience(about.timeout_s)
         self._no_host_since_s = 0.0
@@ -123,13 +97,8 @@ class ModbusLine:
     def join(self, name: str, address: int, fence: Request) -> Member:
         """Give a device its place."""
         member = Member(self, name, address, fence)
-        self._members.append(member)
+        self._places.append(member)
         return member
-
-    def left(self) -> None:
-        """Close the connection when nobody is left."""
-        if all(member.closed for member in self._members):
-            self.close()
 
     def close(self) -> None:
         """Close the connection; a waiting request fails at once."""
@@ -137,56 +106,17 @@ class ModbusLine:
             self._wire.close()
             self._wire = None
 
-    async def serve(self, member: Member, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
-        """Run a job of requests of one device, with the line to itself.
+    def _patiences(self, member: Member) -> list[Patience]:
+        return [member.patience, self._patience]
 
-        The time limit, twice the line's, runs from when the device gets the line.
+    def _check_turn(self, member: Member, asked_at_s: float) -> None:
+        if self._no_host_since_s > asked_at_s:
+            raise DeviceTimeout(member.name, f"no connection to {self._where} within {self.timeout_s} s")
 
-        Raises
-        ------
-        DriverError
-            Naming the device.
-        """
-        loop = asyncio.get_running_loop()
-        self._check_patience(member, loop.time())
-        asked_at_s = loop.time()
-        async with self._lock:
-            if self._no_host_since_s > asked_at_s:
-                raise DeviceTimeout(member.name, f"no connection to {self._where} within {self.timeout_s} s")
-            began_s = loop.time()
-            try:
-                async with asyncio.timeout(2.0 * self.timeout_s):
-                    await self._connect(member)
-                    await self._settle(member)
-                    result = await job()
-            except TimeoutError:
-                member.patience.failed(loop.time())
-                raise DeviceTimeout(member.name, f"not done within {2.0 * self.timeout_s} s") from None
-            except (DeviceTimeout, DeviceGarbled):
-                member.patience.failed(loop.time())
-                raise
-            except DriverError:
-                # A gateway may take its time to say that a device is not there.
-                slow = loop.time() - began_s > self.timeout_s / 2.0
-                if slow:
-                    member.patience.failed(loop.time())
-                else:
-                    member.patience.succeeded()
-                raise
-        member.patience.succeeded()
-        return result
+    def _heard_at_s(self) -> float | None:
+        return self._wire.heard_at_s if self._wire is not None else None
 
-    def _check_patience(self, member: Member, now_s: float) -> None:
-        """Refuse quickly while no try is due."""
-        if member.closed:
-            raise DeviceDisconnected(member.name, "is closed")
-        hold_s = max(member.patience.hold_s(now_s), self._patience.hold_s(now_s))
-        if hold_s > 0.0:
-            failures = max(member.patience.failures, self._patience.failures)
-            raise DeviceTimeout(member.name, f"silent {failures} times, next try in {hold_s:.1f} s")
-
-    async def _connect(self, member: Member) -> None:
-        """Connect if there is no connection."""
+    async def _open(self, member: Member) -> None:
         if member.closed:
             raise DeviceDisconnected(member.name, "is closed")
         if self._wire is not None and self._wire.connected:
@@ -210,16 +140,9 @@ class ModbusLine:
         self.generation += 1
 
     async def _settle(self, member: Member) -> None:
-        """Make sure that no late answer of this device is left on the line."""
-        if self._numbered or not member.unsettled:
+        if self._numbered:
             return
-        loop = asyncio.get_running_loop()
-        give_up_s = loop.time() + self.timeout_s / 2.0
-        while self._wire is not None and loop.time() < give_up_s:
-            quiet_s = loop.time() - self._wire.heard_at_s
-            if quiet_s >= QUIET_S:
-                break
-            await asyncio.sleep(QUIET_S - quiet_s)
+        await self._be_quiet()
         # A refusal is an answer as well. If it is the late one, the fence's data still come, and fit nothing.
         with contextlib.suppress(DeviceRefused):
             await self.ask(member, member.fence)

@@ -1,0 +1,156 @@
+"""What lines with several devices have in common: one job at a time, time limits, spaced tries, late answers."""
+
+from __future__ import annotations
+
+import asyncio
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable
+from typing import Any, Generic, TypeVar
+
+from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceTimeout, DriverError
+from drivers.lines.patience import Patience
+
+ResultT = TypeVar("ResultT")
+PlaceT = TypeVar("PlaceT", bound="Place")
+
+#: Silence after which a serial line counts as quiet, s. Adapters deliver in pieces up to 16 ms apart.
+QUIET_S = 0.02
+
+
+class Place:
+    """One device's place on a line.
+
+    Parameters
+    ----------
+    line : SharedLine
+        The line it hangs on.
+    name : str
+        Of the device, for messages.
+    address : int
+        On the line.
+    """
+
+    def __init__(self, line: SharedLine[Any], name: str, address: int) -> None:
+        self.line = line
+        self.name = name
+        self.address = address
+        self.patience = Patience(line.timeout_s)
+        #: Whether an answer of this device may still be under way; how often that was cleared up.
+        self.unsettled = False
+        self.settlings = 0
+        self.closed = False
+
+    async def serve(self, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
+        """Run a job of requests with the line to itself; see `SharedLine.serve`."""
+        return await self.line.serve(self, job)
+
+    @property
+    def generation(self) -> tuple[int, int]:
+        """Connections and settlings so far; after others the device may be another one."""
+        return self.line.generation, self.settlings
+
+    async def close(self) -> None:
+        """Leave the line; the last one closes it."""
+        self.closed = True
+        self.line.left()
+
+
+class SharedLine(ABC, Generic[PlaceT]):
+    """A line and the devices on it.
+
+    Parameters
+    ----------
+    timeout_s : float
+        Time limit for one answer, s.
+    """
+
+    def __init__(self, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        #: Connections so far.
+        self.generation = 0
+        self._places: list[PlaceT] = []
+        self._lock = asyncio.Lock()
+
+    def left(self) -> None:
+        """Close the line when nobody is left."""
+        if all(place.closed for place in self._places):
+            self.close()
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the line; what waits for an answer fails at once."""
+
+    async def serve(self, place: PlaceT, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
+        """Run a job of one device, with the line to itself.
+
+        The time limit, twice the line's, runs from when the device gets the line.
+
+        Raises
+        ------
+        DriverError
+            Naming the device.
+        """
+        loop = asyncio.get_running_loop()
+        self._check_patience(place, loop.time())
+        asked_at_s = loop.time()
+        async with self._lock:
+            self._check_turn(place, asked_at_s)
+            began_s = loop.time()
+            try:
+                async with asyncio.timeout(2.0 * self.timeout_s):
+                    await self._open(place)
+                    if place.unsettled:
+                        await self._settle(place)
+                    result = await job()
+            except TimeoutError:
+                place.patience.failed(loop.time())
+                raise DeviceTimeout(place.name, f"not done within {2.0 * self.timeout_s} s") from None
+            except (DeviceTimeout, DeviceGarbled):
+                place.patience.failed(loop.time())
+                raise
+            except DriverError:
+                # A gateway may take its time to say that a device is not there.
+                if loop.time() - began_s > self.timeout_s / 2.0:
+                    place.patience.failed(loop.time())
+                else:
+                    place.patience.succeeded()
+                raise
+        place.patience.succeeded()
+        return result
+
+    def _check_patience(self, place: PlaceT, now_s: float) -> None:
+        """Refuse quickly while no try is due."""
+        if place.closed:
+            raise DeviceDisconnected(place.name, "is closed")
+        hold_s, failures = max((patience.hold_s(now_s), patience.failures) for patience in self._patiences(place))
+        if hold_s > 0.0:
+            raise DeviceTimeout(place.name, f"silent {failures} times, next try in {hold_s:.1f} s")
+
+    def _patiences(self, place: PlaceT) -> list[Patience]:
+        """Return what a try has to wait for."""
+        return [place.patience]
+
+    def _check_turn(self, place: PlaceT, asked_at_s: float) -> None:
+        """Refuse a device whose turn it is, where a try of another has shown meanwhile that it is in vain."""
+
+    @abstractmethod
+    async def _open(self, place: PlaceT) -> None:
+        """Open the line if it is not open."""
+
+    @abstractmethod
+    async def _settle(self, place: PlaceT) -> None:
+        """Make sure that no late answer of a device is left on the line."""
+
+    @abstractmethod
+    def _heard_at_s(self) -> float | None:
+        """Return when something came last, s of the loop's clock; None where the line is not open."""
+
+    async def _be_quiet(self) -> None:
+        """Wait until nothing comes any more, half a time limit at most."""
+        loop = asyncio.get_running_loop()
+        give_up_s = loop.time() + self.timeout_s / 2.0
+        while (heard_at_s := self._heard_at_s()) is not None and loop.time() < give_up_s:
+            quiet_s = loop.time() - heard_at_s
+            if quiet_s >= QUIET_S:
+                break
+            await asyncio.sleep(QUIET_S - quiet_s)
