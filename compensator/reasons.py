@@ -168,7 +168,153 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "The first model was calibrated while the effect acted, so its paths were fitted anew beside it.",
         "Judge the extended model on another day before relying on it.",
     ),
-    # Ends of a recording, and what an audit can find.
+    # Warnings of check, run and router.
+    "numbered_port": (
+        "A serial port goes by the order of plugging in, and may be another adapter's after a restart.",
+        "Name the port by a link in /dev/serial/by-id, or by a udev rule.",
+    ),
+    "open_listen": (
+        "Whoever reaches an endpoint of zenoh.listen can publish offsets and send commands in any name.",
+        "Listen on loopback only; for others use a router with TLS and an access list (deploy/zenoh).",
+    ),
+    "unsecured_connect": (
+        "The way to the router is neither encrypted, nor is it proven who is there.",
+        "Connect to tls/HOST:PORT with tls_ca, tls_certificate and tls_key (deploy/zenoh).",
+    ),
+    "unproven_commands": (
+        "Commands are taken of which nobody proves who sent them.",
+        "Leave zenoh.unproven_commands out, and give operators certificates (deploy/zenoh).",
+    ),
+    "no_access_list": (
+        "The router has no access list: whoever connects may publish and command everything.",
+        "Take the access list of deploy/zenoh/access_list.py into its configuration.",
+    ),
+    "certificate_ends": (
+        "A certificate ends within 30 days; from then on the router refuses its owner.",
+        "Renew it now (deploy/zenoh/certificates.py --renew), and restart what uses it.",
+    ),
+    "certificates_unread": (
+        "Certificates are not looked into, so one that has expired is not noticed before the router refuses it.",
+        "Install what reads them: pip install quill-compensator[tls].",
+    ),
+    "adopted_unusable": (
+        "The adopted model cannot be used, and the configured one stands in.",
+        "Adopt it again from its file, or go on with the configured one: `compensator back`.",
+    ),
+    "not_locked": (
+        "The lock beside the recordings cannot be taken, so a second service of this machine is not noticed here.",
+        "Check space and permissions of the recording folder.",
+    ),
+    "others_unknown": (
+        "No router is reached, so whether another service of this machine is alive elsewhere is not known.",
+        "Look whether the router runs; it is asked once, at the start.",
+    ),
+    "router_not_reached": (
+        "There is no connection to the router yet; compensation and recording go on, and it is tried again.",
+        "Look whether it runs at that address, and whether it takes this certificate.",
+    ),
+    "link_lost": (
+        "The connection to a router or another participant has ended; it is tried again.",
+        "Nothing, where it was ended on purpose or comes back; else look for the router and the network.",
+    ),
+    "note_not_kept": (
+        "Where the offset stands cannot be noted in memory while the disk is late: a kill now would lose it.",
+        "Look at free space and permissions of /dev/shm.",
+    ),
+    "note_not_removed": (
+        "The note of the last offset cannot be removed although everything is on disk.",
+        "Look at the permissions of /dev/shm; a note whose number is on disk does not count at the next start.",
+    ),
+    "note_refused": (
+        "A note of the last offset in /dev/shm is none that this service can have left; it does not count.",
+        "Find out who wrote it, where somebody else can log in to this computer.",
+    ),
+    "disk_finishing": (
+        "The service ends and waits for the disk to take the rest of the recording.",
+        "Wait; where it takes minutes, check the disk.",
+    ),
+    # Remarks on tables and recordings that are read as data.
+    "rows_sorted": (
+        "Rows of the table stood out of order and were sorted by their time.",
+        "Look why the logger wrote them so: clocks that were set, or files put together.",
+    ),
+    "gap_bridged": (
+        "Samples are missing; the gap is short beside the machine's time constants and is bridged by a straight line.",
+        "Nothing for one; look at the logger where there are many.",
+    ),
+    "gap_splits": (
+        "Samples are missing; the gap is too long to bridge and splits the record into parts of their own.",
+        "Look at the logger; give it data without such gaps where the fit needs long records.",
+    ),
+    "wild_readings": (
+        "Single readings far off their neighbours were left out.",
+        "Check the sensor for loose contacts and noise.",
+    ),
+    # What watch shows and no service says of itself.
+    "silent": (
+        "Nothing newer has come than an offset whose validity is over; the control holds.",
+        "Look whether the service, the router and the network run; do not rely on compensation meanwhile.",
+    ),
+    "unknown": (
+        "Nothing was received from which the state could be known.",
+        "Wait for one sample; then look whether the service runs.",
+    ),
+    "token_gone": (
+        "The liveliness token of the service is gone: it has ended, or is cut off from the network.",
+        "Look whether the service, the router and the network run.",
+    ),
+    "alive_but_silent": (
+        "The service is connected, for its liveliness token is there, but it publishes nothing that is newer.",
+        "Look at the log of the service, and whether it still polls; restart it where it stands still.",
+    ),
+    "two_services": ("Two services publish below one prefix.", "Stop one of them, or correct its prefix."),
+    "clock_ahead": (
+        "The machine's clock is ahead of this computer's.", "Check the time service (NTP) of both computers."),
+    "old_messages": (
+        "Messages arrive but carry an old time: one of the two clocks is wrong, or somebody repeats them.",
+        "Check the time service (NTP) of both computers, then who publishes below the prefix.",
+    ),
+    "malformed_messages": (
+        "Messages arrived that are none of the service's.", "Find out who publishes below the prefix."),
+    "missed_messages": (
+        "Messages of the service never arrived here.", "Look at the network and the router, where it goes on."),
+    "repeated_numbers": (
+        "Messages came with a number that was there already.",
+        "Find out whether somebody repeats messages, or a second service publishes below the prefix.",
+    ),
+    # Ends of a recording, and what an audit can find or has to remark.
+    "not_worked_out": (
+        "Not every sample could be worked out again from what the recording carries.",
+        "Audit with the version that wrote it; what is named beside it was not checked.",
+    ),
+    "no_chain": (
+        "The file was recorded without a hash chain; that nothing was changed is not proven.",
+        "Treat it as not proven; recordings of this version have a chain.",
+    ),
+    "samples_missing": (
+        "Samples between others were not recorded.", "Look at the events before and behind them: pauses, the disk."),
+    "published_early": (
+        "Offsets were published before they were on disk, which was slow or failed.",
+        "Check the disk of the machine: its health, free space, other programs that write to it.",
+    ),
+    "unsigned_behind": (
+        "Records stand behind the last signature of the file; the signature says nothing of them.",
+        "Audit it again once the file is finished, or the next one is there.",
+    ),
+    "begins_new_chain": (
+        "The hash chain begins anew with this file, which says that no recording was there before it.",
+        "Nothing, where the machine was set up anew; else find out where the recordings before it are.",
+    ),
+    "before_not_given": (
+        "A recording before the first file that was given is not among them; what was before is not proven.",
+        "Give it too, where it is still kept.",
+    ),
+    "begins_running": (
+        "The comparison begins on a running machine, of which the other model knows no more than the zero.",
+        "Leave the first hours out of the judgement, or compare from a recording on that begins at rest.",
+    ),
+    "signature_not_checked": (
+        "The file is signed, and nobody said by whom it should be.", "Give the machine's key: --public-key FILE."),
     "finished": ("The recording has its end: sealed, with checksums and index.", "Nothing."),
     "recovered": (
         "The service was ended hard; the next start kept every whole record and sealed the file.",
@@ -238,6 +384,11 @@ class Caution(str):
         words = super().__new__(cls, f"{figures} {WORDS[code][1]}")
         words.code = code
         return words
+
+    @property
+    def marked(self) -> str:
+        """The warning with its code behind it, as it stands in a terminal or a log."""
+        return f"{self} [{self.code}]"
 
 
 def explain(code: str) -> tuple[str, str] | None:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from compensator.errors import DataError, UsageError
 from compensator.messages import Sample, number
+from compensator.reasons import Caution
 from compensator.recording import decode, read_messages
 
 Vector = npt.NDArray[np.float64]
@@ -63,12 +64,12 @@ class Data:
     ----------
     records : tuple of Record
         In order of time; a long gap starts a new one.
-    remarks : tuple of str
+    remarks : tuple of Caution
         What had to be put right: gaps, rows out of order.
     """
 
     records: tuple[Record, ...]
-    remarks: tuple[str, ...]
+    remarks: tuple[Caution, ...]
 
 
 def load_data(path: Path, period_s: float, roles: Mapping[str, str] | None = None) -> Data:
@@ -247,7 +248,7 @@ def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: floa
     disordered = int(np.sum(np.diff(t_s) < 0))
     if disordered:
         row = int(np.argmax(np.diff(t_s) < 0)) + 3
-        remarks.append(f"{path}: row {row}: {disordered} row(s) out of order; sorted by time")
+        remarks.append(Caution("rows_sorted", f"{path}: row {row}: {disordered} row(s) out of order; sorted by time."))
     t_s = t_s[order] - t_s.min()
     slot = (
         np.round(t_s / period_s).astype(int)
@@ -262,9 +263,11 @@ def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: floa
     start = 0
     for first, last in _gaps(present):
         length = last - first
-        remarks.append(f"{path}: gap of {length} sample(s) from t_s = {first * period_s:g}"
-                       + ("; the record is split there" if length > SHORT_GAP_SAMPLES else "; bridged"))  # fmt: skip
-        if length > SHORT_GAP_SAMPLES:
+        gap = f"{path}: gap of {length} sample(s) from t_s = {first * period_s:g}"
+        if length <= SHORT_GAP_SAMPLES:
+            remarks.append(Caution("gap_bridged", f"{gap}; bridged."))
+        else:
+            remarks.append(Caution("gap_splits", f"{gap}; the record is split there."))
             records.append((start, first))
             start = last
     records.append((start, n))

@@ -20,6 +20,7 @@ from compensator.container import PAYLOAD, Container
 from compensator.errors import DataError, ServiceError
 from compensator.messages import Event, Sample, number
 from compensator.model.thermal_model import ThermalModel
+from compensator.reasons import Caution
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome
 
@@ -67,7 +68,7 @@ class Comparison:
         The other offset − the recorded one.
     samples : int
         Number of samples.
-    remarks : list of str
+    remarks : list of Caution
         What the figures depend on.
     """
 
@@ -79,7 +80,7 @@ class Comparison:
     left_after: Spread
     offsets: Spread
     samples: int
-    remarks: list[str]
+    remarks: list[Caution]
 
     def as_json(self) -> dict[str, Any]:
         """Return it as it stands in the result of `--json`."""
@@ -87,7 +88,8 @@ class Comparison:
             "recorded_model": self.recorded, "other_model": self.other, "samples": self.samples,
             "residual_um": {"before": _spread_json(self.residual_before), "after": _spread_json(self.residual_after)},
             "left_um": {"before": _spread_json(self.left_before), "after": _spread_json(self.left_after)},
-            "offset_difference_um": _spread_json(self.offsets), "remarks": self.remarks,
+            "offset_difference_um": _spread_json(self.offsets), "remarks": list(self.remarks),
+            "remark_codes": [remark.code for remark in self.remarks],
         }  # fmt: skip
 
     def text(self) -> str:
@@ -106,7 +108,7 @@ class Comparison:
             figures = f"{spread.rms:9.3f} {abs(spread.peak):9.3f}" if spread.samples else f"{'–':>9} {'–':>9}"
             worst = worst_utc(spread) if spread.samples else "–"
             lines.append(f"{name:<{width}} {figures} {spread.samples:9d}  {worst}")
-        return "\n".join([*lines, *(f"remark: {remark}" for remark in self.remarks)])
+        return "\n".join([*lines, *(f"remark: {remark.marked}" for remark in self.remarks)])
 
 
 def compare(
@@ -216,10 +218,11 @@ class _Run:
             warm = estimate.y_base_um != 0.0
             compensation.begin(t_q_ref_degc=estimate.t_q_ref_degc, at_ref_degc=estimate.at_ref_degc,
                                y_ref_um=math.nan if warm else number(estimate.y_ref_um), y_base_um=0.0)  # fmt: skip
-            self._result.remarks.append(
+            figures = (
                 f"{file}: begins on a running machine, of which the other model knows no more than the zero; "
-                f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain"
+                f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
             )
+            self._result.remarks.append(Caution("begins_running", figures))
         self._compensation, self._config, self._last_ns = compensation, data, 0
         return compensation
 

@@ -12,6 +12,7 @@ from typing import Any
 from compensator.audit.findings import Difference, Finding, Kind, utc
 from compensator.audit.recording_audit import RecordingAudit, audit_recording
 from compensator.chain import NOTHING
+from compensator.reasons import Caution
 from compensator.signature import Verifier
 
 _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
@@ -31,7 +32,7 @@ class Audit:
         How many there are.
     difference : Difference, optional
         The first sample that comes out differently.
-    remarks : tuple of str
+    remarks : tuple of Caution
         What is worth knowing and not wrong.
     signed : bool
         Whether signatures were checked against a key.
@@ -41,7 +42,7 @@ class Audit:
     findings: tuple[Finding, ...]
     findings_count: int
     difference: Difference | None
-    remarks: tuple[str, ...]
+    remarks: tuple[Caution, ...]
     signed: bool
 
     @property
@@ -74,6 +75,7 @@ class Audit:
             "samples": self.samples, "differing_samples": self.differing,
             "findings_count": self.findings_count, "findings": [f.as_json() for f in self.findings],
             "difference": self.difference.as_json() if self.difference else None, "remarks": list(self.remarks),
+            "remark_codes": [remark.code for remark in self.remarks],
             "files": files,
         }  # fmt: skip
 
@@ -174,7 +176,7 @@ class _Judge:
         self._newest = {file.machine: file.file for file in files}
         self._signed = signed
         self.own: dict[str, list[Finding]] = {}
-        self.remarks: list[str] = []
+        self.remarks: list[Caution] = []
 
     def _find(self, kind: Kind, file: RecordingAudit, text: str) -> None:
         self.own.setdefault(file.file, []).append(Finding(kind=kind, file=file.file, text=text))
@@ -184,27 +186,37 @@ class _Judge:
         if file.original != file.file and _NAME.match(file.file):
             self._find("reordered", file, f"its name is that of another file: it was begun as {file.original}")
         if file.not_worked_out:
-            self.remarks.append(f"{file.file}: not all samples were worked out again: {file.not_worked_out}")
+            self.remarks.append(
+                Caution("not_worked_out", f"{file.file}: not all samples were worked out again: {file.not_worked_out}.")
+            )
         if not file.last and file.end in ("open", "torn"):
-            self.remarks.append(f"{file.file}: torn before anything was recorded")
+            self.remarks.append(Caution("torn", f"{file.file}: torn before anything was recorded."))
             return
         if not file.last:
-            self.remarks.append(f"{file.file}: recorded without a hash chain; that nothing was changed is not proven")
+            self.remarks.append(
+                Caution(
+                    "no_chain", f"{file.file}: recorded without a hash chain; that nothing was changed is not proven."
+                )
+            )
         elif file.end == "recovered":
-            self.remarks.append(f"{file.file}: the service was ended hard; every whole record was kept")
+            self.remarks.append(
+                Caution("recovered", f"{file.file}: the service was ended hard; every whole record was kept.")
+            )
         elif file.end in ("open", "torn"):
             what = "within a group of records" if file.end == "torn" else "behind a whole group of records"
             newest = self._newest[file.machine] == file.file
             known = (
                 "; that no more was there cannot be known until the next file names its last value" if newest else ""
             )
-            self.remarks.append(f"{file.file}: has no end, {what}: still being written, or ended hard{known}")
+            text = f"{file.file}: has no end, {what}: still being written, or ended hard{known}."
+            self.remarks.append(Caution("torn", text) if file.end == "torn" else Caution("open", text))
         if file.skipped:
-            self.remarks.append(f"{file.file}: {file.skipped} sample(s) between others were not recorded")
-        if file.early:
             self.remarks.append(
-                f"{file.file}: {file.early} offset(s) were published before they were on disk, which was slow or failed"
+                Caution("samples_missing", f"{file.file}: {file.skipped} sample(s) between others were not recorded.")
             )
+        if file.early:
+            text = f"{file.early} offset(s) were published before they were on disk, which was slow or failed"
+            self.remarks.append(Caution("published_early", f"{file.file}: {text}."))
         self._seals(file)
 
     def _seals(self, file: RecordingAudit) -> None:
@@ -214,10 +226,16 @@ class _Judge:
             elif not file.last:
                 self._find("unsigned", file, "has no hash chain, so nothing is signed")
             elif file.unsigned_behind:
-                self.remarks.append(f"{file.file}: {file.unsigned_behind} record(s) behind the last signature")
+                self.remarks.append(
+                    Caution(
+                        "unsigned_behind", f"{file.file}: {file.unsigned_behind} record(s) behind the last signature."
+                    )
+                )
         elif file.signed:
             keys = ", ".join(key[:16] for key in file.keys)
-            self.remarks.append(f"{file.file}: signed by {keys}…, not checked (no --public-key)")
+            self.remarks.append(
+                Caution("signature_not_checked", f"{file.file}: signed by {keys}…, not checked (no --public-key).")
+            )
 
     def joint(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
         """Look at what joins a file to the one before it."""
@@ -238,7 +256,12 @@ class _Judge:
             self._state(before, after)
             return
         if not after.previous_file:
-            self.remarks.append(f"{after.file}: begins a new chain; it says that no recording was there before it")
+            self.remarks.append(
+                Caution(
+                    "begins_new_chain",
+                    f"{after.file}: begins a new chain; it says that no recording was there before it.",
+                )
+            )
             return
         named = self._names.get(after.previous_file)
         if named is None:
@@ -261,7 +284,7 @@ class _Judge:
             lost = (
                 "which the limit of what is kept removed" if file.previous_file in self._removed else "not given here"
             )
-            self.remarks.append(f"{file.file}: begins after {file.previous_file}, {lost}")
+            self.remarks.append(Caution("before_not_given", f"{file.file}: begins after {file.previous_file}, {lost}."))
 
     def _state(self, before: RecordingAudit, after: RecordingAudit) -> None:
         """In one run, the state that a file opens with is that which the file before ended with."""
@@ -298,7 +321,7 @@ def summary(found: Audit) -> str:
     if found.findings_count:
         lines.append(f"{found.findings_count} finding(s):")
         lines += [f"  {finding.line()}" for finding in found.findings]
-    lines += [f"remark: {remark}" for remark in _shortened(found.remarks)]
+    lines += [f"remark: {remark}" for remark in _shortened([remark.marked for remark in found.remarks])]
     return "\n".join(lines)
 
 

@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     checks = Compensation(loaded.config, model).plausibility.describe()
     warnings = precautions(loaded)
     for warning in warnings:
-        log.warning("%s: warning: %s", arguments.config, warning)
+        log.warning("%s: warning: %s", arguments.config, warning.marked)
     machine = loaded.config.machine.name
     text = (
         f"{arguments.config}: good. Machine {machine}, model {model.name} ({model.kind}), "
@@ -33,5 +33,6 @@ def run(arguments: argparse.Namespace) -> Answer:
         f"plausibility: {checks}"
     )
     result = {"ok": True, "machine": machine, "model": model.name, "model_sha256": model.sha256,
-              "devices": list(fleet.devices), "warnings": warnings, "checks": checks}  # fmt: skip
+              "devices": list(fleet.devices), "warnings": list(warnings),
+              "warning_codes": [warning.code for warning in warnings], "checks": checks}  # fmt: skip
     return Answer(result, text)

@@ -15,6 +15,7 @@ import zenoh
 from compensator.certificates import check_files, remarks
 from compensator.commands import Answer
 from compensator.errors import ConfigError, ServiceError
+from compensator.reasons import Caution
 from compensator.service.session import ConfigFile, files_of, get, in_words, put, read_config_file
 
 log = logging.getLogger("compensator")
@@ -74,7 +75,7 @@ def checked(path: Path, file: ConfigFile) -> zenoh.Config:
         if wrong is not None:
             raise ConfigError(f"{path}: {wrong}")
         for remark in remarks(certificate, now):
-            log.warning("%s: %s", path, remark)
+            log.warning("%s: warning: %s", path, remark.marked)
     return config
 
 
@@ -84,7 +85,8 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
     if not enabled:
         if access.get("rules") or access.get("policies"):
             raise ConfigError(f"{path}: access_control/enabled: expected true beside rules; without it none applies")
-        log.warning("%s: no access list: whoever connects may publish and command everything", path)
+        caution = Caution("no_access_list", "No access list: whoever connects may publish and command everything.")
+        log.warning("%s: warning: %s", path, caution.marked)
         return
     if access.get("default_permission") != "deny":
         raise ConfigError(f"{path}: access_control/default_permission = {access.get('default_permission')!r}, expected "

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     model = load_model(arguments.model)
     data = load_data(arguments.data, model.period_s, roles_of(arguments.column))
     for remark in data.remarks:
-        log.warning("%s", remark)
+        log.warning("%s", remark.marked)
     for record in data.records:
         require(arguments.data, record, ("t_q_degc", "at_degc"))
     parts = [simulate(model, record, source=str(arguments.data)) for record in data.records]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from compensator.reasons import Caution
 from compensator.tables import SHORT_GAP_SAMPLES, Record
 
 Vector = npt.NDArray[np.float64]
@@ -62,7 +63,7 @@ class Run:
         return np.asarray(self.ambient_k + self.reference[1])
 
 
-def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[str, ...]]]:
+def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Caution, ...]]]:
     """Yield the runs of a record with remarks on what was put right.
 
     Parameters
@@ -76,7 +77,7 @@ def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[str, ...]]]:
     for column, values in record.columns.items():
         cleaned, wild = without_wild(values) if column != "heat_w" else (values, 0)
         if wild and column in ("t_q_degc", "at_degc", "y_um"):
-            remarks.append(f"{name}: {column}: {wild} wild single reading(s) left out")
+            remarks.append(Caution("wild_readings", f"{name}: {column}: {wild} wild single reading(s) left out."))
         columns[column] = cleaned
     inputs = ["t_q_degc", "at_degc", *(["heat_w"] if "heat_w" in columns else [])]
     missing = np.any([np.isnan(columns[c]) for c in inputs], axis=0)

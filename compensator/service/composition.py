@@ -14,6 +14,7 @@ from compensator.config import LoadedConfig, load_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.model.thermal_model import ThermalModel
+from compensator.reasons import Caution
 from compensator.recording import first_sequence
 from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Outcome
@@ -99,7 +100,8 @@ def _adopted(loaded: LoadedConfig, configured: bytes, model: ThermalModel) -> tu
             return configured, model
         return data, check_model(loaded.config, data, source="adopted model")
     except CompensatorError as error:
-        log.warning("the adopted model cannot be used, the configured one stands in: %s", error)
+        figures = f"The adopted model cannot be used, the configured one stands in: {error}."
+        log.warning("%s", Caution("adopted_unusable", figures).marked)
         return configured, model
 
 
@@ -168,7 +170,7 @@ async def run_service(
         clock = clock or SystemClock()
         try:
             for warning in precautions(loaded):
-                log.warning("%s: warning: %s", path, warning)
+                log.warning("%s: warning: %s", path, warning.marked)
         except ConfigError as error:  # recording goes on, whether anybody can be told or not
             log.error("%s; the router will refuse the service", error)
         store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))

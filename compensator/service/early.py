@@ -19,6 +19,7 @@ from pathlib import Path
 import msgspec
 
 from compensator.messages import Offset, number
+from compensator.reasons import Caution
 
 log = logging.getLogger("compensator")
 
@@ -78,7 +79,8 @@ class EarlyNote:
             part.replace(self.path)
         except OSError as error:
             if self._there:
-                log.warning("%s: a kill now would lose the offset: %s", self.path, error)
+                caution = Caution("note_not_kept", f"{self.path}: a kill now would lose the offset: {error}.")
+                log.warning("%s", caution.marked)
             self._there = False
             with suppress(OSError):
                 part.unlink(missing_ok=True)
@@ -90,7 +92,7 @@ class EarlyNote:
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
-            log.warning("%s: cannot be removed: %s", self.path, error)
+            log.warning("%s", Caution("note_not_removed", f"{self.path}: cannot be removed: {error}.").marked)
 
     def read(self, offset_max_um: float) -> Early | None:
         """Return the note, None where there is none that this user wrote and a service could have published.
@@ -108,14 +110,17 @@ class EarlyNote:
             there = os.fstat(file.fileno())
             # Everybody may write into this folder.
             if not stat.S_ISREG(there.st_mode) or there.st_uid != os.geteuid() or there.st_mode & 0o022:
-                log.warning("%s: not written by this service, so it does not count", self.path)
+                self._refused("not written by this service")
                 return None
             try:
                 early = msgspec.json.decode(file.read(_LONGEST), type=Early)
             except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-                log.warning("%s: does not count: %s", self.path, error)
+                self._refused(str(error))
                 return None
         if not abs(early.y_offset_um) <= offset_max_um or early.seq < 0:
-            log.warning("%s: does not count: offset %g µm, number %d", self.path, early.y_offset_um, early.seq)
+            self._refused(f"offset {early.y_offset_um:g} µm, number {early.seq}")
             return None
         return early
+
+    def _refused(self, why: str) -> None:
+        log.warning("%s", Caution("note_refused", f"{self.path}: does not count: {why}.").marked)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from compensator.clock import Clock
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
+from compensator.reasons import Caution
 from compensator.service.early import EarlyNote
 from compensator.service.recording_thread import FAILED, WAITING_EVENTS, Group, RecordingThread
 
@@ -176,7 +177,8 @@ class Journal:
         await self.record(self._clock.utc_ns(), state)
         closing = asyncio.wrap_future(self._thread.close())
         while not (await asyncio.wait([closing], timeout=CLOSING_S))[0]:
-            log.warning("the recording is being finished: the disk has not taken it for %g s", CLOSING_S)
+            figures = f"The recording is being finished: the disk has not taken it for {CLOSING_S:g} s."
+            log.warning("%s", Caution("disk_finishing", figures).marked)
         if self._thread.waiting:
             log.error("%d sample(s) are not on disk, which did not take them", self._thread.waiting)
         error = closing.exception()

@@ -11,6 +11,7 @@ from typing import Any
 from compensator.certificates import check_files, remarks
 from compensator.config import LoadedConfig, Zenoh
 from compensator.errors import ConfigError
+from compensator.reasons import Caution
 from compensator.service.session import tls_files
 
 #: Numbers that go by the order in which adapters are plugged in or found.
@@ -18,7 +19,7 @@ _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 _BY_ID = Path("/dev/serial/by-id")
 
 
-def precautions(loaded: LoadedConfig, now: datetime.datetime | None = None) -> list[str]:
+def precautions(loaded: LoadedConfig, now: datetime.datetime | None = None) -> list[Caution]:
     """Return warnings, each in one line.
 
     Parameters
@@ -47,30 +48,29 @@ def precautions(loaded: LoadedConfig, now: datetime.datetime | None = None) -> l
     return found
 
 
-def _numbered(line: Mapping[str, Any]) -> str | None:
+def _numbered(line: Mapping[str, Any]) -> Caution | None:
     """Say that a serial port has no name of its own."""
     port = str(line.get("port", ""))
     if not _NUMBERED.fullmatch(port):
         return None
     lasting = [link for link in sorted(_BY_ID.glob("*")) if link.resolve() == Path(port).resolve()]
-    expected = f"here {lasting[0]}" if lasting else f"such as {_BY_ID}/…, or a name by a udev rule"
-    return (
-        f"line {line.get('name')!r}: port {port} goes by the order of plugging in, and may be another adapter's after "
-        f"a restart; expected a name that stays, {expected}"
-    )
+    stays = f" The name of it that stays is {lasting[0]}." if lasting else ""
+    figures = f"Line {line.get('name')!r}: port {port} goes by the order of plugging in, and may be another adapter's "
+    return Caution("numbered_port", f"{figures}after a restart.{stays}")
 
 
-def _open_doors(zenoh: Zenoh) -> list[str]:
+def _open_doors(zenoh: Zenoh) -> list[Caution]:
     """Say where somebody on the network may speak for the machine or its operator."""
     found = []
     outside = [endpoint for endpoint in zenoh.listen if not zenoh.is_loopback(endpoint)]
     if outside:
-        found.append(f"zenoh.listen {', '.join(outside)}: whoever reaches it can publish offsets and send commands in "
-                     f"any name; expected a router with TLS and an access list (deploy/zenoh)")  # fmt: skip
+        found.append(Caution("open_listen", f"zenoh.listen {', '.join(outside)}: whoever reaches it can publish "
+                             f"offsets and send commands in any name."))  # fmt: skip
     outside = [endpoint for endpoint in zenoh.connect if not zenoh.is_loopback(endpoint)]
     if outside and not zenoh.secured():
-        found.append(f"zenoh.connect {', '.join(outside)}: neither encrypted nor proven who is there; expected "
-                     f"tls/HOST:PORT with tls_ca, tls_certificate and tls_key")  # fmt: skip
+        found.append(Caution("unsecured_connect", f"zenoh.connect {', '.join(outside)}: neither encrypted nor proven "
+                             f"who is there."))  # fmt: skip
     if zenoh.unproven_commands and not zenoh.on_loopback():
-        found.append("zenoh.unproven_commands: commands are taken of which nobody proves who sent them")
+        figures = "zenoh.unproven_commands: commands are taken of which nobody proves who sent them."
+        found.append(Caution("unproven_commands", figures))
     return found

@@ -22,6 +22,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
+from compensator.reasons import Caution
 from compensator.service.session import put, session_config
 
 log = logging.getLogger("compensator")
@@ -60,7 +61,8 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
         except BlockingIOError as error:
             raise ServiceError(f"{path}: held by another service of {machine}, which goes on; this one ends") from error
         except OSError as error:
-            log.warning("%s: cannot be locked, so a second service is not noticed here: %s", path, error)
+            figures = f"{path}: cannot be locked, so a second service is not noticed here: {error}."
+            log.warning("%s", Caution("not_locked", figures).marked)
         yield
 
 
@@ -98,7 +100,8 @@ def sole_voice(settings: Zenoh) -> Iterator[None]:
             except zenoh.ZError:
                 if settings.mode == "client":  # it can say nothing either
                     raise
-                log.warning("zenoh: nobody is reached, so whether another service is alive elsewhere is not known")
+                figures = "zenoh: nobody is reached, so whether another service is alive elsewhere is not known."
+                log.warning("%s", Caution("others_unknown", figures).marked)
             else:
                 held.callback(_claim(session, settings.prefix).undeclare)
         yield

@@ -19,6 +19,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
+from compensator.reasons import Caution
 from compensator.service.presence import sole_voice
 from compensator.service.session import in_words, session_config, tell_links
 
@@ -110,7 +111,8 @@ class Publisher:
             words = f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})"
             if self._settings.mode != "client":
                 raise ServiceError(words) from error
-            log.warning("%s: is the router there, and does it take this certificate? It is tried again", words)
+            caution = Caution("router_not_reached", f"{words.rstrip('.')}; it is tried again.")
+            log.warning("%s", caution.marked)
             self._waiting = threading.Thread(target=self._begin_later, name="zenoh-router", daemon=True)
             self._waiting.start()
 

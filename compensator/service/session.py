@@ -14,6 +14,7 @@ import zenoh
 from compensator.certificates import TlsFiles
 from compensator.config import Zenoh
 from compensator.errors import ConfigError
+from compensator.reasons import Caution
 
 log = logging.getLogger("compensator")
 
@@ -163,12 +164,13 @@ def tell_links(session: Any, endpoints: Sequence[str]) -> None:
     def tell(event: Any) -> None:
         came = event.kind == zenoh.SampleKind.PUT
         kind = str(event.transport.whatami).rpartition(".")[2].lower()
-        log.log(logging.INFO if came else logging.WARNING, "zenoh: %s %s %s", kind, event.transport.zid,
-                "is connected" if came else "is gone; it is tried again")  # fmt: skip
+        who = f"zenoh: {kind} {event.transport.zid}"
+        if came or kind == "client":  # who looks at the service comes and goes as they like
+            log.info("%s is %s", who, "connected" if came else "gone")
+        else:
+            log.warning("%s", Caution("link_lost", f"{who} is gone; it is tried again.").marked)
 
     if endpoints and not session.info.transports():
-        log.warning(
-            "zenoh: no connection to %s yet: is the router there, and does it take this certificate? It is tried again",
-            ", ".join(endpoints),
-        )
+        figures = f"zenoh: no connection to {', '.join(endpoints)} yet; it is tried again."
+        log.warning("%s", Caution("router_not_reached", figures).marked)
     session.info.declare_transport_events_listener(tell, history=True)

@@ -117,7 +117,7 @@ async function showOne(prefix, count) {
   verdict(machine.tone, sentence(machine));
   pictures(machine, past.history, found.now_s);
   list("why", machine.reasons.map((reason) => [wordLink(reason.code), `: ${reason.means} `, make("b", {}, "To do: "), reason.do]), "warning");
-  list("mind", machine.warnings.map((text) => [text]), "warning");
+  list("mind", machine.warnings.map((text, i) => [text, " ", wordLink(machine.warning_codes[i])]), "warning");
   now(machine); events(machine.events); spells(past.history); channels(machine); points(past.history);
 }
 

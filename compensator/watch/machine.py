@@ -9,6 +9,7 @@ import msgspec
 
 from compensator.clock import NS
 from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
+from compensator.reasons import Caution
 from compensator.watch.history import History, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import TONES, Tone, age, in_words, to_do
@@ -167,29 +168,32 @@ class Machine:
             return "unknown"
         return "silent" if old_s > self._offset.valid_for_s else self._offset.state
 
-    def warnings(self, now_ns: int, monotonic_s: float) -> list[str]:
+    def warnings(self, now_ns: int, monotonic_s: float) -> list[Caution]:
         """Return what is odd about what is heard, in words."""
         said = []
         offset, shown = self._offset, self.shown(now_ns, monotonic_s)
         if self.alive is False and shown not in ("silent", "unknown"):
-            said.append("The service has ended or is cut off: its liveliness token is gone.")
+            said.append(Caution("token_gone", "The service has ended or is cut off: its liveliness token is gone."))
         if self.alive and shown == "silent":
-            said.append("Its liveliness token is there: the service is connected but publishes nothing that is newer.")
+            figures = "Its liveliness token is there: the service is connected but publishes nothing that is newer."
+            said.append(Caution("alive_but_silent", figures))
         other, heard_s = self._other
         if offset is not None and monotonic_s - heard_s < 4.0 * offset.valid_for_s:
-            said.append(f"Two services publish below this prefix: {other} and {self.name}. Stop one of them.")
+            said.append(Caution("two_services", f"Two services publish below this prefix: {other} and {self.name}."))
         if offset is not None and offset.time_utc_ns - now_ns > AHEAD_S * NS:
-            said.append(f"Its clock is ahead of this computer's by {age((offset.time_utc_ns - now_ns) / NS)}.")
+            figures = f"Its clock is ahead of this computer's by {age((offset.time_utc_ns - now_ns) / NS)}."
+            said.append(Caution("clock_ahead", figures))
         if offset is not None and shown == "silent" and monotonic_s - self._arrived_s < offset.valid_for_s / 2.0:
-            said.append(
-                "Messages arrive but carry an old time: one of the two clocks is wrong, or somebody repeats them."
-            )
+            figures = "Messages arrive but carry an old time: one of the two clocks is wrong, or somebody repeats them."
+            said.append(Caution("old_messages", figures))
         if self.malformed:
-            said.append(f"{self.malformed} malformed message(s), the last: {self.last_malformed}")
+            figures = f"{self.malformed} malformed message(s), the last: {self.last_malformed}."
+            said.append(Caution("malformed_messages", figures))
         if self.numbers.missed:
-            said.append(f"{self.numbers.missed} message(s) never arrived here.")
+            said.append(Caution("missed_messages", f"{self.numbers.missed} message(s) never arrived here."))
         if self.numbers.repeated:
-            said.append(f"{self.numbers.repeated} message(s) came with a number that was there already.")
+            figures = f"{self.numbers.repeated} message(s) came with a number that was there already."
+            said.append(Caution("repeated_numbers", figures))
         return said
 
     def tone(self, now_ns: int, monotonic_s: float) -> Tone:
@@ -216,12 +220,13 @@ class Machine:
         shown = self.shown(now_ns, monotonic_s)
         old_s = self.age_s(now_ns, monotonic_s)
         reasons = [in_words(code) for code in offset.reasons] if offset else []
+        warnings = self.warnings(now_ns, monotonic_s)
         found: dict[str, Any] = {
             "prefix": self.prefix, "machine": self.name, "shown": shown, "tone": self.tone(now_ns, monotonic_s),
             "means": in_words(shown).means, "do": in_words(shown).do, "alive": self.alive,
             "state": offset.state if offset else None,
             "reasons": [words._asdict() for words in reasons],
-            "warnings": self.warnings(now_ns, monotonic_s),
+            "warnings": list(warnings), "warning_codes": [warning.code for warning in warnings],
             "seq": offset.seq if offset else None, "time_utc_ns": offset.time_utc_ns if offset else None,
             "age_s": round(old_s, 3) if old_s is not None else None,
             "valid_for_s": offset.valid_for_s if offset else None,

@@ -25,7 +25,6 @@ from compensator.clock import NS
 from compensator.errors import ServiceError
 from compensator.reasons import WORDS
 from compensator.watch.shop import Shop, headline
-from compensator.watch.words import OWN
 
 #: The only address that is bound.
 HOST = "127.0.0.1"
@@ -107,7 +106,7 @@ def page() -> tuple[bytes, str]:
     script = part("compensator.watch", "live.js")
     words = "".join(
         f'<dt id="word={code}"><code>{code}</code></dt><dd>{html.escape(means)} <b>To do:</b> {html.escape(do)}</dd>'
-        for code, (means, do) in {**OWN, **WORDS}.items()
+        for code, (means, do) in WORDS.items()
     )
     text = part("compensator.watch", "live.html")
     for name, filled in (("style", style), ("words", words), ("version", __version__), ("script", script)):

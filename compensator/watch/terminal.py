@@ -200,8 +200,14 @@ def _lists(machine: dict[str, Any]) -> list[tuple[str, list[str]]]:
         + (f" → {event['do']}" if event["do"] else "")
         for event in machine["events"][:EVENTS]
     ]
-    return [("Why", reasons), ("Mind", machine["warnings"]), ("Channels", channels), ("Devices", devices),
-            ("Last events (UTC)", events)]  # fmt: skip
+    mind = [warning.marked for warning in machine["warnings"]]
+    return [
+        ("Why", reasons),
+        ("Mind", mind),
+        ("Channels", channels),
+        ("Devices", devices),
+        ("Last events (UTC)", events),
+    ]
 
 
 def _titled(title: str, lines: list[str]) -> RenderableType:

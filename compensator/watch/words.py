@@ -17,17 +17,6 @@ TONES: Mapping[str, Tone] = {
 }  # fmt: skip
 #: A sign beside each, so that colour is not needed.
 SIGNS: Mapping[Tone, str] = {"good": "✓", "warn": "⚠", "bad": "✗"}
-#: What is shown and no service says of itself → (what it means, what to do)
-OWN: Mapping[str, tuple[str, str]] = {
-    "silent": (
-        "Nothing newer has come than an offset whose validity is over; the control holds.",
-        "Look whether the service, the router and the network run; do not rely on compensation meanwhile.",
-    ),
-    "unknown": (
-        "Nothing was received from which the state could be known.",
-        "Wait for one sample; then look whether the service runs.",
-    ),
-}
 #: Kind of an event → what to do.
 _DO: Mapping[str, str] = {
     "device": "Check power, cable and address of the device; `compensator probe` reads it once.",
@@ -54,7 +43,7 @@ def in_words(code: str) -> Words:
     >>> in_words("ok").do
     'Nothing.'
     """
-    found = OWN.get(code) or explain(code)
+    found = explain(code)
     if found is None:
         return Words(
             code, "This program does not know the code; the service may be newer.", "Bring both to one version."

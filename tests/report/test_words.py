@@ -30,6 +30,32 @@ def cautions() -> set[str]:
     return found
 
 
+def test_every_warning_in_the_log_has_a_code() -> None:
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if PACKAGE / "receiver" in path.parents:  # stands alone, with codes of its own
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "warning":
+                last = node.args[-1]
+                assert isinstance(last, ast.Attribute) and last.attr == "marked", f"{path}: {node.lineno}"
+
+
+def written() -> set[str]:
+    """Texts in the sources, as far as a colon, without those of the table of words itself."""
+    found = set()
+    for root in ("compensator", "drivers"):
+        for path in (PACKAGE.parent / root).rglob("*.py"):
+            if path != PACKAGE / "reasons.py":
+                tree = ast.parse(path.read_text(encoding="utf-8"))
+                found |= {node.value.partition(":")[0] for node in ast.walk(tree) if isinstance(node, ast.Constant)
+                          and isinstance(node.value, str)}  # fmt: skip
+    return found
+
+
+def test_no_code_is_left_over() -> None:
+    assert set(WORDS) - written() == set()
+
+
 def test_every_code_that_is_shown_has_its_sentences() -> None:
     assert len(cautions()) >= 18
     assert cautions() | set(get_args(State)) | set(get_args(Kind)) | set(get_args(End)) <= set(WORDS)
@@ -37,7 +63,9 @@ def test_every_code_that_is_shown_has_its_sentences() -> None:
         assert means.endswith(".") and do.endswith(".") and means != do, code
 
 
-@pytest.mark.parametrize("code", sorted(cautions() | {"hold", "torn", "altered", "outside_validity"}))
+@pytest.mark.parametrize(
+    "code", sorted(cautions() | {"hold", "silent", "unknown", "torn", "altered", "outside_validity"})
+)
 def test_explain_says_the_same(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", code, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import json
 import re
 import shutil
 from pathlib import Path
@@ -82,7 +83,9 @@ def test_an_expired_certificate_is_said_with_its_date(
     assert "valid from" in str(ended.wrong_at(ended.begins - datetime.timedelta(days=1)))
     assert ended.wrong_at(ended.begins + datetime.timedelta(hours=1)) is None
     assert remarks(ended, ended.ends - datetime.timedelta(days=31)) == []
-    assert "in 12 day(s)" in remarks(ended, ended.ends - datetime.timedelta(days=12))[0]
+    (soon,) = remarks(ended, ended.ends - datetime.timedelta(days=12))
+    assert "in 12 day(s)" in soon and soon.code == "certificate_ends"
+    assert [one.code for one in remarks(None, ended.ends)] == ["certificates_unread"]
 
 
 @pytest.mark.parametrize(
@@ -109,7 +112,13 @@ def test_open_doors_and_numbered_ports_are_warned_of(tmp_path: Path, capsys: pyt
     for words in ("zenoh.listen tcp/0.0.0.0:7447", "zenoh.connect tcp/router.shop:7447", "zenoh.unproven_commands",
                   "port /dev/ttyUSB0 goes by the order of plugging in"):  # fmt: skip
         assert words in said, words
-    assert said.count("\n") == 4
+    assert said.count("\n") == 4 and "may be another adapter's after a restart" in said
+    codes = ["numbered_port", "open_listen", "unsecured_connect", "unproven_commands"]
+    assert re.findall(r"\[(\w+)\]$", said, re.MULTILINE) == codes
+    assert main(["check", "--config", str(config), "--json"]) == 0
+    out = capsys.readouterr()
+    found = json.loads(out.out)
+    assert found["warning_codes"] == codes and len(found["warnings"]) == 4
     written(tmp_path, 'listen = ["tcp/[::1]:7447", "tcp/127.0.0.1:7447"]\n', rtu="/dev/serial/by-id/usb-x-port0")
     assert main(["check", "--config", str(config)]) == 0
     assert capsys.readouterr().err == ""

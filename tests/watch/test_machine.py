@@ -86,6 +86,7 @@ def test_an_old_offset_that_arrives_now_is_silent_and_the_clocks_are_doubted(hea
     heard.hear(offset=offset(5, START_NS - 600 * NS))
     assert heard.machine["shown"] == "silent"
     assert any("clocks is wrong" in text for text in heard.machine["warnings"])
+    assert heard.machine["warning_codes"] == ["old_messages"]
 
 
 def test_a_missing_channel_is_missing(heard: Heard) -> None:
@@ -116,7 +117,7 @@ def test_malformed_messages_are_counted_and_change_nothing(heard: Heard, payload
     after = heard.machine
     assert after["malformed"] == 1 and after["last_malformed"].startswith("offset:") and after["tone"] == "warn"
     changed = {name for name in before if before[name] != after[name]}
-    assert changed == {"malformed", "last_malformed", "warnings", "tone"}
+    assert changed == {"malformed", "last_malformed", "warnings", "warning_codes", "tone"}
 
 
 def test_what_is_repeated_or_late_changes_nothing_and_is_counted(heard: Heard) -> None:
