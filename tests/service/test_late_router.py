@@ -58,3 +58,17 @@ def test_the_service_ends_at_once_while_it_waits() -> None:
     with Publisher(settings, lambda *_: {}) as service:
         service.publish("offset", b"{}")
     service.close()
+
+
+def test_a_client_that_leaves_is_no_lost_link(caplog: pytest.LogCaptureFixture) -> None:
+    port = free_port()
+    settings = Zenoh(prefix="shop/vmc-07", mode="peer", listen=[f"tcp/127.0.0.1:{port}"])
+    client = Zenoh(prefix="shop/vmc-07", mode="client", connect=[f"tcp/127.0.0.1:{port}"])
+    with caplog.at_level(logging.INFO), Publisher(settings, lambda *_: {}):
+        with zenoh.open(session_config(client)) as session:
+            number = str(session.zid())
+        for _ in range(600):
+            if f"client {number} is gone" in caplog.text:
+                break
+            threading.Event().wait(0.05)
+    assert f"client {number} is gone" in caplog.text and "tried again" not in caplog.text
