@@ -12,6 +12,7 @@ import msgspec
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Sample
 from compensator.recording import decode, machines_in, read_messages
+from compensator.whole import whole_file
 
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
@@ -54,8 +55,7 @@ def export(recording: Path, out: Path, machine: str = "") -> int:
         row["t_s"] = (row.pop("_ns") - start) / 1e9
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     names.sort(key=lambda name: ("time_utc", "t_s", "seq").index(name) if name in ("time_utc", "t_s", "seq") else 3)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(out) as file:
         writer = csv.DictWriter(file, names, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows.values())

@@ -287,10 +287,6 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Not every sample could be worked out again from what the recording carries.",
         "Audit with the version that wrote it; what is named beside it was not checked.",
     ),
-    "no_chain": (
-        "The file was recorded without a hash chain; that nothing was changed is not proven.",
-        "Treat it as not proven; recordings of this version have a chain.",
-    ),
     "samples_missing": (
         "Samples between others were not recorded.", "Look at the events before and behind them: pauses, the disk."),
     "published_early": (

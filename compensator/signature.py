@@ -74,7 +74,10 @@ class Verifier:
         try:
             key = load_pem_public_key(data)
         except (ValueError, TypeError) as error:
-            raise UsageError(f"{path}: no PEM public key") from error
+            if b"PRIVATE KEY" in data:
+                words = "is a private key, which stays on its machine; expected the public one (openssl pkey -pubout)"
+                raise UsageError(f"{path}: {words}") from error
+            raise UsageError(f"{path}: no PEM public key, expected the machine's (openssl pkey -pubout)") from error
         if not isinstance(key, Ed25519PublicKey):
             raise UsageError(f"{path}: {type(key).__name__}, expected an Ed25519 public key")
         self._key: Any = key

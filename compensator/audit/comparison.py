@@ -146,7 +146,7 @@ def compare(
                 if told is not None and count % 1000 == 0:
                     told(done + container.position, whole)
         done += path.stat().st_size
-    return run.result()
+    return run.result(ordered)
 
 
 def _in_order(paths: Sequence[Path]) -> list[Path]:
@@ -253,10 +253,11 @@ class _Run:
             cells = ["" if math.isnan(value) else repr(value) for value in values]
             self._row([utc(time_ns), sample.seq, *cells, outcome.offset.state])
 
-    def result(self) -> Comparison:
-        """Return the figures."""
+    def result(self, paths: Sequence[Path]) -> Comparison:
+        """Return the figures; the files are named where there are none."""
         if not self._result.samples:
-            raise DataError("no samples in the recordings")
+            names = ", ".join(path.name for path in paths[:3])
+            raise DataError(f"{names}: no samples in it, expected recordings of a machine's service")
         self._result.recorded = ", ".join(self._names)
         return self._result
 

@@ -161,6 +161,7 @@ class _Audit:
             error = damage
         if not self._contents.channels and not isinstance(error, Torn):
             raise error or DataError(f"{self._name}: no channels in it, expected a recording")
+        self._check_ours()
         self._begin()
         assert self._check is not None
         chained = bool(self._check.head)
@@ -222,9 +223,25 @@ class _Audit:
         try:
             self._work.group(records)
         except DataError as error:
-            self._findings.add("unreadable", str(error).removeprefix(f"{self._name}: "))
+            self._findings.add("unreadable", self._bare(str(error)))
             # Without this message all that follows would come out differently.
             self._why_not = f"not worked out from here on: {error}"
+
+    def _bare(self, text: str) -> str:
+        return text.removeprefix(f"{self._name}: ")
+
+    def _check_ours(self) -> None:
+        """Refuse a file that no machine's service wrote; nobody can say of it that it was changed."""
+        contents = self._contents
+        topics = {channel.topic for channel in contents.channels.values()}
+        if contents.metadata or contents.attachments or not topics or topics & {"/sample", "/offset", "/chain"}:
+            return
+        if any("/thermal/" in topic for topic in topics):
+            raise DataError(f"{self._name}: a shop's recording, which has no hash chain; expected the machines' own")
+        there = ", ".join(sorted(topics))[:80]
+        raise DataError(
+            f"{self._name}: no recording of this service: expected /sample, /offset and /chain, got {there}"
+        )
 
     def _tell(self) -> None:
         if self._told is not None:
@@ -238,10 +255,11 @@ class _Audit:
         """Say how the file ends: what a kill leaves is told from what it cannot leave."""
         assert self._check is not None
         sealed, unlisted = self._check.seals.last, len(self._rest)
-        run = self._contents.metadata.get("run", {})
-        expected = "previous_chain" in run
-        if expected and not self._check.head and self._contents.messages:
-            self._findings.add("removed", "the recorder writes it, and it is not there", topic="channel /chain")
+        if not self._check.head and self._contents.messages:
+            text = "the recorder writes it, and it is not there: nothing shows that the file is as it was written"
+            self._findings.add("removed", text, topic="channel /chain")
+        if self._work is None and self._contents.messages:
+            self._findings.add("unreadable", f"its samples cannot be worked out again: {self._bare(self._why_not)}")
         if error is None:
             self._end = "recovered" if sealed == "recovered" else "finished"
             if self._check.head and unlisted:

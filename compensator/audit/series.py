@@ -192,13 +192,7 @@ class _Judge:
         if not file.last and file.end in ("open", "torn"):
             self.remarks.append(Caution("torn", f"{file.file}: torn before anything was recorded."))
             return
-        if not file.last:
-            self.remarks.append(
-                Caution(
-                    "no_chain", f"{file.file}: recorded without a hash chain; that nothing was changed is not proven."
-                )
-            )
-        elif file.end == "recovered":
+        if file.end == "recovered":
             self.remarks.append(
                 Caution("recovered", f"{file.file}: the service was ended hard; every whole record was kept.")
             )

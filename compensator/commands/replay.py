@@ -16,6 +16,7 @@ from compensator.commands.progress import progress
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
 from compensator.model.model_file import load_model
+from compensator.whole import whole_file
 
 if TYPE_CHECKING:
     from compensator.report.page import Page
@@ -69,7 +70,7 @@ def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) 
         from compensator.audit.pages import Curves
 
         curves = Curves()
-    with progress("comparing") as told, out.open("w", newline="", encoding="utf-8") if out else nullcontext() as file:
+    with progress("comparing") as told, whole_file(out) if out else nullcontext() as file:
         row = None
         if file is not None:
             row = csv.writer(file, lineterminator="\n").writerow

@@ -15,6 +15,7 @@ from compensator.commands.outputs import checked_file
 from compensator.model.model_file import load_model
 from compensator.simulation import csv_rows, scores, simulate
 from compensator.tables import load_data, require, roles_of
+from compensator.whole import whole_file
 
 log = logging.getLogger("compensator")
 
@@ -38,8 +39,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         require(arguments.data, record, ("t_q_degc", "at_degc"))
     parts = [simulate(model, record, source=str(arguments.data)) for record in data.records]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with out.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(out) as file:
         csv.writer(file, lineterminator="\n").writerows(csv_rows(columns, COLUMNS))
     result: dict[str, Any] = {
         "samples": int(columns["t_s"].size),

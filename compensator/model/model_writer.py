@@ -5,9 +5,7 @@ from __future__ import annotations
 import datetime
 import json
 import math
-import os
 import re
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import Any
@@ -17,6 +15,7 @@ import numpy as np
 from compensator.errors import ModelError
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
+from compensator.whole import whole_file
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -44,24 +43,16 @@ def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
 
     Examples
     --------
+    >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     len(write_model(FilePath(folder) / "copy.toml", load_model("quill")).sha256)
     64
     """
-    data = dump_model(model).encode("utf-8")
-    parse_model(data, source=str(path))  # before the old file goes: the reader knows bounds that the model does not
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    temporary = FilePath(name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    text = dump_model(model)
+    # Before the old file goes: the reader knows bounds that the model does not.
+    parse_model(text.encode("utf-8"), source=str(path))
+    with whole_file(path) as file:
+        file.write(text)
     return load_model(path.absolute())  # a bare "quill" is the name of a built-in model
 
 

@@ -176,7 +176,8 @@ class _Reader:
         self._close()
         history = self.history
         if not history.whole.samples or not history.states:
-            raise DataError("no samples in the recordings")
+            names = ", ".join(file.name for file in history.files[:3])
+            raise DataError(f"{names}: no samples in it, expected recordings of a machine's service")
         history.episodes.sort(key=lambda episode: episode.number)
         return history
 

@@ -6,8 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
 from compensator.cli import main
+from compensator.container import Contents
 from compensator.recording import recordings
 from tests.audit.made import MACHINE, Service
 from tests.audit.tampering import find, lines_of, rewrite
@@ -66,6 +68,8 @@ def test_what_cannot_be_read_is_one_line_and_exit_code_2(
     rewrite(no_config, lambda lines: [line for line in lines if line.topic not in ("chain", "seal")],
             contents=lambda contents: contents.attachments.pop("config.toml") and None)  # type: ignore[func-returns-value]  # fmt: skip
     (tmp_path / "empty").mkdir()
+    private = tmp_path / "key.pem"
+    private.write_text("-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n")
     for arguments, expected in (
         ([str(text)], "day.csv: not an MCAP file"),
         ([str(random)], "random.mcap: not an MCAP file"),
@@ -73,6 +77,7 @@ def test_what_cannot_be_read_is_one_line_and_exit_code_2(
         ([str(tmp_path / "empty")], "empty: no recordings in it"),
         ([str(rec), "--out", "x.csv"], "--out: is for --model"),
         ([str(rec), "--public-key", str(text)], "day.csv: no PEM public key"),
+        ([str(rec), "--public-key", str(private)], "key.pem: is a private key"),
         ([str(rec), "--public-key", str(text), "--model", "quill"], "--public-key: belongs to the audit"),
         ([str(rec), "--model", str(tmp_path / "none.toml")], "none.toml"),
         ([str(no_config), "--model", "quill"], "attachment config.toml is missing"),
@@ -89,3 +94,53 @@ def test_an_intact_recording_that_says_nonsense_is_named(rec: Path, capsys: pyte
     assert main(["replay", str(rec)]) == 3
     out = capsys.readouterr().out
     assert "unreadable: /sample record" in out and "20 samples" in out
+
+
+def test_a_recording_without_any_trace_of_its_chain_proves_nothing(
+    rec: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tampered(rec)
+
+    def bare(contents: Contents) -> None:
+        for topic in ("chain", "seal"):
+            number = next(n for n, channel in contents.channels.items() if channel.topic == f"/{topic}")
+            del contents.channels[number]
+        run = contents.metadata["run"]
+        for key in [key for key in run if key.startswith("previous")]:
+            del run[key]
+
+    rewrite(rec, lambda lines: [line for line in lines if line.topic not in ("chain", "seal")], contents=bare)
+    assert main(["replay", str(rec)]) == 3
+    assert f"{rec.name}: removed: channel /chain: the recorder writes it" in capsys.readouterr().out
+
+
+def test_samples_that_cannot_be_worked_out_again_prove_nothing(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def bare(contents: Contents) -> None:
+        del contents.attachments["config.toml"]
+        contents.metadata.pop("run")
+
+    rewrite(rec, lambda lines: [line for line in lines if line.topic not in ("chain", "seal")], contents=bare)
+    assert main(["replay", str(rec)]) == 3
+    assert "unreadable: its samples cannot be worked out again: attachment config.toml" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("topic", "expected"),
+    [("/temperature", "no recording of this service"), ("/shop/vmc-07/thermal/sample", "a shop's recording")],
+)
+def test_a_file_that_no_service_wrote_is_no_clean_recording(
+    rec: Path, capsys: pytest.CaptureFixture[str], topic: str, expected: str
+) -> None:
+    foreign = rec.with_name("foreign.mcap")
+    with foreign.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel(topic, "json", schema), 0, b"{}", 0)
+        writer.finish()
+    assert main(["replay", str(rec.parent)]) == 2
+    said = capsys.readouterr()
+    assert not said.out and said.err.count("\n") == 1 and f"foreign.mcap: {expected}" in said.err
+    for other in (["replay", str(foreign), "--model", "quill"], ["report", str(foreign), "--out", f"{foreign}.html"]):
+        assert main(other) == 2
+        assert "foreign.mcap: no samples in it" in capsys.readouterr().err

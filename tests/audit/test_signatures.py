@@ -139,7 +139,7 @@ def test_what_is_no_key_is_said(tmp_path: Path) -> None:
         Signer(wrong)
     with pytest.raises(ConfigError, match="no PEM private key"):
         Signer(public)
-    with pytest.raises(UsageError, match="no PEM public key"):
+    with pytest.raises(UsageError, match="is a private key"):
         Verifier(private)
     with pytest.raises(UsageError, match="expected a key"):
         Verifier(tmp_path / "none.pem")

@@ -124,3 +124,11 @@ def test_an_error_of_the_system_is_told_without_its_number(
     monkeypatch.setattr("compensator.commands.export.export", full)
     assert main(["export", str(tmp_path / "day.mcap"), "--out", str(tmp_path / "o.csv")]) == 1
     assert capsys.readouterr().err == f"compensator: {tmp_path / 'o.csv'}: No space left on device\n"
+
+
+def test_what_fails_half_way_leaves_no_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recording, out = tmp_path / "day.mcap", tmp_path / "both.csv"
+    recording.write_text("no recording")
+    words = ["replay", str(recording), "--model", "quill", "--out", str(out)]
+    refused(capsys, words, "day.mcap: not an MCAP file, expected a recording")
+    assert [path.name for path in tmp_path.iterdir()] == ["day.mcap"]

@@ -1,0 +1,46 @@
+"""Files that are there wholly or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TextIO
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[TextIO]:
+    r"""Give a file to write text to; it takes its place once it is whole, and is gone where something fails.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Where it is to go; its folder is made. What stood there before stays until then.
+
+    Yields
+    ------
+    typing.TextIO
+        Open for UTF-8 text; line ends are written as they are given.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     with whole_file(Path(folder) / "a.csv") as file:
+    ...         _ = file.write("t_s,y_um\n")
+    ...     os.listdir(folder)
+    ['a.csv']
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "w", newline="", encoding="utf-8") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
