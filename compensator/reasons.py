@@ -207,7 +207,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "others_unknown": (
         "No router is reached, so whether another service of this machine is alive elsewhere is not known.",
-        "Look whether the router runs; it is asked once, at the start.",
+        "Look whether the router runs; it is asked at the start only.",
     ),
     "router_not_reached": (
         "There is no connection to the router yet; compensation and recording go on, and it is tried again.",

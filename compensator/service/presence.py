@@ -27,6 +27,8 @@ from compensator.service.session import put, session_config
 
 log = logging.getLogger("compensator")
 
+#: So long a router that refuses is asked again at the start, s.
+REACHED_S = 1.0
 #: So long the token of a service that is gone without a sign may stand (the lease, and some more), s.
 STALE_S = 6.0
 #: So long one that starts waits for others that do, s.
@@ -96,7 +98,7 @@ def sole_voice(settings: Zenoh) -> Iterator[None]:
     with ExitStack() as held:
         if settings.connect:
             try:
-                session = held.enter_context(zenoh.open(_asking(settings)))
+                session = held.enter_context(_reached(settings))
             except zenoh.ZError:
                 if settings.mode == "client":  # it can say nothing either
                     raise
@@ -105,6 +107,21 @@ def sole_voice(settings: Zenoh) -> Iterator[None]:
             else:
                 held.callback(_claim(session, settings.prefix).undeclare)
         yield
+
+
+def _reached(settings: Zenoh) -> Any:
+    """Open a session; a router that a whole shop asks at once is asked again after a moment.
+
+    A client without its router comes back here by itself.
+    """
+    end = time.monotonic() + REACHED_S
+    while True:
+        try:
+            return zenoh.open(_asking(settings))
+        except zenoh.ZError:
+            if settings.mode == "client" or time.monotonic() > end:
+                raise
+            time.sleep(REACHED_S / 5.0)
 
 
 def _asking(settings: Zenoh) -> zenoh.Config:

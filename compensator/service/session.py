@@ -71,12 +71,18 @@ def session_config(settings: Zenoh) -> zenoh.Config:
     return config
 
 
+#: Participants that a router lets in at one time.
+PENDING = 1000
+
+
 def make_room(config: zenoh.Config) -> None:
     """Have a router keep what a whole shop says at one instant.
 
     Services whose clocks agree publish at the same time, and what does not fit on the way to one listener is dropped.
-    Packets of 64 KiB, for each client; 16 are the most that Zenoh takes.
+    Packets of 64 KiB, for each client; 16 are the most that Zenoh takes. After a power cut all of them connect at once,
+    two sessions each; Zenoh's own limit refuses those beyond a hundred that are just being let in.
     """
+    put(config, "transport/unicast/accept_pending", PENDING)
     for priority in ("interactive_high", "data"):
         put(config, f"transport/link/tx/queue/size/{priority}", 16)
 

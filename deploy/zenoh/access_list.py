@@ -102,8 +102,8 @@ def router(shop: dict[str, Any]) -> dict[str, Any]:
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "adminspace": {"enabled": False},
         "transport": {
-            # A second link under the name of a client that is there is refused.
-            "unicast": {"max_links": 1},
+            # A second link under the name of a client that is there is refused. After a power cut all come at once.
+            "unicast": {"max_links": 1, "accept_pending": 1000},
             # Else what is long would pass by the links, through memory that others on this computer can open.
             "shared_memory": {"enabled": False},
             "link": {

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -101,10 +103,12 @@ def route(port: int) -> None:
     with zenoh.open(session_config(Zenoh(prefix="router", mode="router", listen=[f"tcp/127.0.0.1:{port}"]))):
         say("ready")
         sys.stdin.read()
+        time.sleep(1.0)  # where all are ended at once, those that would complain go first
 
 
 def publish(port: int, first: int, count: int, period_s: float, samples: int) -> None:
     """Be some machines: open, wait until somebody hears each, and publish on the second that is told."""
+    lines = obeyed()
     names = [f"vmc-{i:03d}" for i in range(first, first + count)]
     publishers = [
         Publisher(Zenoh(prefix=f"shop/{name}", mode="peer", connect=[f"tcp/127.0.0.1:{port}"]),
@@ -117,14 +121,30 @@ def publish(port: int, first: int, count: int, period_s: float, samples: int) ->
         while not all(one.matching_status.matching for p in publishers for one in p._publishers.values()):
             time.sleep(0.05)
         say("ready")
-        start = float(sys.stdin.readline())
+        start = float(lines.get())
         for seq in range(samples):
             time.sleep(max(start + seq * period_s - time.time(), 0.0))
             for publisher, name in zip(publishers, names, strict=True):
                 for kind, data in messages(name, seq):
                     publisher.publish(kind, data)
         say("done")
-        sys.stdin.read()
+        threading.Event().wait()
+
+
+def obeyed() -> queue.SimpleQueue[str]:
+    """Return the lines of stdin; at its end this process is over at once.
+
+    As if killed: 50 sessions that close one after the other would each say meanwhile that the router is gone.
+    """
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in sys.stdin:
+            lines.put(line)
+        os._exit(0)
+
+    threading.Thread(target=read, daemon=True).start()
+    return lines
 
 
 class Late:
@@ -174,7 +194,8 @@ def cpu_seconds(pid: int) -> float:
 def started(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], IO[str], IO[str]]]:
     """Run this module as a process of its own; yield it when it is ready."""
     command = [sys.executable, "-m", "tests.bench.shop", *map(str, arguments)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    # A group of its own: Ctrl-C reaches this process alone, which ends machines and watch before their router.
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
                           cwd=Path(__file__).parents[2]) as process:  # fmt: skip
         try:
             assert process.stdin is not None and process.stdout is not None

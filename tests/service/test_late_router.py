@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from compensator.config import Zenoh
+from compensator.service import presence
 from compensator.service import publisher as publisher_module
 from compensator.service.publisher import Publisher
 from compensator.service.session import session_config
@@ -72,3 +73,23 @@ def test_a_client_that_leaves_is_no_lost_link(caplog: pytest.LogCaptureFixture) 
                 break
             threading.Event().wait(0.05)
     assert f"client {number} is gone" in caplog.text and "tried again" not in caplog.text
+
+
+def test_a_router_that_is_asked_by_a_whole_shop_at_once_is_asked_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    real, refused = zenoh.open, []
+
+    def opened(config: zenoh.Config) -> zenoh.Session:
+        if not refused:
+            refused.append(config)
+            raise zenoh.ZError("the router lets too many in")
+        return real(config)
+
+    monkeypatch.setattr(presence.zenoh, "open", opened)
+    monkeypatch.setattr(presence, "REACHED_S", LONG_S / 20)
+    port = free_port()
+    settings = Zenoh(prefix="shop/vmc-07", mode="peer", connect=[f"tcp/127.0.0.1:{port}"])
+    with router(port), caplog.at_level(logging.WARNING), presence.sole_voice(settings):
+        assert refused
+    assert "others_unknown" not in caplog.text
