@@ -1,6 +1,6 @@
 "use strict";
 // Asks every other second for what is known and draws it. Everything that comes from a machine is put in as text.
-const POLL_MS = 2000, DAY_S = 86400, SIGNS = {good: "✓", warn: "⚠", bad: "✗"};
+const POLL_MS = 2000, NEEDY = 10, DAY_S = 86400, SIGNS = {good: "✓", warn: "⚠", bad: "✗"};
 const TONES = {ok: "good", starting: "warn", degraded: "warn", hold: "bad", fault: "bad"};
 const $ = (id) => document.getElementById(id);
 let past = {prefix: null, history: null}, drawn = "", lastAnswer = null, effects = [], current = null;
@@ -18,7 +18,12 @@ const signed = (value, digits = 2) => known(value) ? (value < 0 ? "−" : "+") +
 const plain = (value, digits = 2) => known(value) ? (value < 0 ? "−" : "") + Math.abs(value).toFixed(digits) : "–";
 const clock = (t_s, seconds = false) => new Date(1000 * t_s).toLocaleTimeString("en-GB",
   seconds ? {} : {hour: "2-digit", minute: "2-digit"});
-const stamp = (t_s) => `${new Date(1000 * t_s).toLocaleDateString("en-CA")} ${clock(t_s, true)}`;
+const zone = (t_s) => {
+  const date = new Date(1000 * t_s), ahead = -date.getTimezoneOffset(), two = (n) => String(n).padStart(2, "0");
+  return ahead ? `UTC${ahead < 0 ? "−" : "+"}${two(Math.floor(Math.abs(ahead) / 60))}:${two(Math.abs(ahead) % 60)}` : "UTC";
+};
+const day = (t_s) => new Date(1000 * t_s).toLocaleDateString("en-CA");
+const stamp = (t_s) => `${day(t_s)} ${clock(t_s, true)}`;
 const age = (s) => !known(s) ? "–" : s < 120 ? `${Math.max(s, 0).toFixed(0)} s` : s < 3600 ? `${Math.floor(s / 60)} min`
   : s < 172800 ? `${Math.floor(s / 3600)} h ${Math.floor(s % 3600 / 60)} min` : `${(s / 86400).toFixed(1)} d`;
 const wordLink = (code) => make("a", {href: `#word=${code.split(":")[0]}`}, code);
@@ -48,18 +53,20 @@ async function turn() {
     connection(shop.status);
   } catch (error) {
     const since = lastAnswer ? lastAnswer.toLocaleTimeString("en-GB") : "the start";
-    verdict("bad", `The watch has not answered since ${since}: what stands below is old. Start compensator watch --page again.`);
+    verdict("bad", "old", `The watch has not answered since ${since}: what stands below is old. Start compensator watch --page again.`);
   }
 }
 
 function connection(status) {
   const text = status.connected ? `Connected to ${status.where}.` : `No connection to ${status.where}; trying again. What stands here is old.`;
   say($("note"), text + (status.ignored ? ` ${status.ignored} message(s) with keys or of machines that are not followed.` : ""));
+  const now_s = Date.now() / 1000, place = Intl.DateTimeFormat().resolvedOptions().timeZone;
+  say($("zone"), `Times of day are of this computer's time zone, ${place === "UTC" ? "" : `${place}, `}${zone(now_s)}.`);
   $("note").className = status.connected ? "note" : "note tone is-bad";
 }
 
-function verdict(tone, text) {
-  const element = $("verdict"), words = {good: "✓ good", warn: "⚠ mind", bad: "✗ no"}[tone];
+function verdict(tone, word, text) {
+  const element = $("verdict"), words = `${SIGNS[tone]} ${word}`;
   if (element.textContent === words + text) return;
   element.className = `verdict ${tone}`;
   element.replaceChildren(make("b", {}, words), text);
@@ -72,7 +79,12 @@ function showShop(shop, missing) {
   say($("title"), "Thermal compensation, live"); document.title = "Machines, live";
   const tones = shop.machines.map((one) => one.tone);
   const tone = !tones.length || tones.includes("bad") ? "bad" : tones.includes("warn") ? "warn" : "good";
-  verdict(tone, missing !== null ? `Nothing is heard of ${missing}.` : shop.headline);
+  if (missing !== null) verdict("bad", "silent", `Nothing is heard of ${missing}.`);
+  else verdict(tone, {good: "all well", warn: "mind", bad: "look"}[tone], shop.headline);
+  const needy = shop.machines.filter((one) => one.tone !== "good");
+  const lines = needy.slice(0, NEEDY).map((one) => [make("b", {}, `${SIGNS[one.tone]} ${one.prefix} ${one.shown}: `), one.to_do]);
+  if (needy.length > NEEDY) lines.push([`… and ${needy.length - NEEDY} more.`]);
+  list("todo", lines, "warning");
   const body = $("machines").tBodies[0], focused = document.activeElement && document.activeElement.id;
   const rows = new Map([...body.rows].map((row) => [row.dataset.prefix, row]));
   shop.machines.forEach((machine, i) => {
@@ -114,11 +126,11 @@ async function showOne(prefix, count) {
   $("shop").hidden = true; $("machine").hidden = false; $("all").hidden = count < 2;
   say($("title"), machine.machine === prefix ? prefix : `${machine.machine} (${prefix})`);
   document.title = `${SIGNS[machine.tone]} ${machine.machine} ${machine.shown}`;
-  verdict(machine.tone, sentence(machine));
+  verdict(machine.tone, machine.shown, sentence(machine));
   pictures(machine, past.history, found.now_s);
   list("why", machine.reasons.map((reason) => [wordLink(reason.code), `: ${reason.means} `, make("b", {}, "To do: "), reason.do]), "warning");
   list("mind", machine.warnings.map((text, i) => [text, " ", wordLink(machine.warning_codes[i])]), "warning");
-  now(machine); events(machine.events); spells(past.history); channels(machine); points(past.history);
+  bad(machine); now(machine); events(machine.events); spells(past.history); channels(machine); points(past.history);
 }
 
 function joined(before, news, now_s) {
@@ -131,10 +143,10 @@ function joined(before, news, now_s) {
 
 function sentence(machine) {
   const offset = `${signed(machine.y_offset_um)} µm`;
-  if (machine.shown === "silent") return `silent for ${age(machine.age_s)}; the last offset was ${offset}. ${machine.means} ${machine.do}`;
+  if (machine.shown === "silent") return `for ${age(machine.age_s)}; the last offset was ${offset}. ${machine.means} ${machine.do}`;
   if (machine.shown === "unknown") return `${machine.means} ${machine.do}`;
   const rest = machine.tone === "good" ? "" : ` ${machine.do}`;
-  return `${machine.shown}: offset ${offset}. ${machine.means}${rest}`;
+  return `${known(machine.y_offset_um) ? `offset ${offset}` : "no offset"}. ${machine.means}${rest}`;
 }
 
 function list(id, lines, kind) {
@@ -153,9 +165,16 @@ function fill(table, rows) {
   body.replaceChildren(...rows.map((cells) => make("tr", {}, ...cells.map((cell, i) => make(i ? "td" : "th", i ? {} : {scope: "row"}, cell)))));
 }
 
+function bad(machine) {
+  const channels = Object.entries(machine.channels).filter(([, one]) => one.quality !== "good").map(([name, one]) =>
+    [`${name}: `, wordLink(one.quality), `: ${one.means} `, make("b", {}, "To do: "), one.do]);
+  const devices = Object.entries(machine.devices ?? {}).filter(([, error]) => error !== "ok").map(([name, error]) => [`${name}: ${error}`]);
+  list("bad", [...channels, ...devices], "warning");
+}
+
 function now(machine) {
-  fill($("now"), [
-    ["age of the offset", age(machine.age_s)], ["valid for", age(machine.valid_for_s)],
+  tiles($("now"), [
+    [machine.shown === "silent" ? "last offset, µm" : "offset, µm", signed(machine.y_offset_um)], ["age of the offset", age(machine.age_s)], ["valid for", age(machine.valid_for_s)],
     ["rate, µm/min", signed(machine.y_offset_rate_um_per_min)], ["standard deviation, µm", plain(machine.y_offset_std_um)],
     ["measured Y, µm", signed(machine.y_um)], ["predicted Y, µm", signed(machine.y_pred_um)],
     ["residual, µm", signed(machine.residual_um)],
@@ -165,6 +184,13 @@ function now(machine) {
     ["malformed messages", String(machine.malformed)],
     ["model", `${machine.model ?? "–"} ${(machine.model_sha256 ?? "").slice(0, 12)}`], ["recording", machine.recording || "–"],
   ]);
+}
+
+function tiles(element, pairs) {
+  const key = JSON.stringify(pairs);
+  if (element.dataset.key === key) return;
+  element.dataset.key = key;
+  element.replaceChildren(...pairs.map(([name, value]) => make("div", {}, make("dt", {}, name), make("dd", {}, value))));
 }
 
 function events(found) {
@@ -184,7 +210,7 @@ function spells(history) {
     else found.push({from: t, to: t, state, reasons});
   });
   fill($("spells"), found.reverse().slice(0, 30).map((one) =>
-    [clock(one.from), `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.to - one.from + 60), one.reasons]));
+    [day(one.from) === day(Date.now() / 1000) ? clock(one.from) : `${day(one.from)} ${clock(one.from)}`, `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.to - one.from + 60), one.reasons]));
 }
 
 function channels(machine) {
@@ -260,7 +286,7 @@ function chart(frame, title, unit, series, states) {
     make("text", {x: left - 6, y: y(v) + 4, "text-anchor": "end"}, plain(v, rungs.digits)));
   for (const s of hours(from, end, width / 75)) svg.append(make("line", {x1: x(s), x2: x(s), y1: top, y2: tall + strip, class: "axis"}),
     make("text", {x: Math.min(Math.max(x(s), left), width - 20), y: tall + strip + 16, "text-anchor": "middle"}, clock(s)));
-  svg.append(make("text", {x: width - right, y: height - 6, "text-anchor": "end"}, "time of day, h:min"), make("text", {x: 2, y: height - 6}, `${title.split(/[:,]/)[0].toLowerCase().replace("share of each path in the predicted deformation", "share")}, ${unit}`));
+  svg.append(make("text", {x: width - right, y: height - 6, "text-anchor": "end"}, `time of day, ${zone(end)}`), make("text", {x: 2, y: height - 6}, `${title.split(/[:,]/)[0].toLowerCase().replace("share of each path in the predicted deformation", "share")}, ${unit}`));
   series.forEach((one, i) => {
     if (one.band) svg.append(make("path", {d: bands(t, one, from, x, y), class: `band c${i}`}));
     svg.append(make("path", {d: curve(t, one.y, from, x, y), class: `curve c${i}`}));

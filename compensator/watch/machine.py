@@ -12,7 +12,7 @@ from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offse
 from compensator.reasons import Caution
 from compensator.watch.history import History, usable
 from compensator.watch.sequence import Sequence
-from compensator.watch.words import TONES, Tone, age, in_words, to_do
+from compensator.watch.words import TONES, Tone, Words, age, in_words, to_do
 
 #: Kinds of messages by what stands behind `thermal/` in their key.
 KINDS = {"y/offset": "offset", "sample": "sample", "estimate": "estimate", "status": "status", "event": "event"}
@@ -226,7 +226,8 @@ class Machine:
             "means": in_words(shown).means, "do": in_words(shown).do, "alive": self.alive,
             "state": offset.state if offset else None,
             "reasons": [words._asdict() for words in reasons],
-            "warnings": list(warnings), "warning_codes": [warning.code for warning in warnings],
+            "to_do": _to_do(shown, reasons, warnings), "warnings": list(warnings),
+            "warning_codes": [warning.code for warning in warnings],
             "seq": offset.seq if offset else None, "time_utc_ns": offset.time_utc_ns if offset else None,
             "age_s": round(old_s, 3) if old_s is not None else None,
             "valid_for_s": offset.valid_for_s if offset else None,
@@ -271,7 +272,13 @@ class Machine:
         if sample is None or not self._fresh(sample, now_ns):
             return {"t_q_degc": None, "at_degc": None, "period_s": None, "channels": {}}
         channels = {
-            name: {"mean": usable(sample, name), "quality": channel.quality, "errors": channel.errors}
+            name: {
+                "mean": usable(sample, name),
+                "quality": channel.quality,
+                "errors": channel.errors,
+                "means": in_words(channel.quality).means,
+                "do": in_words(channel.quality).do,
+            }
             for name, channel in sample.channels.items()
         }
         return {"t_q_degc": usable(sample, "t_q_degc"), "at_degc": usable(sample, "at_degc"),
@@ -280,3 +287,11 @@ class Machine:
     @staticmethod
     def _event(event: Event) -> dict[str, Any]:
         return {"time_utc_ns": event.time_utc_ns, "kind": event.kind, "text": event.text, "do": to_do(event)}
+
+
+def _to_do(shown: str, reasons: list[Words], warnings: list[Caution]) -> str:
+    """Return in one line what is to be done; what the service said last is no news of one that is silent."""
+    asked = [words.do for words in reasons if shown not in ("silent", "unknown")]
+    if not asked and not (warnings and shown == "ok"):
+        asked = [in_words(shown).do]
+    return " ".join(dict.fromkeys([*asked, *map(str, warnings)]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
@@ -13,18 +12,19 @@ from rich.table import Table
 from rich.text import Text
 
 from compensator.clock import NS
+from compensator.watch.day import STYLES, drawn, evenly, sparkline, spells
 from compensator.watch.shop import Shop, headline
-from compensator.watch.words import SIGNS, age, plain, signed
+from compensator.watch.words import SIGNS, age, here, plain, signed, zone
 
-_STYLES = {"good": "green", "warn": "yellow", "bad": "bold red"}
-_BARS = "▁▂▃▄▅▆▇█"
 #: Width from which on a column is shown in the table of a shop: (heading, least width of the terminal).
 _COLUMNS = (
     ("machine", 0), ("state", 0), ("offset µm", 0), ("µm/min", 100), ("std µm", 100), ("residual µm", 84),
     ("T_Q °C", 120), ("AT °C", 120), ("age", 0), ("alive", 72), ("last 24 h", 140), ("why", 60),
 )  # fmt: skip
-#: Events shown of one machine.
-EVENTS = 6
+#: Events, and times in one state, shown of one machine.
+EVENTS, SPELLS = 6, 4
+#: Lists that stand above the numbers; the rest stands below the day.
+URGENT, PAST = ("Why", "Mind", "Channels", "Devices"), "States of the last day, the newest first"
 
 
 def view(shop: Shop, *, prefix: str, where: str, connected: bool, console: Console) -> RenderableType:
@@ -42,22 +42,34 @@ def view(shop: Shop, *, prefix: str, where: str, connected: bool, console: Conso
         Its size says how much there is room for.
     """
     machines = shop.overview()
-    about = Text(f"{prefix or 'everything'} at {where}, {_utc()}", style="dim")
+    now = here(shop.now_ns())
+    about = Text(f"{prefix or 'everything'} at {where}, {now:%Y-%m-%d %H:%M:%S} {zone(now)}", style="dim")
     parts: list[RenderableType] = [Text(headline(machines), style="bold"), about]
     if not connected:
         parts.append(Text(f"✗ No connection to {where}; trying again. What stands here is old.", style="bold red"))
     if len(machines) == 1:
-        parts.append(detail(machines[0], shop.history(machines[0]["prefix"]), console.width))
+        history = shop.history(machines[0]["prefix"])
+        parts.append(detail(machines[0], history, console.width, shop.now_ns()))
     elif machines:
-        parts.append(overview(shop, machines, console.width, rows=max(console.height - 8, 5)))
+        rows = max(console.height - 8, 5)
+        parts.append(overview(shop, machines, console.width, rows=rows))
+        parts += _to_do(machines[:rows], console.width, console.height - 8 - len(machines))
     if shop.ignored:
         parts.append(Text(f"{shop.ignored} message(s) with keys or of machines that are not followed.", style="yellow"))
     parts.append(Text("Ctrl-C ends the view; nothing is sent to the machines.", style="dim"))
     return Group(*parts)
 
 
-def _utc() -> str:
-    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+def _to_do(machines: Sequence[dict[str, Any]], width: int, rows: int) -> list[RenderableType]:
+    """Return what is to be done, machine by machine, as far as there is room below the table."""
+    lines: list[RenderableType] = []
+    for machine in machines:
+        text = Text(f"{SIGNS[machine['tone']]} {machine['prefix']} {machine['shown']}: {machine['to_do']}")
+        rows -= -(-text.cell_len // max(width - 2, 1))
+        if machine["tone"] == "good" or rows < 1:
+            break
+        lines.append(text)
+    return [Text("\nWhat to do", style="bold"), *lines] if lines else []
 
 
 # ---------------------------------------------------------------------------- a shop
@@ -100,9 +112,9 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
 
 
 def _cells(machine: dict[str, Any]) -> dict[str, Text]:
-    why = " ".join([reason["means"] for reason in machine["reasons"]] + machine["warnings"])
-    if machine["shown"] == "silent":
-        why = " ".join([machine["means"], *machine["warnings"]])
+    # Codes: a sentence would be cut off; what to do stands below, or in the view of the machine alone.
+    reasons = [reason["code"] for reason in machine["reasons"]] if machine["shown"] != "silent" else []
+    why = " ".join([*reasons, *machine["warning_codes"]])
     return {
         "machine": Text(machine["prefix"]), "state": state(machine),
         "offset µm": Text(signed(machine["y_offset_um"]), style="dim" if machine["shown"] == "silent" else ""),
@@ -121,27 +133,40 @@ def _alive(machine: dict[str, Any]) -> str:
 def state(machine: dict[str, Any]) -> Text:
     """Return what a machine is shown as, with a sign."""
     tone = machine["tone"]
-    return Text(f"{SIGNS[tone]} {machine['shown']}", style=_STYLES[tone])
+    return Text(f"{SIGNS[tone]} {machine['shown']}", style=STYLES[tone])
 
 
 # ---------------------------------------------------------------------------- one machine
 
 
-def detail(machine: dict[str, Any], history: dict[str, list[Any]], width: int) -> RenderableType:
-    """Return everything of one machine."""
+def detail(machine: dict[str, Any], history: dict[str, list[Any]], width: int, now_ns: int) -> RenderableType:
+    """Return everything of one machine.
+
+    Parameters
+    ----------
+    machine : dict
+        Snapshot.
+    history : dict of str to list
+        Its last day, column by column.
+    width : int
+        Of the terminal, letters.
+    now_ns : int
+        Now, ns since 1970 UTC.
+    """
     parts: list[RenderableType] = [_verdict(machine)]
     pairs = _pairs(machine)
     per_row = 1 + (width >= 60) + 2 * (width >= 110)
     numbers = Table.grid(padding=(0, 2))
     for i in range(0, len(pairs), per_row):
         numbers.add_row(*(cell for name, value in pairs[i : i + per_row] for cell in (Text(name, style="dim"), value)))
-    lists = [(title, lines) for title, lines in _lists(machine) if lines]
-    urgent = [(title, lines) for title, lines in lists if title in ("Why", "Mind")]
+    past = [spell.text(now_ns / NS) for spell in spells(history)[:SPELLS]]
+    lists = [(title, lines) for title, lines in _lists(machine, past, here(now_ns)) if lines]
+    urgent = [(title, lines) for title, lines in lists if title in URGENT]
     parts += [_titled(title, lines) for title, lines in urgent]
-    parts += [Text(""), numbers, *_last_day(history, width)]
+    parts += [Text(""), numbers, Text(_about(machine), style="dim"), *drawn(history, width - 4)]
     parts += [_titled(title, lines) for title, lines in lists[len(urgent) :]]
     return Panel(
-        Group(*parts), title=f"{machine['machine']}  ({machine['prefix']})", border_style=_STYLES[machine["tone"]]
+        Group(*parts), title=f"{machine['machine']}  ({machine['prefix']})", border_style=STYLES[machine["tone"]]
     )
 
 
@@ -150,6 +175,8 @@ def _verdict(machine: dict[str, Any]) -> Text:
     old = age(machine["age_s"]) if machine["age_s"] is not None else ""
     if machine["shown"] == "silent":
         text.append(f" for {old}; the last offset was {signed(machine['y_offset_um'])} µm", style="bold red")
+    elif machine["y_offset_um"] is None and machine["shown"] != "unknown":
+        text.append(f"  no offset, {old} old", style="bold")
     elif machine["shown"] != "unknown":
         text.append(f"  offset {signed(machine['y_offset_um'])} µm, {old} old", style="bold")
     text.append(f"\n{machine['means']}", style="")
@@ -159,7 +186,6 @@ def _verdict(machine: dict[str, Any]) -> Text:
 
 
 def _pairs(machine: dict[str, Any]) -> list[tuple[str, Text]]:
-    missed = f"{machine['received']} received, {machine['missed']} missed"
     return [
         ("rate, µm/min", Text(signed(machine["y_offset_rate_um_per_min"]))),
         ("std, µm", Text(plain(machine["y_offset_std_um"]))),
@@ -167,47 +193,33 @@ def _pairs(machine: dict[str, Any]) -> list[tuple[str, Text]]:
         ("T_Q, °C", Text(plain(machine["t_q_degc"]))), ("AT, °C", Text(plain(machine["at_degc"]))),
         ("heat, W", Text(plain(machine["heat_w"], 1))), ("predicted Y, µm", Text(signed(machine["y_pred_um"]))),
         *((f"{share['name']}, µm", Text(signed(share["y_um"]))) for share in machine["shares"]),
-        ("alive", Text(_alive(machine))), ("messages", Text(missed)),
-        ("model", Text(f"{machine['model'] or '–'} {(machine['model_sha256'] or '')[:8]}")),
-        ("recording", Text(machine["recording"] or "–")),
     ]  # fmt: skip
 
 
-def _last_day(history: dict[str, list[Any]], width: int) -> list[RenderableType]:
-    lines: list[RenderableType] = []
-    rows = (("offset", "y_offset_um", "µm"), ("residual", "residual_um", "µm"), ("T_Q", "t_q_degc", "°C"),
-            ("AT", "at_degc", "°C"))  # fmt: skip
-    for name, column, unit in rows:
-        values = [value for value in history.get(column, []) if value is not None]
-        if len(values) > 1:
-            hours = (history["t_s"][-1] - history["t_s"][0]) / 3600.0
-            said = f"{plain(min(values), 1)} to {plain(max(values), 1)} {unit}"
-            bars = sparkline(_evenly(history["t_s"], history[column], max(width - 46, 12)), max(width - 46, 12))
-            lines.append(Text.assemble((f"{name:<9}", "dim"), bars, f" {said}", (f" in {hours:.1f} h", "dim")))
-    return lines
+def _about(machine: dict[str, Any]) -> str:
+    """Return what tells where the numbers come from, in one line."""
+    model = f"{machine['model'] or '–'} {(machine['model_sha256'] or '')[:8]}".rstrip()
+    return (f"service {_alive(machine)}; {machine['received']} messages received, {machine['missed']} missed; "
+            f"model {model}; recording {machine['recording'] or '–'}")  # fmt: skip
 
 
-def _lists(machine: dict[str, Any]) -> list[tuple[str, list[str]]]:
+def _lists(machine: dict[str, Any], past: list[str], now: datetime) -> list[tuple[str, list[str]]]:
     reasons = [f"{one['code']}: {one['means']} {one['do']}" for one in machine["reasons"]]
-    channels = [
-        f"{name}: {one['quality']}" + (f" ({', '.join(f'{n} {code}' for code, n in one['errors'].items())})"
-                                       if one["errors"] else "")
-        for name, one in machine["channels"].items() if one["quality"] != "good"
-    ]  # fmt: skip
+    channels = [_channel(name, one) for name, one in machine["channels"].items() if one["quality"] != "good"]
     devices = [f"{name}: {error}" for name, error in (machine["devices"] or {}).items() if error != "ok"]
     events = [
-        f"{datetime.fromtimestamp(event['time_utc_ns'] / NS, UTC):%m-%d %H:%M:%S} {event['kind']}: {event['text']}"
+        f"{here(event['time_utc_ns']):%m-%d %H:%M:%S} {event['kind']}: {event['text']}"
         + (f" → {event['do']}" if event["do"] else "")
         for event in machine["events"][:EVENTS]
     ]
     mind = [warning.marked for warning in machine["warnings"]]
-    return [
-        ("Why", reasons),
-        ("Mind", mind),
-        ("Channels", channels),
-        ("Devices", devices),
-        ("Last events (UTC)", events),
-    ]
+    return [("Why", reasons), ("Mind", mind), ("Channels", channels), ("Devices", devices),
+            (PAST, past), (f"Last events, {zone(now)}", events)]  # fmt: skip
+
+
+def _channel(name: str, channel: dict[str, Any]) -> str:
+    errors = ", ".join(f"{count} × {code}" for code, count in channel["errors"].items())
+    return f"{name}: {channel['quality']}" + (f" ({errors})" if errors else "") + f": {channel['do']}"
 
 
 def _titled(title: str, lines: list[str]) -> RenderableType:
@@ -218,40 +230,7 @@ def _titled(title: str, lines: list[str]) -> RenderableType:
 
 
 def _offsets(history: dict[str, list[Any]], width: int) -> str:
-    return sparkline(_evenly(history["t_s"], history["y_offset_um"], width), width) if history else ""
-
-
-def _evenly(t_s: Sequence[float], values: Sequence[float | None], width: int) -> list[float | None]:
-    """Return the values at even steps of time, None where nothing was heard."""
-    if len(t_s) < 2 or t_s[-1] <= t_s[0]:
-        return list(values)
-    count = min(width, len(t_s))
-    parts: list[list[float]] = [[] for _ in range(count)]
-    for t, value in zip(t_s, values, strict=True):
-        if value is not None:
-            parts[min(int((t - t_s[0]) / (t_s[-1] - t_s[0]) * count), count - 1)].append(value)
-    return [sum(part) / len(part) if part else None for part in parts]
-
-
-def sparkline(values: Sequence[float | None], width: int) -> str:
-    """Draw values as a line of bars, the mean of each part; a part without any is a blank.
-
-    Examples
-    --------
-    >>> sparkline([0.0, 1.0, None, 2.0], 4)
-    '▁▅ █'
-    """
-    if not values:
-        return ""
-    count = min(width, len(values))
-    parts = [values[i * len(values) // count : (i + 1) * len(values) // count] for i in range(count)]
-    means = [[v for v in part if v is not None and math.isfinite(v)] for part in parts]
-    known = [sum(part) / len(part) for part in means if part]
-    if not known:
-        return " " * count
-    low, high = min(known), max(known)
-    scale = (len(_BARS) - 1) / (high - low) if high > low else 0.0
-    return "".join(_BARS[round((sum(p) / len(p) - low) * scale)] if p else " " for p in means)
+    return sparkline(evenly(history["t_s"], history["y_offset_um"], width), width) if history else ""
 
 
 # ---------------------------------------------------------------------------- without a terminal

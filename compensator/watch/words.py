@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any, Literal, NamedTuple
 
+from compensator.clock import NS
 from compensator.messages import Event
 from compensator.reasons import explain
 
@@ -63,6 +65,30 @@ def to_do(event: Event) -> str:
     if event.kind == "recording" and "again" in event.text:
         return ""
     return _DO.get(event.kind, "")
+
+
+def here(time_ns: int) -> datetime:
+    """Return a time as the clock on this computer's wall shows it; recordings and messages stay in UTC.
+
+    Parameters
+    ----------
+    time_ns : int
+        ns since 1970 UTC.
+    """
+    return datetime.fromtimestamp(time_ns / NS, UTC).astimezone()
+
+
+def zone(time: datetime) -> str:
+    """Name the time zone of a local time, with what it is ahead of UTC.
+
+    Examples
+    --------
+    >>> from datetime import timedelta, timezone
+    >>> zone(datetime(2026, 1, 5, tzinfo=timezone(timedelta(hours=1), "CET"))), zone(datetime(2026, 1, 5, tzinfo=UTC))
+    ('CET (UTC+01:00)', 'UTC')
+    """
+    name, ahead = f"{time:%Z}", f"{time:%z}"
+    return "UTC" if name == "UTC" else f"{name} (UTC{ahead[:3]}:{ahead[3:5]})"
 
 
 def age(seconds: float) -> str:

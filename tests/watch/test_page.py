@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -110,7 +111,7 @@ def test_a_port_that_is_taken_is_one_line(server: PageServer) -> None:
         PageServer(Shop(Clock()), lambda: STATUS, port).__enter__()
 
 
-def drawn(address: str, folder: Path, width: int) -> tuple[str, str]:
+def drawn(address: str, folder: Path, width: int, zone: str = "UTC") -> tuple[str, str]:
     """Return the page as a browser has it, and what its console said."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
@@ -118,7 +119,7 @@ def drawn(address: str, folder: Path, width: int) -> tuple[str, str]:
     done = subprocess.run(
         [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", "--dump-dom",
          f"--window-size={width},900", "--virtual-time-budget=4000", "--enable-logging=stderr", address],
-        capture_output=True, text=True, timeout=100, check=True,
+        capture_output=True, text=True, timeout=100, check=True, env={**os.environ, "TZ": zone},
     )  # fmt: skip
     return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
 
@@ -126,7 +127,7 @@ def drawn(address: str, folder: Path, width: int) -> tuple[str, str]:
 def test_a_browser_draws_one_machine_and_takes_nothing_for_code(server: PageServer, tmp_path: Path) -> None:
     text, console = drawn(f"{server.address}#m=shop%2Fvmc-07", tmp_path, 1400)
     assert console == ""
-    assert text.count("<figure>") == 4 and "ok: offset −59.67 µm" in text
+    assert text.count("<figure>") == 4 and "✓ ok</b>offset −59.67 µm" in text
     # T_Q is missing for half an hour: its curve has two parts, the offset's has one.
     curves = re.findall(r'<path d="([^"]*)" class="curve c0">', text)
     parts = [curve.count("M") for curve in curves if curve != "M0 6H32"]
@@ -139,3 +140,28 @@ def test_a_browser_draws_one_machine_and_takes_nothing_for_code(server: PageServ
 def test_a_browser_draws_the_shop(server: PageServer, tmp_path: Path) -> None:
     text, console = drawn(server.address, tmp_path, 400)
     assert console == "" and "2 machines: 2 ok" in text and text.count('data-prefix="shop/vmc-0') == 2
+
+
+def test_the_shop_says_what_to_do_and_times_are_of_the_viewers_zone(tmp_path: Path) -> None:
+    shop = filled()
+    key, t = "shop/vmc-07/thermal/y/offset", START_NS + 180 * 60 * NS  # 08:59 UTC
+    shop.take(key, offset(180, t, state="hold", reasons=["operator_hold"]))
+    with PageServer(shop, lambda: STATUS, 0) as served:
+        text, console = drawn(served.address, tmp_path, 400)
+        assert console == ""
+        assert "<li><b>✗ shop/vmc-07 hold: </b>Send the command resume.</li>" in text
+        text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 1400, zone="Asia/Tokyo")
+    assert console == ""
+    assert "Asia/Tokyo, UTC+09:00" in text and text.count("time of day, UTC+09:00") == 4
+    assert re.search(r"<th scope=\"row\">(\d{4}-\d\d-\d\d )?18:00</th><td>✗ hold</td>", text)
+
+
+def test_a_channel_that_is_not_well_stands_above_the_numbers(tmp_path: Path) -> None:
+    shop = filled()
+    t = START_NS + 180 * 60 * NS
+    shop.take("shop/vmc-07/thermal/sample", sample(180, t, t_q=None, quality="open_circuit"))
+    with PageServer(shop, lambda: STATUS, 0) as served:
+        text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 400)
+    assert console == ""
+    said = 't_q_degc: <a href="#word=open_circuit">open_circuit</a>: The thermocouple or its wiring is broken. <b>To do'
+    assert said in text and text.index(said) < text.index('<dl id="now"')

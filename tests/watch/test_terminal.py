@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import time
+from collections.abc import Iterator
 
 import pytest
 from rich.console import Console
@@ -70,3 +72,59 @@ def test_silence_and_a_lost_connection_are_said() -> None:
     assert "No connection to tcp/127.0.0.1:7447" in text
     one = shop.one("shop/vmc-01")
     assert one is not None and "silent" in line(one) and "11 min old" in line(one)
+
+
+@pytest.fixture
+def tokyo(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("tokyo")
+def test_times_are_of_the_viewers_zone_and_lines_for_a_log_of_utc() -> None:
+    shop, _ = filled("vmc-02")
+    shop.take("shop/vmc-02/thermal/event", event(3))
+    text = shown(shop, 100)
+    # 06:00 UTC, and three minutes later.
+    assert "2026-01-05 15:03:00 JST (UTC+09:00)" in text
+    assert "01-05 15:00:00 device" in text and "15:00 hold for 3 min: operator_hold" in text
+    one = shop.one("shop/vmc-02")
+    assert one is not None and line(one).startswith("2026-01-05T06:02:00Z")
+
+
+def test_the_day_has_every_path_and_the_worst_state_of_each_part() -> None:
+    shop, clock = filled("vmc-01")
+    for i in range(3, 60):
+        t, key = START_NS + i * 60 * NS, "shop/vmc-01/thermal/"
+        held = {"state": "hold", "reasons": ["operator_hold"]} if i in (30, 31) else {}
+        shop.take(key + "y/offset", offset(i, t, machine="vmc-01", **held))
+        shop.take(key + "estimate", estimate(i, t, y_dtf_um=float(i), y_tdtf_um=-float(i)))
+        clock.advance(60)
+    text = shown(shop, 70)
+    rows = {row.split()[1]: row for row in text.splitlines() if row.startswith("│ ") and len(row.split()) > 2}
+    assert "2.0 to 59.0 µm" in rows["DTF"] or "3.0 to 59.0 µm" in rows["DTF"]
+    assert "−59.0 to" in rows["TDTF"] and "µm" in rows["effects"] and "°C" not in rows["residual"]
+    strip = rows["state"].partition(" ▁ ok")[0]
+    assert strip.count("█") == 1 and strip.count("▁") > 20  # two minutes of 60 are one bar of some thirty
+    assert "operator_hold" in text and max(map(len, text.splitlines())) <= 70
+
+
+def test_a_shop_says_what_to_do_as_far_as_there_is_room() -> None:
+    shop, _ = filled("vmc-01", "vmc-02", "vmc-03")
+    text = shown(shop, 100, height=30)
+    assert "✗ shop/vmc-02 hold: Send the command resume." in text and "⚠ shop/vmc-03 degraded: See the quality" in text
+    assert "vmc-01 ok:" not in text
+    for height in range(8, 24):
+        assert len(shown(shop, 100, height=height).splitlines()) <= height
+    assert "What to do" not in shown(shop, 100, height=11)
+
+
+def test_what_is_no_offset_is_no_number() -> None:
+    clock = Clock()
+    shop = Shop(clock)
+    shop.take("shop/a/thermal/y/offset", offset(1, machine="a", state="starting", reasons=["no_zero"], y_offset_um=None,
+                                                y_offset_rate_um_per_min=None, y_offset_std_um=None))  # fmt: skip
+    assert "⚠ starting  no offset, 0 s old" in shown(shop, 80)

@@ -1,0 +1,168 @@
+"""The last day of a machine in letters: curves of bars, a strip of states, and the states in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rich.console import RenderableType
+from rich.text import Text
+
+from compensator.clock import NS
+from compensator.watch.words import TONES, age, here, plain
+
+_BARS = "▁▂▃▄▅▆▇█"
+#: What a state is drawn as; higher is worse, so that colour is not needed.
+_STRIP = {"good": "▁", "warn": "▄", "bad": "█"}
+#: How each tone is coloured.
+STYLES = {"good": "green", "warn": "yellow", "bad": "bold red"}
+#: What is drawn of the history: name, column, unit.
+_ROWS = (("offset", "y_offset_um", "µm"), ("DTF", "y_dtf_um", "µm"), ("TDTF", "y_tdtf_um", "µm"),
+         ("effects", "effects", "µm"), ("residual", "residual_um", "µm"), ("T_Q", "t_q_degc", "°C"),
+         ("AT", "at_degc", "°C"))  # fmt: skip
+#: Room beside the bars: name before, range behind.
+_BESIDE = 38
+#: Points farther apart than this do not belong to one spell, s.
+GAP_S = 150.0
+#: One point of the history stands for so long, s.
+_POINT_S = 60.0
+
+
+class Spell(NamedTuple):
+    """A time in one state for the same reasons.
+
+    Parameters
+    ----------
+    begin_s, end_s : float
+        First and last point, s since 1970.
+    state : str
+        What the service said of itself.
+    reasons : str
+        Codes, with blanks between.
+    """
+
+    begin_s: float
+    end_s: float
+    state: str
+    reasons: str
+
+    def text(self, now_s: float) -> str:
+        """Return it in one line, in local time.
+
+        Parameters
+        ----------
+        now_s : float
+            The day of today is left out, s since 1970.
+        """
+        begin, today = (here(round(t * NS)) for t in (self.begin_s, now_s))
+        when = f"{begin:%H:%M}" if begin.date() == today.date() else f"{begin:%m-%d %H:%M}"
+        long = age(self.end_s - self.begin_s + _POINT_S)
+        return f"{when} {self.state} for {long}" + (f": {self.reasons}" if self.reasons else "")
+
+
+def spells(history: Mapping[str, Sequence[Any]]) -> list[Spell]:
+    """Return the states of a history, the newest first.
+
+    Examples
+    --------
+    >>> day = {"t_s": [0.0, 60.0, 120.0], "state": ["ok", "ok", "hold"], "reasons": ["", "", "operator_hold"]}
+    >>> [(spell.state, spell.end_s - spell.begin_s) for spell in spells(day)]
+    [('hold', 0.0), ('ok', 60.0)]
+    """
+    found: list[Spell] = []
+    columns = (history.get(name, ()) for name in ("t_s", "state", "reasons"))
+    for t, state, reasons in zip(*columns, strict=True):
+        if state is None:
+            continue
+        last = found[-1] if found else None
+        if last is not None and (last.state, last.reasons) == (state, reasons or "") and t - last.end_s < GAP_S:
+            found[-1] = last._replace(end_s=t)
+        else:
+            found.append(Spell(t, t, state, reasons or ""))
+    return found[::-1]
+
+
+def drawn(history: Mapping[str, Sequence[Any]], width: int) -> list[RenderableType]:
+    """Return the last day as lines of bars, each with its range and unit, over a strip of states.
+
+    Parameters
+    ----------
+    history : mapping of str to sequence
+        Columns as of `History`.
+    width : int
+        Of what may be filled, letters.
+    """
+    t_s = history.get("t_s", ())
+    count = max(width - _BESIDE, 12)
+    lines: list[RenderableType] = []
+    for name, column, unit in _ROWS:
+        series = _summed(history.get(column, ())) if column == "effects" else list(history.get(column, ()))
+        values = [value for value in series if value is not None]
+        if len(values) < 2:
+            continue
+        said = f"{plain(min(values), 1)} to {plain(max(values), 1)} {unit}"
+        bars = sparkline(evenly(t_s, series, count), count)
+        lines.append(Text.assemble((f"{name:<9}", "dim"), f"{bars:<{count}}", f" {said}"))
+    if lines:
+        wide = min(count, len(t_s))
+        lines += [_strip(t_s, history["state"], wide), _axis(t_s, wide)]
+    return lines
+
+
+def _summed(effects: Sequence[Sequence[float | None]]) -> list[float | None]:
+    return [sum(part) if part and None not in part else None for part in effects]  # type: ignore[arg-type]
+
+
+def _strip(t_s: Sequence[float], states: Sequence[str | None], count: int) -> Text:
+    """Draw the worst state of each part; a part in which nothing was heard is a blank."""
+    order = ("good", "warn", "bad")
+    worst = [-1] * count
+    span = max(t_s[-1] - t_s[0], 1e-9)
+    for t, state in zip(t_s, states, strict=True):
+        i = min(int((t - t_s[0]) / span * count), count - 1)
+        if state is not None:
+            worst[i] = max(worst[i], order.index(TONES.get(state, "bad")))
+    text = Text.assemble(("state    ", "dim"))
+    for level in worst:
+        text.append(" " if level < 0 else _STRIP[order[level]], style="" if level < 0 else STYLES[order[level]])
+    return text.append(" ▁ ok ▄ mind █ hold, fault", style="dim")
+
+
+def _axis(t_s: Sequence[float], count: int) -> Text:
+    begin, end = (f"{here(round(t * NS)):%H:%M}" for t in (t_s[0], t_s[-1]))
+    line = begin + f"{end:>{max(count - len(begin), len(end) + 1)}}"
+    return Text(f"{'':<9}{line} {(t_s[-1] - t_s[0]) / 3600.0:.1f} h", style="dim")
+
+
+def evenly(t_s: Sequence[float], values: Sequence[float | None], width: int) -> list[float | None]:
+    """Return the values at even steps of time, None where nothing was heard."""
+    if len(t_s) < 2 or t_s[-1] <= t_s[0]:
+        return list(values)
+    count = min(width, len(t_s))
+    parts: list[list[float]] = [[] for _ in range(count)]
+    for t, value in zip(t_s, values, strict=True):
+        if value is not None:
+            parts[min(int((t - t_s[0]) / (t_s[-1] - t_s[0]) * count), count - 1)].append(value)
+    return [sum(part) / len(part) if part else None for part in parts]
+
+
+def sparkline(values: Sequence[float | None], width: int) -> str:
+    """Draw values as a line of bars, the mean of each part; a part without any is a blank.
+
+    Examples
+    --------
+    >>> sparkline([0.0, 1.0, None, 2.0], 4)
+    '▁▅ █'
+    """
+    if not values:
+        return ""
+    count = min(width, len(values))
+    parts = [values[i * len(values) // count : (i + 1) * len(values) // count] for i in range(count)]
+    means = [[v for v in part if v is not None and math.isfinite(v)] for part in parts]
+    known = [sum(part) / len(part) for part in means if part]
+    if not known:
+        return " " * count
+    low, high = min(known), max(known)
+    scale = (len(_BARS) - 1) / (high - low) if high > low else 0.0
+    return "".join(_BARS[round((sum(p) / len(p) - low) * scale)] if p else " " for p in means)
