@@ -311,6 +311,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "signature_not_checked": (
         "The file is signed, and nobody said by whom it should be.", "Give the machine's key: --public-key FILE."),
+    "left_beyond_stated": (
+        "With the correction more is left in Y than the service's own standard deviation says.",
+        "Look at the probe and the couples, then run `compensator diagnose` on these recordings.",
+    ),
     "finished": ("The recording has its end: sealed, with checksums and index.", "Nothing."),
     "recovered": (
         "The service was ended hard; the next start kept every whole record and sealed the file.",

@@ -35,8 +35,6 @@ _TIME = "time, UTC"
 _ROWS = 20
 #: Remarks that are shown; a year of files may have one each.
 _REMARKS = 40
-#: Letters of a hash that tell it from others.
-_SHORT = 12
 #: Values that are brought to a curve together.
 _TOGETHER = 5000
 _ENDS_WHOLE = ("finished", "recovered")
@@ -179,11 +177,11 @@ def _findings(found: Audit) -> Block:
         where = f"/{finding.topic}" if finding.topic and " " not in finding.topic else finding.topic
         number = "" if finding.sequence is None else f"record {finding.sequence}"
         at = "" if finding.time_utc_ns is None else utc(finding.time_utc_ns)
-        return [finding.file, Code(finding.kind), finding.text, " ".join(filter(None, (where, number))), at]
+        return [finding.file, Code(finding.kind), finding.text, " ".join(filter(None, (where, number, at)))]
 
     more = found.findings_count - len(found.findings)
     note = f"And {more} more: of each file the first are named." if more else ""
-    head = ["file", "kind", "what", "where", "time"]
+    head = ["file", "kind", "what", "where"]
     return _folded("Findings", head, [row(finding) for finding in found.findings], note)
 
 
@@ -191,30 +189,21 @@ def _files(files: Sequence[RecordingAudit]) -> Block:
     rows: list[list[Cell]] = [
         [
             file.file, Code(file.end), str(file.samples), str(file.records), str(file.findings_count),
-            str(file.differing), "begins it" if file.previous == NOTHING.hex() else file.previous[:_SHORT] or "–",
-            file.last[:_SHORT] or "–",
-            f"{file.signed} seal(s)" if file.signed else "–",
+            str(file.differing), f"{file.signed} seal(s)" if file.signed else "–",
         ]
         for file in files
     ]  # fmt: skip
-    head = [
-        "file",
-        "end",
-        "samples",
-        "records",
-        "findings",
-        "differ",
-        "chain goes on from",
-        "chain ends with",
-        "signed",
-    ]
-    return _folded("File by file", head, rows, "Hashes are shown by their first letters; all of them stand below.")
+    head = ["file", "end", "samples", "records", "findings", "differ", "signed"]
+    return _folded("File by file", head, rows, "The values of the hash chain stand below, to open.")
 
 
 def _hashes(found: Audit) -> Details:
-    rows: list[list[Cell]] = [[file.file, file.last or "–", file.model or "–"] for file in found.files]
+    rows: list[list[Cell]] = [
+        [file.file, "begins it" if file.previous == NOTHING.hex() else file.previous or "–", file.last or "–",
+         file.model or "–"] for file in found.files
+    ]  # fmt: skip
     keys = sorted({key for file in found.files for key in file.keys})
-    blocks: list[Block] = [Table(head=["file", "last value of the chain", "model, SHA-256"], rows=rows)]
+    blocks: list[Block] = [Table(head=["file", "chain goes on from", "chain ends with", "model, SHA-256"], rows=rows)]
     if keys:
         blocks.append(Table(head=["public keys in the seals"], rows=[[key] for key in keys]))
     blocks.append(Words(title="Made by", lines=[f"compensator {__version__} replay"]))

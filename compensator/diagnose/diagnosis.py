@@ -100,6 +100,9 @@ def _by_search(model: ThermalModel, evidence: Evidence, told: Told, mapped: Mapp
     # What rounds off an effect is of no use where the effect itself cannot be deployed.
     deployed = [e for e in everything if e.deployable] if any(e.deployable for e in effects) and helps else []
     extended = dataclasses.replace(model, effects=(*model.effects, *map(table_of, deployed)), sha256="")
+    if deployed:
+        kept_out = [e.wave[evidence.used] for e in everything if not e.deployable]
+        extended = dataclasses.replace(extended, y_std_um=_stated(model, rms_of(after), evidence.noise_um, kept_out))
     y = evidence.y_um
     return Diagnosis(
         verdict=_verdict(evidence, found), effects=effects,
@@ -166,6 +169,16 @@ def _effects(evidence: Evidence, found: Found) -> tuple[Effect, ...]:
             )
         )  # fmt: skip
     return tuple(sorted(effects, key=lambda e: -e.rms_before_um))
+
+
+def _stated(model: ThermalModel, after_um: float, noise_um: float, kept_out: Sequence[Vector]) -> float:
+    """Return the standard deviation that an extended model states, µm: what it leaves where nothing was fitted.
+
+    Without it, a service would go on to publish the calibration's own, of a machine on which the effect did not act.
+    What was found and cannot be deployed (`kept_out`) goes on acting.
+    """
+    left = max(after_um**2 - noise_um**2, 0.0) + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
+    return max(model.y_std_um, float(np.sqrt(left)))
 
 
 def _rounded(everything: Sequence[Effect]) -> tuple[Caution, ...]:

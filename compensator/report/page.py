@@ -29,6 +29,8 @@ _NUMBER = re.compile(
 )
 #: Longest cell that stays on one line, letters.
 _SENTENCE = 36
+#: Longest name of a file, or hash, that stays on one line, letters.
+_UNBROKEN = 24
 #: Heading of what the codes on a page mean.
 GLOSSARY = "What the words mean, and what to do"
 TONE_WORDS: dict[Tone, str] = {"good": "✓ good", "warn": "⚠ mind", "bad": "✗ no"}
@@ -293,7 +295,17 @@ def _classes(table: Table) -> str:
         i for i in words
         if max((len(text_of(row[i])) for row in table.rows if i < len(row)), default=0) > _SENTENCE
     ]  # fmt: skip
-    return " ".join([*(f"text-{i + 1}" for i in words), *(f"long-{i + 1}" for i in long)])
+    broken = [
+        i for i in words
+        if i not in long and any(_has_long_word(text_of(row[i])) for row in table.rows if i < len(row))
+    ]  # fmt: skip
+    return " ".join(
+        [*(f"text-{i + 1}" for i in words), *(f"long-{i + 1}" for i in long), *(f"name-{i + 1}" for i in broken)]
+    )
+
+
+def _has_long_word(text: str) -> bool:
+    return any(len(word) > _UNBROKEN for word in text.split())
 
 
 def _cell(cell: Cell, scope: str) -> str:

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
-from compensator.reasons import explain
+from compensator.reasons import Caution, explain
 from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
 from compensator.report.page import (
@@ -23,6 +23,7 @@ from compensator.report.page import (
     Table,
     Tone,
     Words,
+    warnings_of,
 )
 
 TIME = "time, UTC"
@@ -32,6 +33,8 @@ STATES = ("ok", "degraded", "starting", "hold", "fault", NO_RECORDING)
 _FOLLOWS = ("ok", "degraded")
 #: Largest share of the time without a following offset that is worth a warning only.
 _MUCH = 0.1
+#: More is left than the service's own standard deviation times this: the model or a sensor is wrong, not only noisy.
+_BEYOND = 3.0
 #: Days that stand one below the other; more are put together by months.
 _DAYS = 31
 #: So many rows stand on the page at once; more are there to open.
@@ -53,7 +56,14 @@ def page_of(history: History) -> Page:
     history : History
         What they tell.
     """
-    blocks: list[Block] = [_offset(history), _band(history), _figures(history), _states(history)]
+    beyond = _beyond(history.whole)
+    blocks: list[Block] = [
+        _offset(history),
+        *([warnings_of([beyond])] if beyond else []),
+        _band(history),
+        _figures(history),
+        _states(history),
+    ]
     if history.reasons:
         blocks.append(_reasons(history))
     if history.episodes:
@@ -97,11 +107,36 @@ def verdict(history: History) -> str:
     if whole.left.samples:
         words += (
             f"; the probe saw an error in Y of {whole.measured.rms:.1f} µm rms, of which {whole.left.rms:.1f} "
-            "are left with the correction"
+            f"are left with the correction{_beside_stated(whole)}"
         )
     elif whole.offset.samples:
         words += f"; it reached {_um(whole.offset.peak, 1)} µm"
     return f"{words}."
+
+
+def _beside_stated(whole: Period) -> str:
+    """Say what is left beside the service's own standard deviation: it alone says what a good model leaves here."""
+    stated = whole.std.rms
+    if not stated > 0.0:
+        return ""
+    if whole.left.rms <= _BEYOND * stated:
+        return f" (the service itself states a standard deviation of {_short(stated)})"
+    return (
+        f": {whole.left.rms / stated:.0f} times the standard deviation of {_short(stated)} that the service itself "
+        "states, so the model lacks something or a sensor lies"
+    )
+
+
+def _beyond(whole: Period) -> Caution | None:
+    """Say where more is left than the service itself expects; nothing where Y was not measured."""
+    if not (whole.left.samples and 0.0 < _BEYOND * whole.std.rms < whole.left.rms):
+        return None
+    said = f"With the correction {_short(whole.left.rms)} rms are left, the service states {_short(whole.std.rms)}."
+    return Caution("left_beyond_stated", said)
+
+
+def _short(value_um: float) -> str:
+    return f"{value_um:.2f} µm" if value_um < 1.0 else f"{value_um:.1f} µm"
 
 
 def _tone(history: History) -> Tone:
@@ -111,7 +146,8 @@ def _tone(history: History) -> Tone:
     worse = history.whole.left.samples and history.whole.left.rms > history.whole.measured.rms
     if "fault" in history.states or without > _MUCH * total or worse:
         return "bad"
-    return "warn" if without or seconds["degraded"] > _MUCH * total else "good"
+    doubtful = without or seconds["degraded"] > _MUCH * total or _beyond(history.whole) is not None
+    return "warn" if doubtful else "good"
 
 
 # ---------------------------------------------------------------------------- pictures

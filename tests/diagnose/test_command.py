@@ -39,6 +39,9 @@ def test_json_model_and_page(tmp_path, table, capsys):
     assert all({"kind", "channel", "rms_after_um", "how_to_tell_apart"} <= set(rival) for rival in found["rivals"])
     model = load_model(out / "model.toml")
     assert [effect.kind for effect in model.effects] == ["scheduled"]
+    # The drift is not deployed and goes on acting: the standard deviation that is published has to say so.
+    drift = found["effects"][1]
+    assert model.y_std_um > 0.9 * np.sqrt(drift["rms_before_um"] ** 2 - drift["rms_after_um"] ** 2)
     assert model.provenance["diagnosis"]["base_model_sha256"] == load_model("quill").sha256
     page = (out / "report.html").read_text(encoding="utf-8")
     for words in ("before and after", "Errors on held-out data", "how it ranked", model.sha256):
@@ -64,6 +67,7 @@ def test_an_adequate_model_is_written_as_it_was(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["verdict"] == "adequate"
     model = load_model(tmp_path / "d" / "model.toml")
     assert (model.dtf, model.effects) == (load_model("quill").dtf, ())
+    assert model.y_std_um == load_model("quill").y_std_um
 
 
 def test_data_without_y_is_refused(tmp_path, capsys):

@@ -124,6 +124,23 @@ def test_the_tone(seconds: dict[str, float], measured: float, left: float, tone:
     assert ("for all of" in verdict(history)) == (set(seconds) <= {"ok", "degraded"})
 
 
+@pytest.mark.parametrize(("left", "stated", "beyond"), [(0.57, 0.28, False), (6.4, 0.28, True), (6.4, 0.0, False)])
+def test_what_is_left_is_held_against_what_the_service_states(left: float, stated: float, beyond: bool) -> None:
+    whole = Period(samples=1)
+    whole.seconds.update({"ok": 8.64e4})
+    whole.measured.add(62.7, 0.0)
+    whole.left.add(left, 0.0)
+    whole.offset.add(-62.7, 0.0)
+    whole.std.add(stated, 0.0)
+    states = {"ok": Stretches()}
+    states["ok"].add(0.0, 60.0)
+    page = page_of(History(machine="m", whole=whole, states=states, curves={"heat": Envelope()}))
+    assert page.tone == ("warn" if beyond else "good")
+    assert ("left_beyond_stated" in codes_of(page.blocks)) == beyond
+    assert ("23 times the standard deviation of 0.28 µm" in page.verdict) == beyond
+    assert ("states a standard deviation of 0.28 µm" in page.verdict) == (not beyond and stated > 0.0)
+
+
 def test_a_minute_is_not_rounded_away() -> None:
     whole = Period(samples=1)
     whole.seconds.update({"ok": 1e8, "hold": 60.0})
