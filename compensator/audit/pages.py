@@ -281,20 +281,22 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
             )
         )
     words, tone = _better(found)
-    return Page(title=f"{found.other} on what {found.recorded} recorded", verdict=words, blocks=blocks, tone=tone)
+    return Page(
+        title=f"Model “{found.other}” on what “{found.recorded}” recorded", verdict=words, blocks=blocks, tone=tone
+    )
 
 
 def _better(found: Comparison) -> tuple[str, Tone]:
     before, after = found.left_before.rms, found.left_after.rms
     if not found.left_before.samples:
         return (
-            f"Y was not measured, so neither is known to be better: the offset of {found.other} differs by "
+            f"Y was not measured, so neither is known to be better: the offset of “{found.other}” differs by "
             f"{_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
             "warn",
         )
     words = (
-        f"With {found.other}, {_um(after)} µm rms would have been left in Y instead of {_um(before)} with the recorded "
-        f"{found.recorded}."
+        f"With “{found.other}”, {_um(after)} µm rms would have been left in Y instead of {_um(before)} with "
+        f"“{found.recorded}”, which was recorded."
     )
     return words, "good" if after < before else "bad" if after > before else "warn"
 

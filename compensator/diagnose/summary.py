@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from compensator.diagnose.joint import Part
 from compensator.diagnose.outcome import Diagnosis, Effect
+from compensator.identify.summary import with_std
 from compensator.simulation import Scores
 
 _VERDICTS = {
@@ -60,9 +62,18 @@ def verdict(diagnosis: Diagnosis) -> str:
     if not diagnosis.effects:
         return f"{words} Residual {diagnosis.before.rms_um:.2f} µm rms, sensor noise {diagnosis.noise_floor_um:.2f}."
     return (
-        f"{words} {name(diagnosis.effects[0])}. On held-out data {diagnosis.before.rms_um:.2f} µm rms become "
+        f"{words} {_names(diagnosis.effects)}. On held-out data {diagnosis.before.rms_um:.2f} µm rms become "
         f"{diagnosis.after.rms_um:.2f} (sensor noise {diagnosis.noise_floor_um:.2f})."
     )
+
+
+def _names(effects: Sequence[Effect]) -> str:
+    """Return all effects in a few words, those of one kind together."""
+    places: dict[str, list[str]] = {}
+    for effect in effects:
+        kind, _, place = name(effect).partition(": ")
+        places.setdefault(kind, []).append(place)
+    return "; ".join(": ".join(filter(None, (kind, ", ".join(filter(None, where))))) for kind, where in places.items())
 
 
 def name(effect: Effect) -> str:
@@ -76,7 +87,7 @@ def text(diagnosis: Diagnosis) -> str:
     """Return the summary for the terminal."""
     lines = [verdict(diagnosis)]
     for i, effect in enumerate(diagnosis.effects, start=1):
-        values = ", ".join(f"{n} {v:.4g} ± {effect.std[n]:.2g}" for n, v in list(effect.part.named.items())[:6])
+        values = ", ".join(f"{n} {with_std(v, effect.std[n])}" for n, v in list(effect.part.named.items())[:6])
         lines += ["", f"{i}. {name(effect)}: {values}", f"   {effect.explanation}"]
         if not effect.deployable:
             lines.append("   It cannot be compensated by the model; model.toml leaves it out.")

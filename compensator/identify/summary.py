@@ -104,16 +104,26 @@ def text(calibration: Calibration, criticism: Criticism) -> str:
 
 
 def with_std(value: float, std: float) -> str:
-    """Return a value with its standard error, or with what stands for one.
+    """Return a value with its standard error, to two digits of the error, or with what stands for one.
 
     Examples
     --------
     >>> with_std(1.0182, 0.0021), with_std(10.0, 0.0), with_std(169.0, 3e5)
-    ('1.018 ± 0.0021', '10', '169 (not determined)')
+    ('1.0182 ± 0.0021', '10', '169 (not determined)')
+    >>> with_std(133.5, 26.1), with_std(1203.0, 1980.0), with_std(-2.147e-6, 1.6e-7)
+    ('134 ± 26', '1200 ± 2000', '-2.15e-06 ± 0.16e-06')
     """
-    if std == 0.0:
-        return f"{value:.4g}"
-    return f"{value:.4g} (not determined)" if std > 10.0 * abs(value) else f"{value:.4g} ± {std:.2g}"
+    if std == 0.0 or not math.isfinite(std):
+        return f"{value:.4g}" + ("" if std == 0.0 else " (not determined)")
+    if std > 10.0 * abs(value):
+        return f"{value:.3g} (not determined)"
+    decimals = 1 - int(f"{std:.1e}".partition("e")[2])
+    power = int(f"{max(abs(value), std):.1e}".partition("e")[2])
+    if -4 < power < 6:
+        places = max(decimals, 0)
+        return f"{round(value, decimals):.{places}f} ± {round(std, decimals):.{places}f}"
+    places = max(decimals + power, 0)
+    return f"{value / 10.0**power:.{places}f}e{power:+03d} ± {std / 10.0**power:.{places}f}e{power:+03d}"
 
 
 def _table(calibration: Calibration) -> list[str]:

@@ -32,6 +32,10 @@ Vector = npt.NDArray[np.float64]
 #: Parameters of an effect that are shown at once; the others are there to open.
 SHOWN = 6
 
+#: Units as they stand in the names of parameters, and on a page.
+_UNITS = {"um": "µm", "k": "K", "w": "W", "min": "min", "h": "h", "s": "s", "degc": "°C", "rpm": "(1/min)", "pct": "%",
+          "bar": "bar"}  # fmt: skip
+
 _TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
 
 
@@ -73,7 +77,8 @@ def _hours(diagnosis: Diagnosis) -> Vector:
 
 
 def _before_and_after(t: Vector, diagnosis: Diagnosis) -> Figure:
-    found = " and ".join(name(effect) for effect in diagnosis.effects) or "nothing to add"
+    count = len(diagnosis.effects)
+    found = name(diagnosis.effects[0]) if count == 1 else f"all {count} effects" if count else "nothing to add"
     return Figure(
         title="Error that the compensation leaves, before and after", x_label="time, h", y_label="residual, µm",
         lines=(
@@ -96,10 +101,10 @@ def _errors(diagnosis: Diagnosis) -> Table:
 
 
 def _effect(t: Vector, effect: Effect) -> Section:
-    parameters = [[key, with_std(value, effect.std[key])] for key, value in effect.part.named.items()]
+    parameters = [[in_words(key), with_std(value, effect.std[key])] for key, value in effect.part.named.items()]
     rows = parameters[:SHOWN]
-    rows.append(["residual without it, µm rms", f"{effect.rms_before_um:.3f}"])
-    rows.append(["residual with it, µm rms", f"{effect.rms_after_um:.3f}"])
+    rows.append(["residual of the fit without it, µm rms", f"{effect.rms_before_um:.2f}"])
+    rows.append(["residual of the fit with it, µm rms", f"{effect.rms_after_um:.2f}"])
     deploy = "Runs in the service." if effect.deployable else "Cannot be deployed; the extended model leaves it out."
     blocks: list[Block] = [
         Words(title="In words", lines=[effect.explanation, deploy]),
@@ -124,10 +129,26 @@ def _effect(t: Vector, effect: Effect) -> Section:
     return Section(title=name(effect), blocks=blocks)
 
 
+def in_words(key: str) -> str:
+    """Return the name of a parameter with its unit as people write it.
+
+    Examples
+    --------
+    >>> in_words("half_width_um"), in_words("gain_um_per_rpm2"), in_words("um_per_h"), in_words("change_per_100")
+    ('half width, µm', 'gain, µm/(1/min)²', 'rate, µm/h', 'change per 100')
+    """
+    words = key.split("_")
+    at = len(words)
+    while at and (words[at - 1].rstrip("2") in _UNITS or words[at - 1] == "per"):
+        at -= 1
+    unit = "".join("/" if word == "per" else _UNITS[word.rstrip("2")] + "²" * word.endswith("2") for word in words[at:])
+    return f"{' '.join(words[:at]) or 'rate'}{', ' if unit else ''}{unit}"
+
+
 def _ranking(diagnosis: Diagnosis) -> Details:
     chosen = diagnosis.effects[0]
-    rows = [[name(chosen), f"{chosen.rms_after_um:.3f}", "chosen"]]
-    rows += [[label, f"{rms:.3f}", ""] for label, rms in diagnosis.tried]
+    rows = [[name(chosen), f"{chosen.rms_after_um:.2f}", "chosen"]]
+    rows += [[label, f"{rms:.2f}", ""] for label, rms in diagnosis.tried]
     return Details(
         title="What was tried in place of the largest effect, and how it ranked",
         blocks=[Table(head=["explanation", "leaves µm rms", ""], rows=rows)],

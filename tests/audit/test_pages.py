@@ -91,7 +91,7 @@ def test_every_model_that_recorded_is_named(tmp_path: Path, capsys: pytest.Captu
     service = Service(tmp_path / "rec").run(20)
     service.adopt(other_model())
     service.run(20).stop()
-    assert "quill on what quill, other recorded" in page(capsys, 0, tmp_path / "rec", "--model", "quill")
+    assert "Model “quill” on what “quill, other” recorded" in page(capsys, 0, tmp_path / "rec", "--model", "quill")
 
 
 def test_a_page_of_another_format_is_refused_before_the_work(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
