@@ -129,7 +129,7 @@ async def _serve(
 
 
 def _explain(config: Path, port: int) -> None:
-    sys.stdout.write(f"""
+    sys.stderr.write(f"""
 {MACHINE} runs, and its hours before now are on record. An offset goes out every minute. In another terminal:
   compensator watch --config {config}
   compensator watch --config {config} --page       a live page
@@ -139,14 +139,14 @@ Type here:  break t_q | at | y    its wire is broken        freeze …    its va
             unplug t_q | at | y   its device is gone        mend        all is well again
 Ctrl-C ends it.
 """)
-    sys.stdout.flush()
+    sys.stderr.flush()
 
 
 def _obey(typed: IO[str], faults: Breakable) -> None:
     """Do what is typed, until there is no more."""
     for line in typed:
-        sys.stdout.write(obey(line, faults) + "\n")
-        sys.stdout.flush()
+        sys.stderr.write(obey(line, faults) + "\n")
+        sys.stderr.flush()
 
 
 def obey(line: str, breakable: Breakable) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import json
 import shutil
 import signal
 import subprocess
@@ -102,26 +103,25 @@ def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest
     folder = tmp_path / "live/recordings"
     began_ns = time.time_ns()
     process = subprocess.Popen(
-        [sys.executable, "-m", "compensator", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
+        [sys.executable, "-m", "compensator", *command, "--json"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
     try:
-        assert process.stdin is not None and process.stdout is not None
-        for line in process.stdout:
-            if "Ctrl-C ends it" in line:
-                break
+        assert process.stdin is not None and process.stderr is not None
+        assert any("Ctrl-C ends it" in line for line in process.stderr)
         process.stdin.write("break t_q\n")
         process.stdin.flush()
-        assert process.stdout.readline() == "break t_q: done; the next sample shows it\n"
+        assert any(line == "break t_q: done; the next sample shows it\n" for line in process.stderr)
         assert main(command) == 1, "a second one in the same folder is refused, and leaves alone what is there"
         assert "held by another service of vmc-07" in capfd.readouterr().err
         process.send_signal(signal.SIGINT)
         said, _ = process.communicate(timeout=60)
-        assert process.returncode == 0 and f"compensator replay {folder}" in said
+        assert process.returncode == 0 and json.loads(said) == {"recordings": str(folder)}
     finally:
         process.kill()
         process.wait()
-        process.stdin.close()
-        process.stdout.close()
+        for pipe in (process.stdin, process.stdout, process.stderr):
+            pipe.close()
     offsets = [
         msgspec.json.decode(record.data, type=Offset)
         for path in recordings(folder, "vmc-07") for record in read_messages(path, ("offset",))
