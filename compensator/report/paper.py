@@ -79,6 +79,16 @@ def write_pdf(path: Path, page: Page) -> Path:
         The file.
     page : Page
         What stands on it.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
     """
     pieces = [*_head(page), *_blocks(page.blocks, 2), *_glossary(page)]
     # What fonts are made of while they are written is not for the terminal.
@@ -104,6 +114,16 @@ def write_png(path: Path, page: Page) -> Path:
         The file.
     page : Page
         What stands on it.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
     """
     first = next((block for block in page.blocks if isinstance(block, Figure)), None)
     pieces = [*_head(page), *(_blocks([first], 2) if first is not None else ())]
