@@ -12,7 +12,7 @@ import json
 import logging
 import sys
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 from compensator import __version__
 from compensator.commands import Answer, arguments
@@ -125,8 +125,16 @@ def _in_words(error: Exception) -> str:
     return str(error)
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says in one line what is wrong, as everything else does, and where the rest stands."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with exit code 2."""
+        self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` has all options\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="compensator", description="Thermal error compensation for machine tools.",
         epilog="example: compensator demo --out demo-out",
     )  # fmt: skip

@@ -9,7 +9,7 @@ import hashlib
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -299,12 +299,27 @@ def parse_config(data: bytes, *, source: str) -> Config:
     return config
 
 
+def _keys_at(where: str) -> list[str]:
+    """Return the keys of a table, such as `limits` or `channel[1]`."""
+    table: Any = Config
+    for part in re.findall(r"[^.\[\]]+", re.sub(r"\[\d+\]", "", where)):
+        of = {field.encode_name: field.type for field in msgspec.structs.fields(table)}[part]
+        (table,) = (one for one in (of, *get_args(of)) if isinstance(one, type) and issubclass(one, msgspec.Struct))
+    return [field.encode_name for field in msgspec.structs.fields(table)]
+
+
 def _in_words(message: str, table: object) -> str:
     """Turn "…- at `$.limits.offset_max_um`" into "limits.offset_max_um = …: …"."""
     match = re.search(r" - at `\$\.?([^`]*)`$", message)
+    where, text = (match.group(1), message[: match.start()]) if match is not None else ("", message)
+    key = re.fullmatch(r"Object (missing required|contains unknown) field `([^`]*)`", text)
+    if key is not None:
+        what = f"{f'{where}.' if where else ''}{key[2]}"
+        if key[1] == "missing required":
+            return f"{what}: missing, expected a value (every key: deploy/CONFIGURATION.md)"
+        return f"{what}: no such key, expected one of: {', '.join(_keys_at(where))}"
     if match is None:
         return message
-    where, text = match.group(1), message[: match.start()]
     value = table
     for part in re.findall(r"[^.\[\]]+", where):
         try:

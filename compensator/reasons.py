@@ -197,6 +197,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Certificates are not looked into, so one that has expired is not noticed before the router refuses it.",
         "Install what reads them: pip install quill-compensator[tls].",
     ),
+    "service_runs": (
+        "The service runs and has the devices, so a second program may be refused by them, or disturb its readings.",
+        "Look at its readings with `compensator watch`, or stop it for the probe.",
+    ),
     "adopted_unusable": (
         "The adopted model cannot be used, and the configured one stands in.",
         "Adopt it again from its file, or go on with the configured one: `compensator back`.",

@@ -12,7 +12,7 @@ from compensator.config import LoadedConfig
 from compensator.errors import ServiceError
 from compensator.model.model_file import read_model_bytes
 from compensator.service.adoption import check_model
-from compensator.service.asking import Operator, ask, operator_of_file
+from compensator.service.asking import NotReached, Operator, ask, operator_of_file
 from compensator.service.composition import load
 from compensator.service.model_store import ModelStore
 
@@ -31,10 +31,7 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     data = read_model_bytes(arguments.model)
     model = check_model(loaded.config, data, source=arguments.model)
     wanted = {"sha256": model.sha256, "model": data.decode(), "force": arguments.force}
-    operator = operator_of(arguments)
-    reply = ask(
-        loaded.config.zenoh, "adopt", json.dumps(wanted).encode(), timeout_s=arguments.timeout, operator=operator
-    )
+    reply = _asked("adopt", wanted, loaded, arguments)
     if reply is None:
         if model.sha256 == running.sha256:
             raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is the service's model already")
@@ -51,8 +48,7 @@ def back(arguments: argparse.Namespace) -> Answer:
         If the configured model is in use, or the service refuses.
     """
     loaded, _, _, _ = load(arguments.config)
-    payload = json.dumps({"force": arguments.force}).encode()
-    reply = ask(loaded.config.zenoh, "back", payload, timeout_s=arguments.timeout, operator=operator_of(arguments))
+    reply = _asked("back", {"force": arguments.force}, loaded, arguments)
     if reply is not None:
         return _answered(reply, "", "")
     store = _store(loaded)
@@ -67,6 +63,17 @@ def back(arguments: argparse.Namespace) -> Answer:
 def operator_of(arguments: argparse.Namespace) -> Operator | None:
     """Return who sends a command, None where nothing is said of it."""
     return operator_of_file(arguments.zenoh) if arguments.zenoh is not None else None
+
+
+def _asked(
+    name: str, wanted: dict[str, Any], loaded: LoadedConfig, arguments: argparse.Namespace
+) -> dict[str, Any] | None:
+    """Ask the running service; None where there is none."""
+    payload, operator = json.dumps(wanted).encode(), operator_of(arguments)
+    try:
+        return ask(loaded.config.zenoh, name, payload, timeout_s=arguments.timeout, operator=operator)
+    except NotReached:
+        return None
 
 
 def _store(loaded: LoadedConfig) -> ModelStore:

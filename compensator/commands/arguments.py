@@ -56,7 +56,9 @@ def bridge(parser: argparse.ArgumentParser) -> None:
 
 def explain(parser: argparse.ArgumentParser) -> None:
     """Describe the argument of `explain`."""
-    parser.add_argument("code", metavar="CODE", help="such as degraded, or t_q_missing")
+    parser.add_argument(
+        "code", metavar="CODE", nargs="?", help="such as degraded, or t_q_missing; all where none is given"
+    )
 
 
 def identify(parser: argparse.ArgumentParser) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 
 from compensator.commands import Answer
 from compensator.errors import UsageError
@@ -18,8 +19,13 @@ def run(arguments: argparse.Namespace) -> Answer:
     UsageError
         If there is no such code.
     """
+    known = {**WORDS, **{code: words for code, words in RECEIVER_WORDS.items() if code not in WORDS}}
+    if arguments.code is None:
+        lines = [f"{code:<22} {means}" for code, (means, _) in known.items()]
+        return Answer({code: {"means": means, "do": do} for code, (means, do) in known.items()}, "\n".join(lines))
     words = explain(arguments.code) or RECEIVER_WORDS.get(arguments.code)
     if words is None:
-        known = ", ".join(dict.fromkeys([*WORDS, *RECEIVER_WORDS]))
-        raise UsageError(f"{arguments.code}: unknown, expected one of: {known}")
+        near = difflib.get_close_matches(arguments.code, known, n=3)
+        meant = f"expected one of: {', '.join(near)}" if near else "nothing like it is known"
+        raise UsageError(f"{arguments.code}: unknown, {meant}; `compensator explain` has all codes")
     return Answer({"code": arguments.code, "means": words[0], "do": words[1]}, f"{words[0]}\n{words[1]}")

@@ -50,8 +50,6 @@ def _order(name: str, payload: dict[str, Any], arguments: argparse.Namespace) ->
         except msgspec.ValidationError as error:
             raise UsageError(f"--prefix {arguments.prefix!r}: expected words between single slashes") from error
     reply = ask(settings, name, json.dumps(payload).encode(), timeout_s=arguments.timeout, operator=operator)
-    if reply is None:
-        raise ServiceError(f"{settings.prefix}: the service is not reached; does it run, and is its router there?")
     if not reply.get("ok"):
         raise ServiceError(f"the service refuses: {reply.get('text', 'no reason given')}")
     return Answer(reply, str(reply.get("text", "")))

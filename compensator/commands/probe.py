@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import logging
 from typing import Any
 
 from compensator.commands import Answer
+from compensator.reasons import Caution
 from compensator.service.composition import load, read_once
+from compensator.service.presence import is_used
 from drivers.errors import DriverError
+
+log = logging.getLogger("compensator")
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -20,10 +25,16 @@ def run(arguments: argparse.Namespace) -> Answer:
         If the configuration cannot be used.
     """
     loaded, _, _, fleet = load(arguments.config)
+    config = loaded.config
+    warnings = []
+    if is_used(loaded.resolve(config.recording.folder), config.machine.name):
+        warnings.append(Caution("service_runs", f"The service of {config.machine.name} runs and has the devices."))
+    for warning in warnings:
+        log.warning("%s: warning: %s", arguments.config, warning.marked)
     units = {name: dict(device.units) for name, device in fleet.devices.items()}
     answers = asyncio.run(read_once(fleet))
     rows: list[dict[str, Any]] = []
-    for channel in loaded.config.channel:
+    for channel in config.channel:
         answer, unit = answers[channel.device], units[channel.device][channel.input]
         row = {"channel": channel.name, "device": channel.device, "input": channel.input, "value": None, "unit": unit}
         if isinstance(answer, DriverError):
@@ -35,7 +46,8 @@ def run(arguments: argparse.Namespace) -> Answer:
                 row["value"] = reading.value
         rows.append(row)
     good = all(row["quality"] == "good" for row in rows)
-    return Answer({"channels": rows}, "\n".join(map(_line, rows)), 0 if good else 1)
+    result = {"channels": rows, "warnings": list(warnings), "warning_codes": [warning.code for warning in warnings]}
+    return Answer(result, "\n".join(map(_line, rows)), 0 if good else 1)
 
 
 def _line(row: dict[str, Any]) -> str:

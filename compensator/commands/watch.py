@@ -19,7 +19,7 @@ from rich.live import Live
 from compensator.clock import SystemClock
 from compensator.commands import Answer
 from compensator.config import LoadedConfig, load_config
-from compensator.errors import UsageError
+from compensator.errors import ServiceError, UsageError
 from compensator.watch.listener import Listener, Sink, Source, of_endpoints, of_file, of_settings
 from compensator.watch.past import last_day
 from compensator.watch.shop import Shop, headline
@@ -102,9 +102,15 @@ def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
         if arguments.wait:
             with until_stopped() as stopped:
                 stopped.wait(arguments.wait)
+        if not shop.overview() and not arguments.json:
+            there = listener.elsewhere()
+            known = f"alive there: {', '.join(there)}" if there else "no service is alive there"
+            raise ServiceError(f"nothing is heard below {source.prefix or 'any prefix'} at {source.where}; {known}")
         console = Console(file=sys.stdout)
         with console.capture() as captured:
-            console.print(view(shop, prefix=source.prefix, where=source.where, connected=True, console=console))
+            console.print(
+                view(shop, prefix=source.prefix, where=source.where, connected=True, console=console, stays=False)
+            )
     machines = shop.overview()
     result = {"machines": machines, "headline": headline(machines), "ignored": shop.ignored}
     return Answer(result, captured.get().rstrip("\n"), 0 if machines else 1)

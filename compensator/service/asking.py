@@ -19,6 +19,10 @@ from compensator.service.publisher import SENDER
 from compensator.service.session import files_of, get, put, read_config_file, session_config
 
 
+class NotReached(ServiceError):
+    """No service heard the command."""
+
+
 class Operator(NamedTuple):
     """How an operator reaches services.
 
@@ -101,7 +105,7 @@ def _user() -> str:
 
 def ask(
     settings: Zenoh, command: str, payload: bytes, *, timeout_s: float, operator: Operator | None = None
-) -> dict[str, Any] | None:
+) -> dict[str, Any]:
     """Send a command to the running service.
 
     Parameters
@@ -119,17 +123,21 @@ def ask(
 
     Returns
     -------
-    dict or None
-        `ok` and `text`; None where no service is there.
+    dict
+        `ok` and `text`.
 
     Raises
     ------
+    NotReached
+        If nobody answers at the endpoints, or no service of that prefix is there; it names those that are.
     ServiceError
         If the service is alive and does not answer.
     """
     operator = operator or operator_here(settings)
+    nobody = f"{settings.prefix}: the service is not reached"
     if operator is None:
-        return None
+        raise NotReached(f"{nobody}: zenoh has neither listen nor connect to find it at")
+    where = ", ".join(get(operator.config, "connect/endpoints") or ())
     key = f"{settings.prefix}/thermal/command/{command}" + (f"/{operator.name}" if operator.name else "")
     try:
         with zenoh.open(operator.config) as session:
@@ -137,10 +145,29 @@ def ask(
                 if answer.ok is not None:
                     reply: dict[str, Any] = json.loads(answer.ok.payload.to_bytes())
                     return reply
-            alive = list(session.liveliness().get(f"{settings.prefix}/thermal/alive", timeout=timeout_s))
-    except (zenoh.ZError, ValueError):
-        return None
-    if alive:
+            own = f"{settings.prefix}/thermal/alive"
+            # Who may know of this machine alone asks for it alone.
+            alive = [*alive_at(own, session, timeout_s), *alive_at("**/thermal/alive", session, timeout_s)]
+    except (zenoh.ZError, ValueError) as error:
+        raise NotReached(f"{nobody}: nobody answers at {where}; does the service, or its router, run?") from error
+    if settings.prefix in alive:
         raise ServiceError(f"{key}: the service is alive and gives no answer: does the router's access list permit "
                            f"{operator.name or 'this'}?")  # fmt: skip
-    return None
+    there = f"alive there: {', '.join(sorted(alive))}" if alive else "none is alive there"
+    raise NotReached(f"{nobody}: none of that prefix at {where}; {there}")
+
+
+def alive_at(key: str, session: zenoh.Session, timeout_s: float) -> list[str]:
+    """Return the prefixes of the services that are alive, as far as whoever asks may know.
+
+    Parameters
+    ----------
+    key : str
+        Of their tokens, such as `**/thermal/alive` for all.
+    session : zenoh.Session
+        Open.
+    timeout_s : float
+        How long to wait, s.
+    """
+    replies = session.liveliness().get(key, timeout=timeout_s)
+    return sorted({str(reply.ok.key_expr).removesuffix("/thermal/alive") for reply in replies if reply.ok is not None})

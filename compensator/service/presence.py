@@ -68,6 +68,31 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
         yield
 
 
+def is_used(folder: Path, machine: str) -> bool:
+    """Tell whether a service of a machine holds the folder of its recordings; changes nothing.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Folder of the recordings.
+    machine : str
+        Name of the machine.
+    """
+    try:
+        descriptor = os.open(folder / f"{machine}.lock", os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)  # and with it the lock
+    return False
+
+
 def _opened(path: Path) -> int:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

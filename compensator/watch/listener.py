@@ -18,7 +18,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError, UsageError
-from compensator.service.asking import operator_of_file
+from compensator.service.asking import alive_at, operator_of_file
 from compensator.service.session import get, in_words, put, session_config
 
 #: Seconds between two attempts where nobody is there to connect to.
@@ -151,6 +151,10 @@ class Listener:
         for answer in alive:
             if answer.ok is not None:
                 self._token(answer.ok)
+
+    def elsewhere(self) -> list[str]:
+        """Return the prefixes of services that are alive, whether they are listened to or not."""
+        return alive_at("**/thermal/alive", self._session, ANSWER_S) if self._session is not None else []
 
     def start(self) -> None:
         """Connect in the background, again and again until somebody is there, and ask after each new connection."""

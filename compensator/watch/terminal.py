@@ -27,7 +27,9 @@ EVENTS, SPELLS = 6, 4
 URGENT, PAST = ("Why", "Mind", "Channels", "Devices"), "States of the last day, the newest first"
 
 
-def view(shop: Shop, *, prefix: str, where: str, connected: bool, console: Console) -> RenderableType:
+def view(
+    shop: Shop, *, prefix: str, where: str, connected: bool, console: Console, stays: bool = True
+) -> RenderableType:
     """Return what is shown now: the machine of the prefix, or all below it.
 
     Parameters
@@ -40,6 +42,8 @@ def view(shop: Shop, *, prefix: str, where: str, connected: bool, console: Conso
         Whether there is a connection.
     console : rich.console.Console
         Its size says how much there is room for.
+    stays : bool
+        Whether it is drawn again and again until Ctrl-C.
     """
     machines = shop.overview()
     now = here(shop.now_ns())
@@ -56,7 +60,8 @@ def view(shop: Shop, *, prefix: str, where: str, connected: bool, console: Conso
         parts += _to_do(machines[:rows], console.width, console.height - 8 - len(machines))
     if shop.ignored:
         parts.append(Text(f"{shop.ignored} message(s) with keys or of machines that are not followed.", style="yellow"))
-    parts.append(Text("Ctrl-C ends the view; nothing is sent to the machines.", style="dim"))
+    if stays:
+        parts.append(Text("Ctrl-C ends the view; nothing is sent to the machines.", style="dim"))
     return Group(*parts)
 
 

@@ -228,8 +228,14 @@ def test_bad_tables_get_one_line_and_exit_2(
 
 
 BAD_CONFIGS = [
-    ("offset_max_um = 200.0", "offset_maximum_um = 200.0", "offset_maximum_um"),
-    ("offset_max_um = 200.0\n", "", "offset_max_um"),
+    (
+        "offset_max_um = 200.0",
+        "offset_maximum_um = 200.0",
+        "limits.offset_maximum_um: no such key, expected one of: offset_max_um, ",
+    ),
+    ("offset_max_um = 200.0\n", "", "limits.offset_max_um: missing"),
+    ("[machine]", "[machin]", "machin: no such key, expected one of: machine, "),
+    ('name = "t_q_degc"', 'nam = "t_q_degc"', "channel[0].nam: no such key, expected one of: name, device"),
     ("predict_for_min = 30.0", "predict_for_min = -1.0", "loss.predict_for_min = -1.0"),
     ('device = "probe"', 'device = "prob"', "device 'prob' is not configured"),
     ('name = "y_um"\ndevice = "probe"', 'name = "y_um"\ndevice = "control"', "expected um"),
@@ -310,6 +316,31 @@ def test_explain_knows_every_state_and_refuses_others(capsys: pytest.CaptureFixt
     for code in ("starting", "ok", "degraded", "hold", "fault", "outside_validity:t_q_degc"):
         assert main(["explain", code]) == 0
     assert main(["explain", "nonsense"]) == 2
+    capsys.readouterr()
+    assert main(["explain", "operator_holt"]) == 2
+    error = capsys.readouterr().err
+    assert "expected one of: operator_hold;" in error and len(error) < 200
+    assert main(["explain", "--json"]) == 0
+    assert {"hold", "open_listen", "silent", "catching_up"} <= set(json.loads(capsys.readouterr().out))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["nonsense"],
+        ["zero", "--mode", "bogus"],
+        ["check"],
+        ["report"],
+        ["hold", "--timeout", "soon"],
+        ["watch", "--conect"],
+    ],
+)
+def test_wrong_usage_is_one_line_that_leads_to_the_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and error.startswith("compensator") and "--help`" in error and error.count("\n") == 1
     assert START_NS % 60_000_000_000 == 0
 
 

@@ -1,0 +1,54 @@
+"""`zero`, `hold` and `resume` where no service hears them: one line that says how far they came."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from compensator.cli import main
+from compensator.config import Zenoh
+from compensator.service.presence import is_used, sole_user
+from compensator.service.publisher import Publisher
+from tests.receiver.wire import free_port
+
+
+def operator(folder: Path, port: int) -> str:
+    path = folder / "operator.json5"
+    path.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"]}}))
+    return str(path)
+
+
+@pytest.mark.parametrize("command", ["zero", "hold", "resume"])
+def test_an_endpoint_at_which_nobody_answers_is_named(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    port = free_port()
+    assert main([command, "--prefix", "shop/vmc-07", "--zenoh", operator(tmp_path, port)]) == 1
+    error = capsys.readouterr().err
+    assert f"shop/vmc-07: the service is not reached: nobody answers at tcp/127.0.0.1:{port}" in error
+    assert error.count("\n") == 1
+
+
+def test_a_wrong_prefix_is_told_from_a_service_that_is_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = free_port()
+    settings = Zenoh(prefix="shop/vmc-07", mode="peer", listen=[f"tcp/127.0.0.1:{port}"])
+    with Publisher(settings, lambda *_: {"ok": True, "text": "held"}):
+        assert main(["hold", "--prefix", "shop/vmc-70", "--zenoh", operator(tmp_path, port), "--timeout", "2"]) == 1
+        error = capsys.readouterr().err
+        assert "none of that prefix" in error and error.endswith("alive there: shop/vmc-07\n")
+        assert main(["hold", "--prefix", "shop/vmc-07", "--zenoh", operator(tmp_path, port)]) == 0
+        capsys.readouterr()
+        assert main(["watch", "--connect", f"tcp/127.0.0.1:{port}", "--prefix", "shop/vmc-70", "--once"]) == 1
+        error = capsys.readouterr().err
+        assert "nothing is heard below shop/vmc-70" in error and error.endswith("alive there: shop/vmc-07\n")
+
+
+def test_a_folder_that_a_service_holds_is_known_to_be_held(tmp_path: Path) -> None:
+    assert not is_used(tmp_path, "vmc-07") and list(tmp_path.iterdir()) == []
+    with sole_user(tmp_path, "vmc-07"):
+        assert is_used(tmp_path, "vmc-07") and not is_used(tmp_path, "vmc-08")
+    assert not is_used(tmp_path, "vmc-07")
+    with sole_user(tmp_path, "vmc-07"):  # looking did not keep it
+        pass
