@@ -180,10 +180,13 @@ class ChainCheck:
             self._findings.add("removed", "the first message of the chain is missing", topic="chain", sequence=0)
             self.head, self._next = self.previous, message.records[0].sequence if message.records else sequence
             return
-        for name in stated.keys() | found.keys():
-            if stated.get(name) != found.get(name):
-                kind = "removed" if name not in found else "inserted" if name not in stated else "altered"
-                self._findings.add(kind, "not what the recording began with", topic=name)  # type: ignore[arg-type]
+        for name in sorted(stated.keys() | found.keys()):
+            if name not in found:
+                self._findings.add("removed", "the recording began with it, and it is not there", topic=name)
+            elif name not in stated:
+                self._findings.add("inserted", "the recording did not begin with it", topic=name)
+            elif stated[name] != found[name]:
+                self._findings.add("altered", "not what the recording began with", topic=name)
         if list(stated) != list(found) and stated == found:
             self._findings.add("reordered", "attachments or metadata stand in another order", topic="chain", sequence=0)
         try:
