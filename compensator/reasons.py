@@ -238,6 +238,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Wait; where it takes minutes, check the disk.",
     ),
     # Remarks on tables and recordings that are read as data.
+    "estimates_left_out": (
+        "The table is an exported recording: what the service estimated and published in it counts as no measurement.",
+        "Nothing; where the heat was measured it stands in heat_measured_w and is used.",
+    ),
     "rows_sorted": (
         "Rows of the table stood out of order and were sorted by their time.",
         "Look why the logger wrote them so: clocks that were set, or files put together.",

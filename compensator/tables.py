@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -23,6 +23,10 @@ ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 #: A gap of up to this many model samples stays inside a record; the engine bridges it.
 SHORT_GAP_SAMPLES = 60
 
+
+#: What stands in an exported recording beside what was measured.
+EXPORTED = ("seq", "heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um", "y_offset_um",
+            "y_offset_rate_um_per_min", "y_offset_std_um", "state", "reasons")  # fmt: skip
 
 #: How files begin that somebody may take for a table, and what to do with them.
 _OTHER_FILES = (
@@ -92,8 +96,9 @@ def load_data(path: Path, period_s: float, roles: Mapping[str, str] | None = Non
     if path.suffix == ".mcap":
         return load_recordings([path], period_s, roles)
     t_s, columns = _read_csv(path)
-    columns = _with_roles(path, columns, roles or {})
-    return _gridded(path, t_s, columns, period_s)
+    measured, remarks = _measured_alone(path, columns)
+    data = _gridded(path, t_s, _with_roles(path, measured, roles or {}), period_s)
+    return replace(data, remarks=(*remarks, *data.remarks))
 
 
 def load_recordings(paths: Sequence[Path], period_s: float, roles: Mapping[str, str] | None = None) -> Data:
@@ -144,6 +149,20 @@ def roles_of(pairs: Sequence[str]) -> dict[str, str]:
             raise UsageError(f"--column {pair}: expected ROLE=NAME, such as t_q_degc=t5_degc")
         roles[role] = name
     return roles
+
+
+def _measured_alone(path: Path, columns: dict[str, Vector]) -> tuple[dict[str, Vector], tuple[Caution, ...]]:
+    """Leave out of an exported recording what the service made of the measurements.
+
+    Its heat is the model's own estimate: a model fitted to that as if somebody had measured it would find itself again.
+    """
+    if not {"y_pred_um", "y_offset_um"} <= columns.keys():
+        return columns, ()
+    kept = {name: values for name, values in columns.items() if name not in EXPORTED}
+    if "heat_measured_w" in kept:
+        kept["heat_w"] = kept.pop("heat_measured_w")
+    said = f"{path}: an exported recording; what the service estimated and published is left out, heat_w with it."
+    return kept, (Caution("estimates_left_out", said),)
 
 
 def _with_roles(path: Path, columns: dict[str, Vector], roles: Mapping[str, str]) -> dict[str, Vector]:
