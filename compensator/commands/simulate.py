@@ -12,12 +12,18 @@ import numpy as np
 
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_file
+from compensator.identify.screening import check_scale
 from compensator.model.model_file import load_model
+from compensator.model.thermal_model import ThermalModel
+from compensator.reasons import Caution
 from compensator.simulation import csv_rows, scores, simulate
-from compensator.tables import load_data, require, roles_of
+from compensator.tables import Record, load_data, require, roles_of
 from compensator.whole import whole_file
 
 log = logging.getLogger("compensator")
+
+#: So many rows of one and the same T_Q are no measurement, samples.
+_STILL = 60
 
 COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_tdtf_um", "y_std_um")
 
@@ -37,6 +43,8 @@ def run(arguments: argparse.Namespace) -> Answer:
         log.warning("%s", remark.marked)
     for record in data.records:
         require(arguments.data, record, ("t_q_degc", "at_degc"))
+        for remark in doubts(str(arguments.data), model, record):
+            log.warning("%s", remark.marked)
     parts = [simulate(model, record, source=str(arguments.data)) for record in data.records]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     with whole_file(out) as file:
@@ -53,3 +61,35 @@ def run(arguments: argparse.Namespace) -> Answer:
         text += f"\nfit {score.fit_pct:.2f} %, residual {score.rms_um:.3f} µm rms"
         text += f", {score.peak_to_peak_um:.2f} µm peak to peak"
     return Answer(result, text)
+
+
+def doubts(source: str, model: ThermalModel, record: Record) -> list[Caution]:
+    """Return what makes a prediction from these temperatures doubtful.
+
+    Parameters
+    ----------
+    source : str
+        Name of the data.
+    model : ThermalModel
+        What is run.
+    record : Record
+        What it is run over.
+
+    Raises
+    ------
+    DataError
+        If a temperature is in kelvin, or below absolute zero.
+    """
+    found = []
+    for name in ("t_q_degc", "at_degc"):
+        values = record.columns[name]
+        known = values[~np.isnan(values)]
+        check_scale(source, name, values)
+        if name == "t_q_degc" and known.size >= _STILL and np.ptp(known) == 0.0:
+            found.append(Caution("stuck", f"{source}: {name} = {known[0]:g} in every row."))
+        low, high = model.validity.get(name, (-np.inf, np.inf))
+        outside = int(np.sum((known < low) | (known > high)))
+        if outside:
+            said = f"{source}: {name} lies outside {low:g} to {high:g} °C in {outside} of {known.size} samples."
+            found.append(Caution("outside_validity", said))
+    return found

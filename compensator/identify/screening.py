@@ -22,6 +22,8 @@ HOTTEST_AIR_DEGC = 50.0
 MACHINE_DEGC = (-30.0, 150.0)
 #: Deformations of a machine tool's spindle lie in here, peak to peak, µm.
 DEFORMATION_UM = (0.5, 3000.0)
+#: A machine's temperatures in kelvin lie in here.
+KELVIN = (250.0, 420.0)
 #: Beyond these no thermocouple at a machine shows a temperature, °C.
 POSSIBLE_DEGC = (-273.15, 1500.0)
 #: Shortest stretch of one and the same value by which a sensor that is never still otherwise counts as dead, samples.
@@ -97,6 +99,30 @@ def screen_temperatures(name: str, runs: Sequence[Run], *, quiet_air: bool = Fal
     _check_pair(name, _joined(columns["t_q_degc"]), _joined(columns["at_degc"]))
 
 
+def check_scale(name: str, column: str, values: Vector) -> None:
+    """Refuse a temperature in kelvin, and the code of a fault among temperatures.
+
+    Parameters
+    ----------
+    name, column : str
+        File and column, for the message.
+    values : numpy.ndarray
+        °C; NaN where missing.
+
+    Raises
+    ------
+    DataError
+        If all values look like kelvin, or one is below absolute zero.
+    """
+    known = values[~np.isnan(values)]
+    if known.size and known.min() >= KELVIN[0] and known.max() <= KELVIN[1]:
+        raise DataError(f"{name}: {column} runs from {known.min():.1f} to {known.max():.1f}: kelvin? expected °C")
+    if known.size and known.min() < POSSIBLE_DEGC[0]:
+        count = int(np.sum(known < POSSIBLE_DEGC[0]))
+        raise DataError(f"{name}: {column} = {known.min():g}, {count} sample(s) like it: a fault's code? expected °C, and "
+                        "an empty cell where a value is missing")  # fmt: skip
+
+
 def _check_possible(run: Run, column: str, values: Vector) -> None:
     """Refuse numbers that stand for a fault, such as −9999, among temperatures."""
     low, high = POSSIBLE_DEGC
@@ -144,8 +170,7 @@ def _check_temperature(name: str, column: str, values: Vector, *, still: bool) -
         )
     low, high = float(values.min()), float(values.max())
     air = column == "at_degc"
-    if low >= 250.0 and high <= 420.0:
-        raise DataError(f"{name}: {column} runs from {low:.1f} to {high:.1f}: kelvin? expected °C")
+    check_scale(name, column, values)
     if high - low > 2000.0 or abs(middle) > 1000.0:
         raise DataError(f"{name}: {column} runs from {low:g} to {high:g}: thousandths of a degree? expected °C")
     if air and middle > HOTTEST_AIR_DEGC:

@@ -132,3 +132,20 @@ def test_what_fails_half_way_leaves_no_table(tmp_path: Path, capsys: pytest.Capt
     words = ["replay", str(recording), "--model", "quill", "--out", str(out)]
     refused(capsys, words, "day.mcap: not an MCAP file, expected a recording")
     assert [path.name for path in tmp_path.iterdir()] == ["day.mcap"]
+
+
+def test_simulate_says_where_temperatures_cannot_be_right(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out.csv"
+
+    def run(t_q: str) -> list[str]:
+        rows = (f"{60 * i},{t_q.format(20 + i / 10)},20.0" for i in range(90))
+        (tmp_path / "run.csv").write_text("t_s,t_q_degc,at_degc\n" + "\n".join(rows) + "\n")
+        return ["simulate", str(tmp_path / "run.csv"), "--model", "quill", "--out", str(out)]
+
+    refused(capsys, run("293"), "run.csv: t_q_degc runs from 293.0 to 293.0: kelvin?")
+    refused(capsys, run("-9999"), "t_q_degc = -9999, 90 sample(s) like it: a fault's code?")
+    assert not out.exists()
+    for text, code in (("20.0", "[stuck]"), ("68.{0:.0f}", "[outside_validity]"), ("{0:.2f}", "")):
+        assert main(run(text)) == 0
+        said = capsys.readouterr().err
+        assert said.count("\n") == bool(code) and code in said
