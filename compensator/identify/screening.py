@@ -119,8 +119,8 @@ def check_scale(name: str, column: str, values: Vector) -> None:
         raise DataError(f"{name}: {column} runs from {known.min():.1f} to {known.max():.1f}: kelvin? expected °C")
     if known.size and known.min() < POSSIBLE_DEGC[0]:
         count = int(np.sum(known < POSSIBLE_DEGC[0]))
-        raise DataError(f"{name}: {column} = {known.min():g}, {count} sample(s) like it: a fault's code? expected °C, and "
-                        "an empty cell where a value is missing")  # fmt: skip
+        raise DataError(f"{name}: {column} = {known.min():g}, {count} sample(s) like it: a fault's code? expected °C, "
+                        "and an empty cell where a value is missing")  # fmt: skip
 
 
 def _check_possible(run: Run, column: str, values: Vector) -> None:
