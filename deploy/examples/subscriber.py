@@ -1,4 +1,4 @@
-"""Follow the Y offset of a machine.  python subscriber.py tcp/127.0.0.1:7447 shop/vmc-07 [COUNT]."""
+"""Follow the Y offset, a line each minute: python subscriber.py tcp/127.0.0.1:7447 shop/vmc-07 [COUNT]."""
 
 import json
 import sys

@@ -3,7 +3,7 @@
 import sys
 import time
 
-from compensator.receiver import Receiver, load_settings
+from compensator.receiver import Receiver, ReceiverError, load_settings
 
 
 def apply(offset_um: float, why: str) -> None:
@@ -11,12 +11,14 @@ def apply(offset_um: float, why: str) -> None:
     print(f"{offset_um:+.2f} µm  {why}", flush=True)
 
 
-settings, _ = load_settings(sys.argv[1])
-with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: what your control applies already
-    try:
+try:
+    settings, _ = load_settings(sys.argv[1] if len(sys.argv) > 1 else "receiver.toml")
+    with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: what your control applies already
         while True:
             applied = receiver.poll()
             apply(applied.offset_um, f"{applied.state} {' '.join(reason.text for reason in applied.reasons)}")
-            time.sleep(0.1)
-    except KeyboardInterrupt:
-        pass  # what is applied stands
+            time.sleep(0.5)
+except ReceiverError as error:
+    sys.exit(f"follow.py: {error}")
+except KeyboardInterrupt:
+    pass  # what is applied stands

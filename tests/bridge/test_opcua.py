@@ -200,3 +200,8 @@ def test_it_does_not_start_like_this(
 def test_check_opens_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bridge", "opcua", "--config", str(written(tmp_path)), "--check", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["sign"] == -1
+
+
+def test_the_trial_without_a_plc_can_be_loaded() -> None:
+    settings, opcua = load_bridge(Path(__file__).parents[2] / "deploy/opcua/trial.toml")
+    assert (settings.prefix, opcua.offset_node, opcua.unit) == ("shop/vmc-07", "ns=2;i=2", "um")

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from compensator.receiver import Receiver, ReceiverError, Settings
+from compensator.demo import live
+from compensator.receiver import Receiver, ReceiverError, Settings, load_settings
 from tests.receiver.offsets import MACHINE
 from tests.receiver.wire import PREFIX, ScriptedService, free_port, router, until
 
@@ -176,3 +177,11 @@ offset_rate_max_um_per_min = 60000.0
     done = subprocess.run([sys.executable, "-m", "compensator.receiver", "--config", str(tmp_path / "none.toml")],
                           cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)  # fmt: skip
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "none.toml" in done.stderr
+    done = subprocess.run([sys.executable, str(ROOT / "deploy/receiver/follow.py"), str(tmp_path / "none.toml")],
+                          cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)  # fmt: skip
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "none.toml" in done.stderr
+
+
+def test_the_shipped_settings_follow_the_machine_to_try_things_on() -> None:
+    settings, _ = load_settings(ROOT / "deploy/receiver/receiver.example.toml")
+    assert (settings.machine, settings.prefix) == (live.MACHINE, live.PREFIX)

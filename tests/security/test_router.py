@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
 
+from compensator.certificates import check_files
 from compensator.cli import main
 from compensator.commands.router import checked
-from compensator.service.session import read_config_file
+from compensator.config import Zenoh
+from compensator.service.asking import operator_of_file
+from compensator.service.session import read_config_file, tls_files
 from tests.security.shop import DEPLOY, Shop, script
 
 
@@ -122,3 +127,23 @@ def test_a_list_that_gives_other_rights_than_meant_is_refused(
     path = tmp_path / "shop.toml"
     path.write_text(text.replace(old, new), encoding="utf-8")
     assert expected in script("access_list.py", str(path), code=1)
+
+
+def test_the_trial_on_one_computer_works_as_written(tmp_path: Path) -> None:
+    text = (DEPLOY / "README.md").read_text(encoding="utf-8").partition("<!-- trial -->")[2].split("```")[1]
+    assert text.count("\ncompensator ") == 1
+    shell = text.replace("/path/to/deploy/zenoh", str(DEPLOY)).replace("python ", f"{sys.executable} ")
+    shell = shell.replace("\ncompensator ", f"\n{sys.executable} -m compensator ")
+    done = subprocess.run(["sh", "-euc", shell], cwd=tmp_path, capture_output=True, text=True, timeout=110, check=False,
+                          env={**os.environ, "PYTHONPATH": str(DEPLOY.parents[1])})  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Listens on tls/127.0.0.1:7448, access list on." in done.stdout
+    for name in ("receiver", "operator"):
+        operator_of_file(tmp_path / f"{name}.json5")  # files are where the configuration says
+    files = tls_files(Zenoh(**_zenoh(tmp_path / "service.toml")))
+    assert files is not None and check_files("service.toml", files) is not None
+
+
+def _zenoh(path: Path) -> dict[str, Any]:
+    table = tomllib.loads(path.read_text(encoding="utf-8"))["zenoh"]
+    return {key: str(path.parent / value) if key.startswith("tls_") else value for key, value in table.items()}
