@@ -21,6 +21,7 @@ STYLES = {"good": "green", "warn": "yellow", "bad": "bold red"}
 _ROWS = (("offset", "y_offset_um", "µm"), ("DTF", "y_dtf_um", "µm"), ("TDTF", "y_tdtf_um", "µm"),
          ("effects", "effects", "µm"), ("residual", "residual_um", "µm"), ("T_Q", "t_q_degc", "°C"),
          ("AT", "at_degc", "°C"))  # fmt: skip
+_SHORT = ("offset", "residual")
 #: Room beside the bars: name before, range behind.
 _BESIDE = 38
 #: Points farther apart than this do not belong to one spell, s.
@@ -83,7 +84,7 @@ def spells(history: Mapping[str, Sequence[Any]]) -> list[Spell]:
     return found[::-1]
 
 
-def drawn(history: Mapping[str, Sequence[Any]], width: int) -> list[RenderableType]:
+def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = False) -> list[RenderableType]:
     """Return the last day as lines of bars, each with its range and unit, over a strip of states.
 
     Parameters
@@ -92,11 +93,15 @@ def drawn(history: Mapping[str, Sequence[Any]], width: int) -> list[RenderableTy
         Columns as of `History`.
     width : int
         Of what may be filled, letters.
+    short : bool
+        Offset, residual and states only.
     """
     t_s = history.get("t_s", ())
     count = max(width - _BESIDE, 12)
     lines: list[RenderableType] = []
     for name, column, unit in _ROWS:
+        if short and name not in _SHORT:
+            continue
         series = _summed(history.get(column, ())) if column == "effects" else list(history.get(column, ()))
         values = [value for value in series if value is not None]
         if len(values) < 2:

@@ -23,6 +23,8 @@ _COLUMNS = (
 )  # fmt: skip
 #: Events, and times in one state, shown of one machine.
 EVENTS, SPELLS = 6, 4
+#: Rows of a terminal from which on everything is drawn.
+TALL = 44
 #: Lists that stand above the numbers; the rest stands below the day.
 URGENT, PAST = ("Why", "Mind", "Channels", "Devices"), "States of the last day, the newest first"
 
@@ -53,7 +55,8 @@ def view(
         parts.append(Text(f"✗ No connection to {where}; trying again. What stands here is old.", style="bold red"))
     if len(machines) == 1:
         history = shop.history(machines[0]["prefix"])
-        parts.append(detail(machines[0], history, console.width, shop.now_ns()))
+        short = stays and console.height < TALL
+        parts.append(detail(machines[0], history, console.width, shop.now_ns(), short=short))
     elif machines:
         rows = max(console.height - 8, 5)
         parts.append(overview(shop, machines, console.width, rows=rows))
@@ -144,7 +147,9 @@ def state(machine: dict[str, Any]) -> Text:
 # ---------------------------------------------------------------------------- one machine
 
 
-def detail(machine: dict[str, Any], history: dict[str, list[Any]], width: int, now_ns: int) -> RenderableType:
+def detail(
+    machine: dict[str, Any], history: dict[str, list[Any]], width: int, now_ns: int, *, short: bool = False
+) -> RenderableType:
     """Return everything of one machine.
 
     Parameters
@@ -157,6 +162,8 @@ def detail(machine: dict[str, Any], history: dict[str, list[Any]], width: int, n
         Of the terminal, letters.
     now_ns : int
         Now, ns since 1970 UTC.
+    short : bool
+        Leave out what a terminal that is not tall has no room for: what does not fit is cut off below.
     """
     parts: list[RenderableType] = [_verdict(machine)]
     pairs = _pairs(machine)
@@ -164,11 +171,16 @@ def detail(machine: dict[str, Any], history: dict[str, list[Any]], width: int, n
     numbers = Table.grid(padding=(0, 2))
     for i in range(0, len(pairs), per_row):
         numbers.add_row(*(cell for name, value in pairs[i : i + per_row] for cell in (Text(name, style="dim"), value)))
-    past = [spell.text(now_ns / NS) for spell in spells(history)[:SPELLS]]
+    past = [spell.text(now_ns / NS) for spell in spells(history)[: SPELLS // 2 if short else SPELLS]]
     lists = [(title, lines) for title, lines in _lists(machine, past, here(now_ns)) if lines]
     urgent = [(title, lines) for title, lines in lists if title in URGENT]
     parts += [_titled(title, lines) for title, lines in urgent]
-    parts += [Text(""), numbers, Text(_about(machine), style="dim"), *drawn(history, width - 4)]
+    parts += [
+        Text(""),
+        numbers,
+        *([] if short else [Text(_about(machine), style="dim")]),
+        *drawn(history, width - 4, short=short),
+    ]
     parts += [_titled(title, lines) for title, lines in lists[len(urgent) :]]
     return Panel(
         Group(*parts), title=f"{machine['machine']}  ({machine['prefix']})", border_style=STYLES[machine["tone"]]

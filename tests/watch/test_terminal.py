@@ -122,6 +122,14 @@ def test_a_shop_says_what_to_do_as_far_as_there_is_room() -> None:
     assert "What to do" not in shown(shop, 100, height=11)
 
 
+@pytest.mark.parametrize("height", [30, 60])
+def test_states_of_the_day_are_seen_in_a_terminal_that_is_not_tall(height: int) -> None:
+    shop, _ = filled("vmc-03")
+    seen = shown(shop, 100, height).splitlines()[:height]
+    assert any(row.startswith("│ state") for row in seen) and any("degraded for 3 min" in row for row in seen)
+    assert any(row.startswith("│ DTF  ") for row in seen) == (height == 60)
+
+
 def test_what_is_no_offset_is_no_number() -> None:
     clock = Clock()
     shop = Shop(clock)
