@@ -210,7 +210,7 @@ function spells(history) {
     else found.push({from: t, to: t, state, reasons});
   });
   fill($("spells"), found.reverse().slice(0, 30).map((one) =>
-    [day(one.from) === day(Date.now() / 1000) ? clock(one.from) : `${day(one.from)} ${clock(one.from)}`, `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.to - one.from + 60), one.reasons]));
+    [day(one.from) === day(Date.now() / 1000) ? clock(one.from) : `${day(one.from).slice(5)} ${clock(one.from)}`, `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.to - one.from + 60), one.reasons]));
 }
 
 function channels(machine) {
