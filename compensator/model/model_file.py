@@ -94,7 +94,7 @@ def parse_model(data: bytes, *, source: str) -> ThermalModel:
     try:
         table = tomllib.loads(data.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ModelError(f"{source}: not a TOML file: {error}") from error
+        raise ModelError(f"{source}: not a TOML file, expected a model: {error}") from error
     try:
         return _model(table, hashlib.sha256(data).hexdigest())
     except CompensatorError as error:

@@ -58,8 +58,9 @@ class Takeover:
     def begin(self, wanted: Wanted, reply: Future[dict[str, Any]], sender: Sender) -> None:
         """Begin to make a model ready; the reply comes once it is, or is refused. In the loop only."""
         if self._adoption is None or self._ended or self._adopting is not None:
-            why = "another model is under way" if self._adopting is not None else "this service takes no model now"
-            why = f"{wanted.action}: {why}"
+            why = f"{wanted.action}: this service takes no model now"
+            if self._adopting is not None:
+                why = f"{wanted.action}: another model is under way until the next sample; ask again then"
             self._journal.note("command_refused", why, {"name": wanted.action, "ok": False} | sent_by(sender))
             reply.set_result(refusal(why))
             return
