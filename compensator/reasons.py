@@ -237,6 +237,19 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "The service ends and waits for the disk to take the rest of the recording.",
         "Wait; where it takes minutes, check the disk.",
     ),
+    # Why a bridge writes nothing.
+    "plc_not_reached": (
+        "The PLC's server is not reached or refuses; what it holds stands, and it is tried again.",
+        "Look at the server, the network and the node's access rights.",
+    ),
+    "plc_written_over": (
+        "The PLC holds another value than was written, so somebody else writes there; the offset stands.",
+        "Find out who writes there; once the value has stood for resume_after_s the offset goes on from it.",
+    ),
+    "plc_beyond_limit": (
+        "The PLC holds what no offset can be; nothing is written over it.",
+        "Put it right in the PLC, at the value that the axis has now.",
+    ),
     # Remarks on tables and recordings that are read as data.
     "estimates_left_out": (
         "The table is an exported recording: what the service estimated and published in it counts as no measurement.",

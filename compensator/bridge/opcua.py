@@ -16,7 +16,8 @@ from cryptography import x509
 from compensator.bridge.register import Register
 from compensator.bridge.settings import OpcUa
 from compensator.errors import ConfigError
-from compensator.receiver import Applied, Receiver
+from compensator.reasons import Caution
+from compensator.receiver import Applied, Reason, Receiver
 from compensator.receiver.subscriber import monotonic_s
 
 log = logging.getLogger("compensator")
@@ -71,7 +72,8 @@ class Bridge:
                 async with await self._client() as client:
                     await self._connected(client, stop)
             except _GONE as error:
-                self.register.lost(f"{self._settings.endpoint}: {type(error).__name__} {error}".rstrip())
+                figures = f"{self._settings.endpoint}: {type(error).__name__} {error}".rstrip(". ")
+                self.register.lost(Caution("plc_not_reached", f"{figures}.").marked)
             await self._apart(stop)
 
     async def _client(self) -> Client:
@@ -144,7 +146,10 @@ class Bridge:
             await _pause(stop, min(self._settings.cycle_s, self._settings.retry_s))
 
     def _tell(self, applied: Applied) -> None:
-        codes = " ".join(r.code if r.code in ("catching_up", "expired") else r.text for r in applied.reasons)
+        # The way to go and the age change all the time: without them.
+        codes = " ".join(
+            (Reason(r.code) if r.code in ("catching_up", "expired") else r).marked for r in applied.reasons
+        )
         news = (
             f"trouble: {self.register.trouble}" if self.register.trouble else f"{applied.state}: {codes}".rstrip(": ")
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 
+from compensator.reasons import Caution
 from compensator.receiver import Follower
 
 
@@ -73,10 +74,8 @@ class Register:
         if self._stands is None or not self._same(value, self._stands[0]):
             self._stands = (value, now_s)
         found_um, left_um = value / self._per_um, self._written / self._per_um
-        self.trouble = (
-            f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: somebody else writes there; "
-            f"the offset stands"
-        )
+        figures = f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: somebody else writes there."
+        self.trouble = Caution("plc_written_over", figures).marked
         if now_s - self._stands[1] < self._resume_after_s:
             return False
         return self._go_on_from(value)
@@ -88,9 +87,8 @@ class Register:
         offset_um = value / self._per_um
         largest = self._follower.limits.offset_max_um
         if not (math.isfinite(offset_um) and abs(offset_um) <= largest):
-            self.trouble = (
-                f"the PLC holds {offset_um:g} µm, beyond {largest:g} µm: put it right there; nothing is written"
-            )
+            figures = f"the PLC holds {offset_um:g} µm, beyond {largest:g} µm; nothing is written."
+            self.trouble = Caution("plc_beyond_limit", figures).marked
             return False
         self._follower.rebase(offset_um)
         self._known, self._written, self._stands = True, value, None

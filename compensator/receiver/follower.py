@@ -88,7 +88,7 @@ class Applied:
     @property
     def text(self) -> str:
         """Return it as one line for people."""
-        why = " ".join(reason.text for reason in self.reasons)
+        why = " ".join(reason.marked for reason in self.reasons)
         return f"{self.offset_um:+.2f} µm, {self.state}" + (f": {why}" if why else "")
 
 
@@ -131,7 +131,7 @@ class Follower:
     ...     b'"reasons": [], "model_sha256": ""}')
     True
     >>> print(follower.advance(1.0).text)  # 6 µm/min: 0.1 µm in a second
-    +1.90 µm, following: The offset is still under way at the permitted rate. (to -12.00 µm)
+    +1.90 µm, following: The offset is still under way at the permitted rate. (to -12.00 µm) [catching_up]
     """
 
     machine: str

@@ -87,5 +87,10 @@ class Reason:
         meaning = WORDS[self.code][0]
         return f"{meaning} ({self.detail})" if self.detail else meaning
 
+    @property
+    def marked(self) -> str:
+        """Return it in words with its code, which `compensator explain` knows."""
+        return f"{self.text} [{self.code}]"
+
     def __str__(self) -> str:
         return self.text

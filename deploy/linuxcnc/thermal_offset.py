@@ -22,7 +22,7 @@ import hal
 import linuxcnc
 from reconcile import AxisView, Reconciler
 
-from compensator.receiver import Applied, Receiver, ReceiverError, load_settings
+from compensator.receiver import Applied, Reason, Receiver, ReceiverError, load_settings
 from compensator.receiver.settings import read_table
 from compensator.receiver.subscriber import monotonic_s
 
@@ -120,8 +120,8 @@ def _obey(component: Any, receiver: Receiver, fade_um_per_min: float) -> None:
 
 def _words(applied: Applied) -> list[str]:
     """Return the reasons that are news; the way to go and the age change all the time."""
-    return [reason.text for reason in applied.reasons if reason.code not in ("catching_up", "expired")] + [
-        reason.code for reason in applied.reasons if reason.code in ("catching_up", "expired")
+    return [reason.marked for reason in applied.reasons if reason.code not in ("catching_up", "expired")] + [
+        Reason(reason.code).marked for reason in applied.reasons if reason.code in ("catching_up", "expired")
     ]
 
 

@@ -16,7 +16,7 @@ try:
     with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: what your control applies already
         while True:
             applied = receiver.poll()
-            apply(applied.offset_um, f"{applied.state} {' '.join(reason.text for reason in applied.reasons)}")
+            apply(applied.offset_um, f"{applied.state} {' '.join(reason.marked for reason in applied.reasons)}")
             time.sleep(0.5)
 except ReceiverError as error:
     sys.exit(f"follow.py: {error}")

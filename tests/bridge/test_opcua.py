@@ -113,7 +113,7 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                 await until(lambda: asyncio.sleep(0, said[-1] == "following"), "all is written")
                 # Somebody else writes: it stands, says so, and goes on from there once that stands.
                 await plc.put(-30.0)
-                await until(lambda: asyncio.sleep(0, "somebody else" in said[-1]), "the difference is said")
+                await until(lambda: asyncio.sleep(0, "[plc_written_over]" in said[-1]), "the difference is said")
                 assert await at(-30.0) and await plc.state.read_value() == 4
                 count = len(plc.values)
                 await until(lambda: at(20.0), "it goes on")
@@ -128,7 +128,7 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                 await until(lambda: asyncio.sleep(0, said[-1] == "following"), "all is written")
                 # What the PLC holds is no offset: nothing is written over it.
                 await plc.put(5_000.0)
-                await until(lambda: asyncio.sleep(0, "put it right" in said[-1]), "it is said")
+                await until(lambda: asyncio.sleep(0, "plc_beyond_limit" in said[-1]), "it is said")
                 assert await at(5_000.0)
                 await plc.put(0.0)
                 count = len(plc.values)

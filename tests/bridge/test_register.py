@@ -42,7 +42,7 @@ def test_goes_on_from_what_the_plc_holds() -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -0.0501, 1e30])
 def test_nothing_is_written_over_what_cannot_be(value: float) -> None:
     r = register()
-    assert not r.seen(0.0, value) and "put it right" in r.trouble
+    assert not r.seen(0.0, value) and "[plc_beyond_limit]" in r.trouble
     assert r.seen(1.0, 0.001) and not r.trouble
 
 
