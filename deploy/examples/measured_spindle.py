@@ -20,7 +20,7 @@ import numpy as np
 
 def compensator(*words: str | Path) -> str:
     """Run a command, show it, and return what it prints."""
-    print("\n$ compensator", *(Path(w).name if isinstance(w, Path) else w for w in words), flush=True)
+    print("\n$ compensator", *words, flush=True)
     command = [sys.executable, "-m", "compensator", *map(str, words)]
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
