@@ -111,14 +111,15 @@ def test_a_port_that_is_taken_is_one_line(server: PageServer) -> None:
         PageServer(Shop(Clock()), lambda: STATUS, port).__enter__()
 
 
-def drawn(address: str, folder: Path, width: int, zone: str = "UTC") -> tuple[str, str]:
+def drawn(address: str, folder: Path, width: int, zone: str = "UTC", scheme: int = 1) -> tuple[str, str]:
     """Return the page as a browser has it, and what its console said."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
         pytest.skip("chromium is not installed")
     done = subprocess.run(
         [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", "--dump-dom",
-         f"--window-size={width},900", "--virtual-time-budget=4000", "--enable-logging=stderr", address],
+         f"--window-size={width},900", f"--blink-settings=preferredColorScheme={scheme}",
+         "--virtual-time-budget=4000", "--enable-logging=stderr", address],
         capture_output=True, text=True, timeout=100, check=True, env={**os.environ, "TZ": zone},
     )  # fmt: skip
     return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
