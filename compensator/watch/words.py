@@ -25,6 +25,8 @@ _DO: Mapping[str, str] = {
     "recording": "Check free space, permissions and the disk.",
     "clock": "Check the time service of the machine's computer.",
     "error": "Report it with its text; the offset is held until the service is well again.",
+    "command_refused": "Find out who sent it and whether they may; the offset was not touched.",
+    "adopt": "The model before goes on; see what is said of the new one.",
     "restart": "Nothing while the standard deviation is small enough for the work.",
 }
 
@@ -55,14 +57,14 @@ def in_words(code: str) -> Words:
 
 def to_do(event: Event) -> str:
     """Return what to do about an event; empty where there is nothing."""
-    if event.kind == "device" and event.data.get("ok") is True:
+    if event.kind in ("device", "adopt") and event.data.get("ok") is not False:
         return ""
     if event.kind == "state":
         state = str(event.data.get("state", ""))
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
         return " ".join(dict.fromkeys(in_words(code).do for code in codes)) if state not in ("", "ok") else ""
-    if event.kind == "recording" and "again" in event.text:
+    if event.kind == "recording" and ("again" in event.text or "removed" in event.data):
         return ""
     return _DO.get(event.kind, "")
 

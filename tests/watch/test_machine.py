@@ -174,6 +174,19 @@ def test_events_say_what_to_do(heard: Heard) -> None:
     assert "resume" in newest["do"] and back["do"] == "" and "probe" in gone["do"]
 
 
+@pytest.mark.parametrize(
+    ("kind", "data", "expected"),
+    [("adopt", {"ok": False}, "model before"), ("adopt", {"ok": True}, ""), ("command_refused", {"ok": False}, "who"),
+     ("recording", {}, "free space"), ("recording", {"removed": ["old.mcap"]}, ""), ("start", {}, "")],
+)  # fmt: skip
+def test_an_event_asks_for_something_only_where_something_is_wrong(
+    heard: Heard, kind: str, data: dict[str, Any], expected: str
+) -> None:
+    heard.hear(event=event(5, kind=kind, text="said", **data))
+    (found,) = heard.machine["events"]
+    assert (expected in found["do"]) if expected else found["do"] == ""
+
+
 def test_machines_that_need_somebody_stand_first_and_strangers_are_counted(heard: Heard) -> None:
     for name, state in (("a", "ok"), ("b", "hold"), ("c", "degraded")):
         heard.shop.take(f"shop/{name}/thermal/y/offset", offset(1, machine=name, state=state))
