@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,23 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the page cannot be made of that kind, or the machine that runs on cannot begin.
     """
+    with _quietly():
+        return _run(arguments)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Leave out who connects and goes: here that is everybody who looks."""
+    log = logging.getLogger("compensator")
+    before = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
+
+
+def _run(arguments: argparse.Namespace) -> Answer:
     if arguments.live:
         recordings = run_live(arguments.out, hours=arguments.hours, seed=arguments.seed, port=arguments.port)
         text = f"ended; the recordings: compensator replay {recordings}, compensator report {recordings}"

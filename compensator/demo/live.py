@@ -35,6 +35,12 @@ Breakable = Mapping[str, tuple[Faults, int]]
 MACHINE, PREFIX = "vmc-07", "shop/vmc-07"
 #: Length of the duty after the history; then its last inputs go on, h.
 AFTER_H = 7 * 24.0
+#: The checks between the sensors: what acts undeclared in this machine is noticed, and leads to `diagnose`.
+CHECKS = """
+[plausibility]
+t_q_below_at_after_min = 15.0
+false_alarm_days = 30.0
+"""
 #: What is typed, and the fault of an input or of a whole device that it stands for.
 INPUT_FAULTS = {"break": "open", "freeze": "frozen"}
 UNPLUG = {"t_q": "silence", "at": "silence", "y": "disconnect"}
@@ -85,9 +91,9 @@ def run_live(out: Path, *, hours: float, seed: int, port: int, typed: IO[str] | 
     with hardware(world) as devices:
         config = folder / "config.toml"
         model = "../conduction/calibration/model.toml"
-        text = configuration(MACHINE, devices.lines, port, model, prefix=PREFIX)
+        text = configuration(MACHINE, devices.lines, port, model, prefix=PREFIX) + CHECKS
         config.write_text(text, encoding="utf-8")
-        asyncio.run(_serve(config, world, devices, hours, lambda: _explain(config, port), typed or sys.stdin))
+        asyncio.run(_serve(config, world, devices, hours, lambda: _explain(out, config, port), typed or sys.stdin))
     return recordings
 
 
@@ -128,13 +134,15 @@ async def _serve(
         await run_service(str(config), clock=clock, on_ready=ready)
 
 
-def _explain(config: Path, port: int) -> None:
+def _explain(out: Path, config: Path, port: int) -> None:
     sys.stderr.write(f"""
 {MACHINE} runs, and its hours before now are on record. An offset goes out every minute. In another terminal:
-  compensator watch --config {config}
-  compensator watch --config {config} --page       a live page
-  python deploy/examples/subscriber.py tcp/127.0.0.1:{port} {PREFIX}
-  compensator hold --config {config}               and: resume, zero, adopt, back
+  compensator watch --config {config}              with --page: a live page
+  python deploy/examples/subscriber.py tcp/127.0.0.1:{port} {PREFIX}              a line each minute
+  compensator hold --config {config}               and: resume, zero
+Something acts in it that its model lacks. What, and without it:
+  compensator diagnose {config.parent}/recordings/*.mcap --model {out}/conduction/calibration/model.toml --out diagnosis
+  compensator adopt diagnosis/model.toml --config {config}              and back
 Type here:  break t_q | at | y    its wire is broken        freeze …    its value stands still
             unplug t_q | at | y   its device is gone        mend        all is well again
 Ctrl-C ends it.
@@ -171,6 +179,6 @@ def obey(line: str, breakable: Breakable) -> str:
             faults.set(UNPLUG[name])
         else:
             faults.set(INPUT_FAULTS[word], input=number)
-        return f"{word} {name}: done; the next sample shows it"
+        return f"{word} {name}: done; shows within two minutes"
     words = ", ".join([*INPUT_FAULTS, "unplug"])
     return f"{line.strip()!r}: expected one of {words} with one of {', '.join(breakable)}; or mend"

@@ -111,7 +111,7 @@ def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest
         assert any("Ctrl-C ends it" in line for line in process.stderr)
         process.stdin.write("break t_q\n")
         process.stdin.flush()
-        assert any(line == "break t_q: done; the next sample shows it\n" for line in process.stderr)
+        assert any(line == "break t_q: done; shows within two minutes\n" for line in process.stderr)
         assert main(command) == 1, "a second one in the same folder is refused, and leaves alone what is there"
         assert "held by another service of vmc-07" in capfd.readouterr().err
         process.send_signal(signal.SIGINT)
