@@ -289,6 +289,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Look at the log of the service, and whether it still polls; restart it where it stands still.",
     ),
     "two_services": ("Two services publish below one prefix.", "Stop one of them, or correct its prefix."),
+    "misfit": (
+        "Measured and predicted Y are farther apart than the service states: the model lacks something or a sensor lies.",
+        "Run `compensator diagnose` on the recordings; [plausibility] makes it an alarm of the service.",
+    ),
     "clock_ahead": (
         "The machine's clock is ahead of this computer's.", "Check the time service (NTP) of both computers."),
     "old_messages": (

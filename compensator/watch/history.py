@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from statistics import median
 from typing import Any
 
 from compensator.clock import NS
@@ -54,6 +56,29 @@ class History:
         oldest = (now_ns - SPAN_NS) // STEP_NS
         for bucket in [bucket for bucket in self._points if bucket < oldest]:
             del self._points[bucket]
+
+    def misfit(self, now_ns: int, minutes: int) -> tuple[float, float, int]:
+        """Return how far measured and predicted Y are apart, what the service states, and of how many points that is.
+
+        Parameters
+        ----------
+        now_ns : int
+            Now, ns since 1970 UTC.
+        minutes : int
+            How far to look back, min.
+
+        Returns
+        -------
+        (float, float, int)
+            Medians of |residual| and of the offset's standard deviation, µm; NaN without any point that has both.
+        """
+        last = now_ns // STEP_NS
+        points = [self._points[bucket] for bucket in range(last - minutes, last + 1) if bucket in self._points]
+        pairs = [(point.get("residual_um"), point.get("y_offset_std_um")) for point in points]
+        both = [(abs(residual), std) for residual, std in pairs if residual is not None and std is not None]
+        if not both:
+            return math.nan, math.nan, 0
+        return median(residual for residual, _ in both), median(std for _, std in both), len(both)
 
     def columns(self, since_ns: int = 0) -> dict[str, list[Any]]:
         """Return the points from a time on, column by column.

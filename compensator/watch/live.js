@@ -145,7 +145,7 @@ function sentence(machine) {
   const offset = `${signed(machine.y_offset_um)} µm`;
   if (machine.shown === "silent") return `for ${age(machine.age_s)}; the last offset was ${offset}. ${machine.means} ${machine.do}`;
   if (machine.shown === "unknown") return `${machine.means} ${machine.do}`;
-  const rest = machine.tone === "good" ? "" : ` ${machine.do}`;
+  const rest = machine.tone === "good" ? "" : machine.shown === "ok" ? " But mind what is said below." : ` ${machine.do}`;
   return `${known(machine.y_offset_um) ? `offset ${offset}` : "no offset"}. ${machine.means}${rest}`;
 }
 

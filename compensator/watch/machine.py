@@ -20,6 +20,9 @@ KINDS = {"y/offset": "offset", "sample": "sample", "estimate": "estimate", "stat
 LONGEST = 2**20
 #: Events kept of each machine.
 EVENTS = 50
+#: Measured and predicted Y are too far apart where the median of so many minutes is beyond so many standard deviations
+#: and so many µm.
+MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
 #: A message whose time lies farther ahead says that two clocks differ, s.
 AHEAD_S = 5.0
 
@@ -186,6 +189,9 @@ class Machine:
         if offset is not None and shown == "silent" and monotonic_s - self._arrived_s < offset.valid_for_s / 2.0:
             figures = "Messages arrive but carry an old time: one of the two clocks is wrong, or somebody repeats them."
             said.append(Caution("old_messages", figures))
+        misfit = self._misfit(now_ns, shown)
+        if misfit is not None:
+            said.append(misfit)
         if self.malformed:
             figures = f"{self.malformed} malformed message(s), the last: {self.last_malformed}."
             said.append(Caution("malformed_messages", figures))
@@ -196,13 +202,31 @@ class Machine:
             said.append(Caution("repeated_numbers", figures))
         return said
 
+    def _misfit(self, now_ns: int, shown: str) -> Caution | None:
+        """Say that the probe sees more than the service states, where the service itself raises no alarm of it.
+
+        A median: after the heat is switched a sound model is off for some minutes.
+        """
+        if self._offset is None or shown not in ("ok", "degraded"):
+            return None
+        if any(code.startswith("implausible") for code in self._offset.reasons):
+            return None
+        residual_um, std_um, count = self.history.misfit(now_ns, MISFIT_MIN)
+        if count < MISFIT_MIN // 2 or residual_um < max(MISFIT_STDS * std_um, MISFIT_UM):
+            return None
+        figures = (f"Measured and predicted Y have been {residual_um:.1f} µm apart for half an hour (median); the "
+                   f"service states a standard deviation of {std_um:.2f} µm.")  # fmt: skip
+        return Caution("misfit", figures)
+
     def tone(self, now_ns: int, monotonic_s: float) -> Tone:
         """Return how much the machine needs somebody."""
         tone = TONES[self.shown(now_ns, monotonic_s)]
         heard_s = monotonic_s - self._other[1]
         if self._offset is not None and heard_s < 4.0 * self._offset.valid_for_s:
             return "bad"
-        return "warn" if tone == "good" and (self.alive is False or self.malformed) else tone
+        if tone == "good" and (self.alive is False or self.malformed or self._misfit(now_ns, "ok") is not None):
+            return "warn"
+        return tone
 
     def snapshot(self, now_ns: int, monotonic_s: float) -> dict[str, Any]:
         """Return everything that is known now, for a view or as JSON.

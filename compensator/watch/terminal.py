@@ -23,6 +23,8 @@ _COLUMNS = (
 )  # fmt: skip
 #: Events, and times in one state, shown of one machine.
 EVENTS, SPELLS = 6, 4
+#: What is to be done about a machine that says itself that it is well.
+BELOW = "But mind what is said below."
 #: Rows of a terminal from which on everything is drawn.
 TALL = 44
 #: Lists that stand above the numbers; the rest stands below the day.
@@ -198,7 +200,7 @@ def _verdict(machine: dict[str, Any]) -> Text:
         text.append(f"  offset {signed(machine['y_offset_um'])} µm, {old} old", style="bold")
     text.append(f"\n{machine['means']}", style="")
     if machine["tone"] != "good":
-        text.append(f" {machine['do']}")
+        text.append(f" {machine['do'] if machine['shown'] != 'ok' else BELOW}")
     return text
 
 

@@ -166,6 +166,26 @@ def test_a_service_that_is_gone_is_told_before_its_offset_is_too_old(heard: Hear
     assert any("liveliness token is gone" in text for text in heard.machine["warnings"])
 
 
+def test_a_probe_that_sees_more_than_the_service_states_is_told_after_half_an_hour(heard: Heard) -> None:
+    def minute(i: int, residual_um: float, **changes: Any) -> None:
+        t = START_NS + i * 60 * NS
+        heard.hear(offset=offset(i, t, **changes), estimate=estimate(i, t, residual_um=residual_um))
+        heard.clock.advance(60)
+
+    for i in range(30):
+        minute(i, 9.0 if i % 3 == 0 else 0.4)  # the heat is switched again and again
+    assert heard.machine["tone"] == "good" and heard.machine["warning_codes"] == []
+    for i in range(30, 60):
+        minute(i, -6.5)
+    assert heard.machine["tone"] == "warn" and heard.machine["warning_codes"] == ["misfit"]
+    assert heard.machine["shown"] == "ok" and "6.5 µm apart" in heard.machine["to_do"]
+    assert "compensator diagnose" in heard.machine["to_do"] and "Nothing." not in heard.machine["to_do"]
+    minute(60, -6.5, y_offset_std_um=4.0)  # one minute changes nothing
+    assert heard.machine["warning_codes"] == ["misfit"]
+    minute(61, -6.5, state="degraded", reasons=["implausible:model"])
+    assert heard.machine["warning_codes"] == []  # the service says it itself
+
+
 def test_events_say_what_to_do(heard: Heard) -> None:
     heard.hear(event=event(5, ok=False))
     heard.hear(event=event(6, text="couples: answers again", ok=True))
