@@ -290,7 +290,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "two_services": ("Two services publish below one prefix.", "Stop one of them, or correct its prefix."),
     "misfit": (
-        "Measured and predicted Y are farther apart than the service states: the model lacks something or a sensor lies.",
+        "Measured and predicted Y differ by more than the service states: the model lacks something, or a sensor lies.",
         "Run `compensator diagnose` on the recordings; [plausibility] makes it an alarm of the service.",
     ),
     "clock_ahead": (
