@@ -17,7 +17,8 @@ def whole_file(path: Path) -> Iterator[TextIO]:
     Parameters
     ----------
     path : pathlib.Path
-        Where it is to go; its folder is made. What stood there before stays until then.
+        Where it is to go; its folder is made. What stood there before stays until then. A link keeps leading where it
+        leads, and what is no file (`/dev/null`, a pipe) is written to as it is.
 
     Yields
     ------
@@ -32,7 +33,12 @@ def whole_file(path: Path) -> Iterator[TextIO]:
     ...     os.listdir(folder)
     ['a.csv']
     """
+    path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists() and not path.is_file():
+        with path.open("w", newline="", encoding="utf-8") as file:
+            yield file
+        return
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     temporary = Path(name)
     try:

@@ -1,11 +1,15 @@
 """Slips of the pen on the command line: one line that says what to do, and nothing that was read is written over."""
 
+import os
+import stat
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from compensator.cli import main
+from compensator.whole import whole_file
 
 HEADER = "t_s,t_q_degc,at_degc,y_um,heat_w\n"
 
@@ -149,3 +153,21 @@ def test_simulate_says_where_temperatures_cannot_be_right(tmp_path: Path, capsys
         assert main(run(text)) == 0
         said = capsys.readouterr().err
         assert said.count("\n") == bool(code) and code in said
+
+
+def test_what_is_no_file_is_written_to_and_a_link_stays_one(tmp_path: Path) -> None:
+    """Or `--out /dev/null`, given as root, would leave the computer without it."""
+    pipe, read = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: read.append(pipe.read_text("utf-8")))
+    reader.start()
+    with whole_file(pipe) as file:
+        file.write("t_s\n")
+    reader.join()
+    assert read == ["t_s\n"] and stat.S_ISFIFO(pipe.stat().st_mode)
+    kept, link = tmp_path / "kept.csv", tmp_path / "link.csv"
+    kept.write_text("before\n")
+    link.symlink_to(kept)
+    with whole_file(link) as file:
+        file.write("after\n")
+    assert link.is_symlink() and kept.read_text() == "after\n"
