@@ -68,7 +68,12 @@ def page_of(
         Details(title="Heat, as it was and as it was estimated", blocks=[_heat(day) for day in days]),
         Details(title="The paper's own case, beside what is printed", blocks=[_beside_the_print(paper)]),
     ]  # fmt: skip
-    return Page(title="A simulated day, compensated", verdict=verdict(days), blocks=blocks)
+    rms = loop["second_day_rms_um"]
+    closed = (
+        f"An effect that the calibration never saw leaves {rms['first']:.1f} µm rms; with what the diagnosis found in "
+        f"the recordings, {rms['extended']:.1f}."
+    )
+    return Page(title="A simulated day, compensated", verdict=f"{verdict(days)} {closed}", blocks=blocks)
 
 
 def verdict(days: Sequence[MachineDay]) -> str:
@@ -113,8 +118,8 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
                    "extended one."),
             Table(head=["conduction machine", "rms µm"], rows=rows,
                   note=f"Found in the recordings of the first day: {', '.join(loop['found']) or 'nothing'} "
-                  f"({loop['verdict']}). Drawn by the seed and not passed on: {loop['drawn']}. The running service "
-                  f"took the extended model over; judged from {loop['adopted_after_h']:.1f} h on."),
+                  f"({str(loop['verdict']).replace('_', ' ')}). Drawn by the seed and not passed on: {loop['drawn']}. "
+                  f"The running service took the extended model over; judged from {loop['adopted_after_h']:.1f} h on."),
         ],
     )  # fmt: skip
 
