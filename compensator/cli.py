@@ -77,7 +77,7 @@ COMMANDS = (
             arguments.router, "compensator.commands.router:run"),
     Command("watch", "live view of one machine or many", "watch --connect tcp/127.0.0.1:7447 --prefix shop",
             arguments.watch, "compensator.commands.watch:run"),
-    Command("export", "a recording as a table", "export day.mcap --out day.csv",
+    Command("export", "recordings as a table", "export day.mcap --out day.csv",
             arguments.export, "compensator.commands.export:run"),
     Command("bridge", "the offset to a control that speaks OPC UA", "bridge opcua --config bridge.toml",
             arguments.bridge, "compensator.commands.bridge:run"),

@@ -1,8 +1,9 @@
-"""A recording as a table: one row for each sample, with everything that was measured, estimated and published."""
+"""Recordings as a table: one row for each sample, with everything that was measured, estimated and published."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,18 @@ _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residu
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
 
 
-def export(recording: Path, out: Path, machine: str = "") -> int:
-    """Write a recording as CSV.
+def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
+    """Write recordings of one machine as one CSV, in the order of their samples.
 
     Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
     offset, its state and reasons. `heat_w` is the estimate; a measured heat stands in `heat_measured_w`.
 
     Parameters
     ----------
-    recording, out : pathlib.Path
-        The MCAP file, and the CSV.
+    recordings : sequence of pathlib.Path
+        The MCAP files, in any order.
+    out : pathlib.Path
+        The CSV.
     machine : str
         Of a shop's recording: prefix of the machine, such as `shop/vmc-07`.
 
@@ -39,17 +42,23 @@ def export(recording: Path, out: Path, machine: str = "") -> int:
     Raises
     ------
     DataError
-        If it is no recording, or has no samples.
+        If one is no recording or has no samples, or they are of several machines.
     """
     rows: dict[int, dict[str, Any]] = {}
-    for record in read_messages(recording, ("sample", "estimate", "offset"), prefix=machine):
-        message = decode(record, recording)
-        assert isinstance(message, (Sample, EstimateMessage, Offset))
-        rows.setdefault(message.seq, {}).update(_cells(message))
-    if not rows:
-        machines = machines_in(recording)
-        words = f"of {machine or 'one machine'} in it; a shop's recording, expected --machine" if machines else "in it"
-        raise DataError(f"{recording}: no samples {words}" + (f", one of: {', '.join(machines)}" if machines else ""))
+    machines: dict[str, Path] = {}
+    for recording in recordings:
+        before = len(rows)
+        for record in read_messages(recording, ("sample", "estimate", "offset"), prefix=machine):
+            message = decode(record, recording)
+            assert isinstance(message, (Sample, EstimateMessage, Offset))
+            machines.setdefault(message.machine, recording)
+            rows.setdefault(message.seq, {}).update(_cells(message))
+        if len(rows) == before:
+            raise _without_samples(recording, machine, alone=len(recordings) == 1)
+    if len(machines) > 1:
+        (one, first), (other, second) = list(machines.items())[:2]
+        raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
+    rows = dict(sorted(rows.items()))
     start = min(row["_ns"] for row in rows.values())
     for row in rows.values():
         row["t_s"] = (row.pop("_ns") - start) / 1e9
@@ -60,6 +69,15 @@ def export(recording: Path, out: Path, machine: str = "") -> int:
         writer.writeheader()
         writer.writerows(rows.values())
     return len(rows)
+
+
+def _without_samples(recording: Path, machine: str, *, alone: bool) -> DataError:
+    """Return what is wrong with a file that gave no row; one that was given twice gives none the second time."""
+    machines = machines_in(recording)
+    if machines:
+        words = f"of {machine or 'one machine'} in it; a shop's recording, expected --machine"
+        return DataError(f"{recording}: no samples {words}, one of: {', '.join(machines)}")
+    return DataError(f"{recording}: no samples in it" + ("" if alone else " that the files before it have not"))
 
 
 def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:

@@ -41,7 +41,8 @@ def simulate(parser: argparse.ArgumentParser) -> None:
 
 def export(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `export`."""
-    parser.add_argument("recording", type=Path, metavar="FILE.mcap")
+    words = "recordings of one machine, in any order"
+    parser.add_argument("recording", type=Path, nargs="+", metavar="FILE.mcap", help=words)
     parser.add_argument("--out", type=Path, required=True, metavar="CSV")
     words = "of a shop's recording (watch --record): the machine, such as shop/vmc-07"
     parser.add_argument("--machine", default="", metavar="PREFIX", help=words)

@@ -1,4 +1,4 @@
-"""`compensator export`: a recording as a table."""
+"""`compensator export`: recordings as a table."""
 
 from __future__ import annotations
 
@@ -17,6 +17,6 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the recording cannot be read, or the table cannot be written there.
     """
-    out = checked_file(arguments.out, "--out", read=(arguments.recording,), ending=".csv")
+    out = checked_file(arguments.out, "--out", read=arguments.recording, ending=".csv")
     samples = export(arguments.recording, out, arguments.machine)
     return Answer({"samples": samples, "out": str(out)}, f"{samples} samples → {out}")

@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from compensator.cli import main
+from compensator.recording import read_messages
 from compensator.tables import EXPORTED, load_data
-from tests.audit.made import Service, other_model
+from tests.audit.made import MACHINE, Service, other_model
 
 
 @pytest.fixture(scope="module")
@@ -33,3 +35,38 @@ def test_a_heat_that_was_measured_is_the_known_heat(tmp_path: Path) -> None:
     head = "t_s,t_q_degc,at_degc,heat_measured_w,heat_w,y_pred_um,y_offset_um"
     table.write_text(f"{head}\n0,20,20,80,79.2,0,0\n60,21,20,81,79.9,1,-1\n")
     assert load_data(table, 60.0).records[0].columns["heat_w"].tolist() == [80.0, 81.0]
+
+
+def test_several_recordings_are_one_table_in_the_order_of_their_samples(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Service(tmp_path / "rec").run(20).stop()
+    Service(tmp_path / "rec", seq=20).run(10).stop()
+    first, second = sorted((tmp_path / "rec").glob("*.mcap"))
+    out = tmp_path / "both.csv"
+    assert main(["export", str(second), str(first), "--out", str(out)]) == 0
+    rows = [line.split(",") for line in out.read_text(encoding="utf-8").splitlines()]
+    t_s, seq = (rows[0].index(name) for name in ("t_s", "seq"))
+    assert [float(row[t_s]) for row in rows[1:]] == [60.0 * i for i in range(30)]
+    numbers = [int(row[seq]) for row in rows[1:]]
+    assert numbers == list(range(numbers[0], numbers[0] + 30))
+    capsys.readouterr()
+    for words, expected in (
+        ([first, first], "no samples in it that the files before it have not"),
+        ([first, other_machine(second, tmp_path / "other.mcap")], "expected recordings of one machine"),
+    ):
+        assert main(["export", *map(str, words), "--out", str(tmp_path / "none.csv")]) == 2
+        assert expected in capsys.readouterr().err and not (tmp_path / "none.csv").exists()
+
+
+def other_machine(recording: Path, path: Path) -> Path:
+    """The samples of a recording, as another machine's."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/sample", "json", 0)
+        for record in read_messages(recording, ("sample",)):
+            data = record.data.replace(MACHINE.encode(), b"vmc-99")
+            writer.add_message(channel, 0, data, 0)
+        writer.finish()
+    return path
