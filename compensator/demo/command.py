@@ -17,7 +17,7 @@ from compensator.demo.figures import table as table_of
 from compensator.demo.live import run_live
 from compensator.demo.loop import close_the_loop
 from compensator.demo.machine import MACHINES
-from compensator.report.demonstration import page_of, verdict
+from compensator.report.demonstration import closed, page_of, verdict
 from compensator.report.formats import checked, write
 
 
@@ -85,12 +85,10 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
     made = page_of(days, table, loop, second_day, paper_case(out / "paper", seed=seed))
     for path in (page, *([also] if also is not None else [])):
         write(path, made)
-    rms = loop["second_day_rms_um"]
     said = (
         f"The loop, on the conduction machine with an effect drawn by the seed ({loop['drawn']}): found "
         f"{', '.join(loop['found']) or 'nothing'} in the first day's recordings.\n"
-        f"Second day, rms: {rms['without']:.2f} µm without compensation, {rms['first']:.2f} with the first model, "
-        f"{rms['extended']:.2f} with the extended one."
+        f"Second day, {loop['second_day_rms_um']['without']:.2f} µm rms without compensation. {closed(loop)}"
     )
     result = {"machines": results, "loop": loop, "report": str(page)}
     return result, f"{as_text(table)}\n\n{verdict(days)}\n{said}\npage: {page}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from compensator.commands.diagnose import diagnose_files
 from compensator.demo.calibration import PERIOD_S
 from compensator.demo.day import run_day
 from compensator.demo.figures import errors_of
-from compensator.service.model_store import sha256_of
+from compensator.model.model_file import load_model
+from compensator.model.model_writer import dump_model
 from sim_hardware.physics import draw_effect
 
 Vector = npt.NDArray[np.float64]
@@ -48,12 +50,9 @@ def close_the_loop(
     run_day(before, machine="conduction", hours=hours, seed=seed + 1, model=first, effects=[effect])
     recordings = sorted((before / "recordings").glob("*.mcap"))
     found = diagnose_files(recordings, folder / "calibration" / "model.toml", folder / "diagnosis").result
-    # An adequate model is left as it was: there is nothing to take over.
-    adopt = (
-        folder / "diagnosis" / "model.toml"
-        if found["model_sha256"] != sha256_of((folder / "calibration" / "model.toml").read_bytes())
-        else None
-    )
+    first_model, extended = folder / "calibration" / "model.toml", folder / "diagnosis" / "model.toml"
+    # A model that was left as it was: there is nothing to take over.
+    adopt = extended if _acting(extended) != _acting(first_model) else None
     days = {
         name: run_day(folder / f"second-day-{name}", machine="conduction", hours=hours, seed=seed + 2, model=first,
                       effects=[effect], adopt=model)
@@ -73,6 +72,11 @@ def close_the_loop(
         "verdict": found["verdict"], "report": found["report"],
         "explanation": [e["explanation"] for e in found["effects"]],
         "held_out_rms_um": {"before": found["before"]["rms_um"], "after": found["after"]["rms_um"]},
-        "adopted_after_h": adopted_h,
+        "adopted": adopt is not None, "adopted_after_h": adopted_h,
         "second_day_rms_um": {name: float(np.std(values)) for name, values in errors.items()},
     }, curves  # fmt: skip
+
+
+def _acting(model: Path) -> str:
+    """Return what a model file says without where it comes from."""
+    return dump_model(dataclasses.replace(load_model(model), provenance={}))

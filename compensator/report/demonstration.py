@@ -68,12 +68,7 @@ def page_of(
         Details(title="Heat, as it was and as it was estimated", blocks=[_heat(day) for day in days]),
         Details(title="The paper's own case, beside what is printed", blocks=[_beside_the_print(paper)]),
     ]  # fmt: skip
-    rms = loop["second_day_rms_um"]
-    closed = (
-        f"An effect that the calibration never saw leaves {rms['first']:.1f} µm rms; with what the diagnosis found in "
-        f"the recordings, {rms['extended']:.1f}."
-    )
-    return Page(title="A simulated day, compensated", verdict=f"{verdict(days)} {closed}", blocks=blocks)
+    return Page(title="A simulated day, compensated", verdict=f"{verdict(days)} {closed(loop)}", blocks=blocks)
 
 
 def verdict(days: Sequence[MachineDay]) -> str:
@@ -85,6 +80,24 @@ def verdict(days: Sequence[MachineDay]) -> str:
         for day in days
     ]
     return f"Thermal error in Y over {hours:.0f} simulated hours, peak to peak: {', '.join(parts)}."
+
+
+def closed(loop: Mapping[str, Any]) -> str:
+    """Return one sentence: what closing the loop has brought.
+
+    Parameters
+    ----------
+    loop : dict
+        What was drawn, found and left.
+    """
+    rms = loop["second_day_rms_um"]
+    left = f"An effect that the calibration never saw leaves {rms['first']:.2f} µm rms"
+    if loop["adopted"]:
+        return f"{left}; with what the diagnosis found in the recordings, {rms['extended']:.2f}."
+    return (
+        f"{left}; what the diagnosis found in the recordings ({', '.join(loop['found']) or 'nothing'}) cannot run in "
+        "the service, or does not hold on blocks of time that it did not see, so the model was left as it was."
+    )
 
 
 def _error(day: MachineDay) -> Figure:
@@ -110,6 +123,10 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
     names = {"without": "without compensation", "first": "first model", "extended": "extended model"}
     rows = [[words, f"{rms[key]:.2f}"] for key, words in names.items()]
     lines = tuple(Line(names[key], *second_day[key]) for key in ("first", "extended"))
+    taken = (
+        f"The running service took the extended model over; judged from {loop['adopted_after_h']:.1f} h on."
+        if loop["adopted"] else "The model was left as it was: both days are the same."
+    )  # fmt: skip
     return Section(
         title="The loop closed: an effect the calibration never saw, on a second day with another duty",
         blocks=[
@@ -119,7 +136,7 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
             Table(head=["conduction machine", "rms µm"], rows=rows,
                   note=f"Found in the recordings of the first day: {', '.join(loop['found']) or 'nothing'} "
                   f"({str(loop['verdict']).replace('_', ' ')}). Drawn by the seed and not passed on: {loop['drawn']}. "
-                  f"The running service took the extended model over; judged from {loop['adopted_after_h']:.1f} h on."),
+                  + taken),
         ],
     )  # fmt: skip
 

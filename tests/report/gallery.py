@@ -69,7 +69,7 @@ def _demo(path: Path) -> None:
         MachineDay(name=name, figures=figures, errors=errors, heat=(t, t, t, t)) for name in ("conduction", "published")
     ]
     loop = {"second_day_rms_um": {"without": 38.3, "first": 6.3, "extended": 1.2}, "found": ["hysteresis DTF"],
-            "verdict": "explained", "drawn": "hysteresis DTF", "adopted_after_h": 1.0}  # fmt: skip
+            "verdict": "explained", "drawn": "hysteresis DTF", "adopted": True, "adopted_after_h": 1.0}  # fmt: skip
     paper = {
         "comparison": [{"path": "TTF", "figure": "gain at rest, K/W", "found": 0.25, "std": 0.01, "reference": 0.25}]
     }
