@@ -105,7 +105,7 @@ def _by_search(model: ThermalModel, evidence: Evidence, told: Told, mapped: Mapp
         extended = dataclasses.replace(extended, y_std_um=_stated(model, rms_of(after), evidence.noise_um, kept_out))
     y = evidence.y_um
     return Diagnosis(
-        verdict=_verdict(evidence, found), effects=effects,
+        verdict=_verdict(evidence, found, helps=helps), effects=effects,
         before=scores(y, y - before), after=scores(y, y - after), held_out=HELD_OUT,
         noise_floor_um=evidence.noise_um, model=extended, evidence=evidence,
         residual_before=np.where(evidence.used, found.before.residual, np.nan),
@@ -219,7 +219,8 @@ def _tried(found: Found, evidence: Evidence) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(best.items(), key=lambda item: item[1]))
 
 
-def _verdict(evidence: Evidence, found: Found) -> Verdict:
+def _verdict(evidence: Evidence, found: Found, *, helps: bool) -> Verdict:
+    """Say how far the residual is explained; what does not hold on data that was not seen explains part at most."""
     parts = found.joint.parts
     clean = found.joint.cost < NOISE_TIMES**2 * (evidence.count * evidence.noise_um**2 + evidence.allowance)
     if not parts:
@@ -227,4 +228,4 @@ def _verdict(evidence: Evidence, found: Found) -> Verdict:
     hidden = [isinstance(part.hypothesis, Unobserved) for part in parts]
     if all(hidden):
         return "unexplained"
-    return "explained" if clean and not any(hidden) else "partly_explained"
+    return "explained" if clean and helps and not any(hidden) else "partly_explained"

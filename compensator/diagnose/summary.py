@@ -19,6 +19,13 @@ _VERDICTS = {
 }
 
 
+#: The words where what was found makes held-out data worse.
+_DOES_NOT_HOLD = (
+    "Something acts that the model lacks; what fits it best here does not hold on data that was not seen, so the model "
+    "was left as it was."
+)
+
+
 def figures(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the diagnosis as `diagnosis.json` holds it."""
     return {
@@ -59,6 +66,8 @@ def _scores(scores: Scores) -> dict[str, float | None]:
 def verdict(diagnosis: Diagnosis) -> str:
     """Return the sentence to take away."""
     words = _VERDICTS[diagnosis.verdict]
+    if any(warning.code == "made_worse" for warning in diagnosis.warnings):
+        words = _DOES_NOT_HOLD
     if not diagnosis.effects:
         return f"{words} Residual {diagnosis.before.rms_um:.2f} µm rms, sensor noise {diagnosis.noise_floor_um:.2f}."
     return (

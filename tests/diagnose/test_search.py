@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.joint import fit_joint, standard_errors
 from compensator.diagnose.search import Search
+from compensator.diagnose.summary import verdict
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model
@@ -109,3 +111,22 @@ def test_standard_errors_are_what_scatters():
         values.append(joint.parts[0].amplitudes[0])
         stds.append(standard_errors(evidence, joint, evidence.colour(joint.residual))[0]["change"])
     assert 0.5 * np.std(values) < np.mean(stds) < 2.0 * np.std(values)
+
+
+def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
+    """However well it fits: the verdict must not say found, and the model is left as it was."""
+    columns, _, _ = record([draw("gain DTF", 3)], 77, hours=24.0)
+    good = diagnose(QUILL, runs_from(columns))
+    assert good.verdict == "explained" and good.model.effects and "is found" in verdict(good)
+    held_out = diagnosis_module._held_out
+
+    def worse(*arguments):
+        before, _ = held_out(*arguments)
+        return before, 1.1 * before
+
+    monkeypatch.setattr(diagnosis_module, "_held_out", worse)
+    monkeypatch.setattr(diagnosis_module, "_doubtful", lambda *_: False)
+    bad = diagnose(QUILL, runs_from(columns))
+    assert bad.verdict == "partly_explained" and not bad.model.effects
+    assert "made_worse" in [warning.code for warning in bad.warnings]
+    assert "does not hold on data that was not seen" in verdict(bad) and "is found" not in verdict(bad)
