@@ -28,6 +28,7 @@ from compensator.report.page import (
     Table,
     Tone,
     Words,
+    sentence_of,
 )
 
 _TIME = "time, UTC"
@@ -60,7 +61,7 @@ def audit_page(found: Audit) -> Page:
         blocks.append(_findings(found))
     blocks.append(_files(found.files))
     if found.remarks:
-        lines: list[Cell] = [(str(remark), " ", Code(remark.code)) for remark in found.remarks[:_REMARKS]]
+        lines = [sentence_of(remark) for remark in found.remarks[:_REMARKS]]
         if len(found.remarks) > _REMARKS:
             lines.append(f"And {len(found.remarks) - _REMARKS} more; replay --json has all.")
         blocks.append(Words(title="Remarks", lines=lines))
@@ -274,12 +275,7 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
                              clock=True, x_limits=ends, lines=left, height=2.8))  # fmt: skip
     blocks.append(_before_and_after(found))
     if found.remarks:
-        blocks.append(
-            Words(
-                title="What the figures depend on",
-                lines=[(str(remark), " ", Code(remark.code)) for remark in found.remarks],
-            )
-        )
+        blocks.append(Words(title="What the figures depend on", lines=[sentence_of(one) for one in found.remarks]))
     words, tone = _better(found)
     return Page(
         title=f"Model “{found.other}” on what “{found.recorded}” recorded", verdict=words, blocks=blocks, tone=tone

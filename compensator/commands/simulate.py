@@ -12,7 +12,7 @@ import numpy as np
 
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_file
-from compensator.identify.screening import check_scale
+from compensator.identify.screening import DEAD_SAMPLES, check_scale
 from compensator.model.model_file import load_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Caution
@@ -21,9 +21,6 @@ from compensator.tables import Record, load_data, require, roles_of
 from compensator.whole import whole_file
 
 log = logging.getLogger("compensator")
-
-#: So many rows of one and the same T_Q are no measurement, samples.
-_STILL = 60
 
 COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_tdtf_um", "y_std_um")
 
@@ -85,7 +82,7 @@ def doubts(source: str, model: ThermalModel, record: Record) -> list[Caution]:
         values = record.columns[name]
         known = values[~np.isnan(values)]
         check_scale(source, name, values)
-        if name == "t_q_degc" and known.size >= _STILL and np.ptp(known) == 0.0:
+        if name == "t_q_degc" and known.size >= DEAD_SAMPLES and np.ptp(known) == 0.0:
             found.append(Caution("stuck", f"{source}: {name} = {known[0]:g} in every row."))
         low, high = model.validity.get(name, (-np.inf, np.inf))
         outside = int(np.sum((known < low) | (known > high)))

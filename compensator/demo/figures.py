@@ -33,9 +33,8 @@ def errors_of(day: Day) -> dict[str, Vector]:
     }  # fmt: skip
 
 
-def figures_of(day: Day) -> dict[str, Any]:
+def figures_of(day: Day, errors: Mapping[str, Vector]) -> dict[str, Any]:
     """Return errors without and with compensation, fit, and what else the table shows of a day."""
-    errors = errors_of(day)
     estimate = [outcome.estimate for outcome in day.outcomes]
     fit = scores(np.array([number(e.y_um) for e in estimate]), np.array([number(e.y_pred_um) for e in estimate]))
     still = errors["followed"]
@@ -58,8 +57,9 @@ def shown(name: str, day: Day) -> MachineDay:
     """Return what the page shows of a day."""
     hours = [(o.estimate.time_utc_ns - START_NS) / NS / 3600 for o in day.outcomes]
     heat = [number(o.estimate.heat_w) for o in day.outcomes]
+    errors = errors_of(day)
     return MachineDay(
-        name=name, figures=figures_of(day), errors=errors_of(day),
+        name=name, figures=figures_of(day, errors), errors=errors,
         heat=(day.truth["t_s"] / 3600.0, day.truth["heat_w"], np.array(hours), np.array(heat)),
     )  # fmt: skip
 

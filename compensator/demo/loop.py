@@ -49,8 +49,8 @@ def close_the_loop(
     before = folder / "with-effect"
     run_day(before, machine="conduction", hours=hours, seed=seed + 1, model=first, effects=[effect])
     recordings = sorted((before / "recordings").glob("*.mcap"))
-    found = diagnose_files(recordings, folder / "calibration" / "model.toml", folder / "diagnosis").result
     first_model, extended = folder / "calibration" / "model.toml", folder / "diagnosis" / "model.toml"
+    found = diagnose_files(recordings, first_model, extended.parent).result
     # A model that was left as it was: there is nothing to take over.
     adopt = extended if _acting(extended) != _acting(first_model) else None
     days = {

@@ -112,7 +112,12 @@ class Words:
 
 def warnings_of(cautions: Iterable[Caution]) -> Words:
     """Return warnings as a block; each leads to its sentences at the end of the page."""
-    return Words(title="Warnings", lines=[(str(said), " ", Code(said.code)) for said in cautions], kind="warning")
+    return Words(title="Warnings", lines=[sentence_of(said) for said in cautions], kind="warning")
+
+
+def sentence_of(caution: Caution) -> Cell:
+    """Return a warning or remark as a line; its code leads to its sentences at the end of the page."""
+    return (str(caution), " ", Code(caution.code))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

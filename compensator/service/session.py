@@ -18,6 +18,9 @@ from compensator.reasons import Caution
 
 log = logging.getLogger("compensator")
 
+#: Participants that a router lets in at one time.
+PENDING = 1000
+
 
 def put(config: zenoh.Config, key: str, value: object) -> None:
     """Set one key of a Zenoh configuration."""
@@ -69,10 +72,6 @@ def session_config(settings: Zenoh) -> zenoh.Config:
         put(config, "transport/link/tls/connect_private_key", settings.tls_key)
         put(config, "transport/link/protocols", ["tls", "quic"])
     return config
-
-
-#: Participants that a router lets in at one time.
-PENDING = 1000
 
 
 def make_room(config: zenoh.Config) -> None:

@@ -23,6 +23,8 @@ EVENTS = 50
 #: Measured and predicted Y are too far apart where the median of so many minutes is beyond so many standard deviations
 #: and so many µm.
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
+#: Warnings for which a machine that says itself that it is well needs somebody all the same.
+NEEDY = {"token_gone", "malformed_messages", "misfit"}
 #: A message whose time lies farther ahead says that two clocks differ, s.
 AHEAD_S = 5.0
 
@@ -218,16 +220,6 @@ class Machine:
                    f"service states a standard deviation of {std_um:.2f} µm.")  # fmt: skip
         return Caution("misfit", figures)
 
-    def tone(self, now_ns: int, monotonic_s: float) -> Tone:
-        """Return how much the machine needs somebody."""
-        tone = TONES[self.shown(now_ns, monotonic_s)]
-        heard_s = monotonic_s - self._other[1]
-        if self._offset is not None and heard_s < 4.0 * self._offset.valid_for_s:
-            return "bad"
-        if tone == "good" and (self.alive is False or self.malformed or self._misfit(now_ns, "ok") is not None):
-            return "warn"
-        return tone
-
     def snapshot(self, now_ns: int, monotonic_s: float) -> dict[str, Any]:
         """Return everything that is known now, for a view or as JSON.
 
@@ -246,7 +238,7 @@ class Machine:
         reasons = [in_words(code) for code in offset.reasons] if offset else []
         warnings = self.warnings(now_ns, monotonic_s)
         found: dict[str, Any] = {
-            "prefix": self.prefix, "machine": self.name, "shown": shown, "tone": self.tone(now_ns, monotonic_s),
+            "prefix": self.prefix, "machine": self.name, "shown": shown, "tone": _tone(shown, warnings),
             "means": in_words(shown).means, "do": in_words(shown).do, "alive": self.alive,
             "state": offset.state if offset else None,
             "reasons": [words._asdict() for words in reasons],
@@ -311,6 +303,15 @@ class Machine:
     @staticmethod
     def _event(event: Event) -> dict[str, Any]:
         return {"time_utc_ns": event.time_utc_ns, "kind": event.kind, "text": event.text, "do": to_do(event)}
+
+
+def _tone(shown: str, warnings: list[Caution]) -> Tone:
+    """Return how much a machine needs somebody."""
+    codes = {warning.code for warning in warnings}
+    if "two_services" in codes:
+        return "bad"
+    tone = TONES[shown]
+    return "warn" if tone == "good" and codes & NEEDY else tone
 
 
 def _to_do(shown: str, reasons: list[Words], warnings: list[Caution]) -> str:
