@@ -359,16 +359,20 @@ def _check_zenoh(zenoh: Zenoh) -> None:
             expected = "tls/HOST:PORT with tls_ca, tls_certificate and tls_key" if given else "tls_ca, … beside it"
             raise ConfigError(f"zenoh.connect: {endpoint!r}, expected {expected}")
         if endpoint.startswith(_SECURED) and endpoint in zenoh.listen:
-            raise ConfigError(f"zenoh.listen: {endpoint!r}, expected a router (`compensator router`): it has the list "
-                              f"of who may do what, the service has none")  # fmt: skip
+            raise ConfigError(
+                f"zenoh.listen: {endpoint!r}, expected a router (`compensator router`): it has the list "
+                f"of who may do what, the service has none"
+            )
     if not given:
         return
     for key in _TLS_KEYS:
         if key not in given:
             raise ConfigError(f"zenoh.{key}: missing beside {given[0]}")
     if zenoh.listen or zenoh.mode == "router" or not zenoh.connect:
-        raise ConfigError("zenoh: with tls_key, expected connect alone, no listen and no mode router: whoever "
-                          "connected to the service would speak with its certificate")  # fmt: skip
+        raise ConfigError(
+            "zenoh: with tls_key, expected connect alone, no listen and no mode router: whoever "
+            "connected to the service would speak with its certificate"
+        )
 
 
 def _check_channel(channel: Channel, devices: set[str]) -> None:

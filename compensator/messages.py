@@ -227,7 +227,7 @@ class ChainLink(msgspec.Struct, frozen=True, kw_only=True):
     sequence : int
         Its number in the file.
     sha256 : str
-        Hash over the record and the value before it, see `compensator.chain`.
+        Hash over the record and the value before it, see `compensator.recording.chain`.
     """
 
     topic: str
@@ -319,8 +319,12 @@ def schemas() -> dict[str, dict[str, Any]]:
     for name, message in MESSAGES.items():
         schema = msgspec.json.schema(message)
         definition = schema["$defs"].pop(message.__name__)
-        made[name] = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"thermal.{name}",
-                      **definition, "$defs": schema["$defs"]}  # fmt: skip
+        made[name] = {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "title": f"thermal.{name}",
+            **definition,
+            "$defs": schema["$defs"],
+        }
         made[name]["title"] = f"thermal.{name}"
     return made
 

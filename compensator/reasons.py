@@ -15,8 +15,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "The service compensates with less than everything; the reasons say what is missing or limited.",
         "Look at the reasons.",
     ),
-    "hold": ("The last good offset stands and does not follow the machine.",
-        "Look at the reasons; find the cause before the next precise cut."),
+    "hold": (
+        "The last good offset stands and does not follow the machine.",
+        "Look at the reasons; find the cause before the next precise cut.",
+    ),
     "fault": ("There is no offset to rely on.", "Do not rely on compensation; look at the reasons and the events."),
     "no_zero": ("No zero has been set yet.", "Bring T_Q and AT back, or send the command zero."),
     "t_q_missing": ("T_Q cannot be used in this sample.", "See the quality of t_q_degc: check couple and module."),
@@ -39,7 +41,8 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "offset_limited": (
         "The offset has reached its largest permitted value.",
-        "Check sensors and model before raising limits.offset_max_um."),
+        "Check sensors and model before raising limits.offset_max_um.",
+    ),
     "rate_limited": (
         "The offset moves at its largest permitted rate and has not arrived yet.",
         "Wait; if it stays so, check sensors and limits.offset_rate_max_um_per_min.",
@@ -294,15 +297,21 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Run `compensator diagnose` on the recordings; [plausibility] makes it an alarm of the service.",
     ),
     "clock_ahead": (
-        "The machine's clock is ahead of this computer's.", "Check the time service (NTP) of both computers."),
+        "The machine's clock is ahead of this computer's.",
+        "Check the time service (NTP) of both computers.",
+    ),
     "old_messages": (
         "Messages arrive but carry an old time: one of the two clocks is wrong, or somebody repeats them.",
         "Check the time service (NTP) of both computers, then who publishes below the prefix.",
     ),
     "malformed_messages": (
-        "Messages arrived that are none of the service's.", "Find out who publishes below the prefix."),
+        "Messages arrived that are none of the service's.",
+        "Find out who publishes below the prefix.",
+    ),
     "missed_messages": (
-        "Messages of the service never arrived here.", "Look at the network and the router, where it goes on."),
+        "Messages of the service never arrived here.",
+        "Look at the network and the router, where it goes on.",
+    ),
     "repeated_numbers": (
         "Messages came with a number that was there already.",
         "Find out whether somebody repeats messages, or a second service publishes below the prefix.",
@@ -313,7 +322,9 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Audit with the version that wrote it; what is named beside it was not checked.",
     ),
     "samples_missing": (
-        "Samples between others were not recorded.", "Look at the events before and behind them: pauses, the disk."),
+        "Samples between others were not recorded.",
+        "Look at the events before and behind them: pauses, the disk.",
+    ),
     "published_early": (
         "Offsets were published before they were on disk, which was slow or failed.",
         "Check the disk of the machine: its health, free space, other programs that write to it.",
@@ -335,7 +346,9 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Leave the first hours out of the judgement, or compare from a recording on that begins at rest.",
     ),
     "signature_not_checked": (
-        "The file is signed, and nobody said by whom it should be.", "Give the machine's key: --public-key FILE."),
+        "The file is signed, and nobody said by whom it should be.",
+        "Give the machine's key: --public-key FILE.",
+    ),
     "left_beyond_stated": (
         "With the correction more is left in Y than the service's own standard deviation says.",
         "Look at the probe and the couples, then run `compensator diagnose` on these recordings.",
@@ -354,7 +367,9 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "Audit it again once the next recording is there: that one names its last value.",
     ),
     "truncated": (
-        "The end of the recording was cut off.", "Find out who had access to it; take the file from a backup."),
+        "The end of the recording was cut off.",
+        "Find out who had access to it; take the file from a backup.",
+    ),
     "damaged": (
         "The file is no recording from some byte on, or a checksum is wrong.",
         "Check disk and copy; take the file from a backup.",
@@ -370,18 +385,19 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "missing_file": ("A recording between two others is not there.", "Add it and audit again."),
     "unsigned": ("There is no signature where there must be one.", "Check [recording] signing_key of the machine."),
     "false_signature": (
-        "A signature is not of the key given.", "Check whether the key is this machine's; else trust nothing in it."),
+        "A signature is not of the key given.",
+        "Check whether the key is this machine's; else trust nothing in it.",
+    ),
     "state": (
         "A recording opens with another state than the one before ended with.",
         "Treat the offsets from there on as not proven, and report it.",
     ),
-    "unreadable": (
-        "A record is intact and yet not what its schema says.", "Audit with the version that wrote it."),
+    "unreadable": ("A record is intact and yet not what its schema says.", "Audit with the version that wrote it."),
     "index": (
         "The index of the recording does not lead to all that is in it: readers that seek would miss records.",
         "Find out who had access; the records themselves stand, so a copy made by reading all of it has a right index.",
     ),
-}  # fmt: skip
+}
 
 
 class Caution(str):

@@ -200,8 +200,10 @@ class Installation:
         """Have a version check a configuration; nothing is opened."""
         done = subprocess.run(
             [str(version / "bin/compensator"), "check", "--config", str(config)],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         if done.returncode != 0:
             lines = done.stderr.strip().splitlines() or ["no answer"]
             raise InstallError(f"{version.name} cannot use {config}: {lines[-1]}")

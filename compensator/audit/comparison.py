@@ -16,19 +16,26 @@ from compensator.audit.recording_audit import recorded_groups
 from compensator.audit.verification import Record
 from compensator.clock import NS
 from compensator.config import Config
-from compensator.container import PAYLOAD, Container
 from compensator.errors import DataError, ServiceError
 from compensator.messages import Event, Sample, number
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Caution
+from compensator.recording.container import PAYLOAD, Container
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome
 
 #: Columns of the table of both offsets.
 COLUMNS = (
-    "time_utc", "seq", "y_um", "y_offset_um", "residual_um", "other_y_um", "other_y_offset_um", "other_residual_um",
+    "time_utc",
+    "seq",
+    "y_um",
+    "y_offset_um",
+    "residual_um",
+    "other_y_um",
+    "other_y_offset_um",
+    "other_residual_um",
     "other_state",
-)  # fmt: skip
+)
 
 
 class _Estimate(msgspec.Struct):
@@ -85,12 +92,15 @@ class Comparison:
     def as_json(self) -> dict[str, Any]:
         """Return it as it stands in the result of `--json`."""
         return {
-            "recorded_model": self.recorded, "other_model": self.other, "samples": self.samples,
+            "recorded_model": self.recorded,
+            "other_model": self.other,
+            "samples": self.samples,
             "residual_um": {"before": _spread_json(self.residual_before), "after": _spread_json(self.residual_after)},
             "left_um": {"before": _spread_json(self.left_before), "after": _spread_json(self.left_after)},
-            "offset_difference_um": _spread_json(self.offsets), "remarks": list(self.remarks),
+            "offset_difference_um": _spread_json(self.offsets),
+            "remarks": list(self.remarks),
             "remark_codes": [remark.code for remark in self.remarks],
-        }  # fmt: skip
+        }
 
     def text(self) -> str:
         """Return a table for people."""
@@ -102,8 +112,10 @@ class Comparison:
             (f"offset of {self.other} − recorded offset", self.offsets),
         ]
         width = max(len(name) for name, _ in rows)
-        lines = [f"{self.samples} samples; y_um was measured in {self.residual_before.samples} of them",
-                 f"{'':<{width}} {'rms µm':>9} {'peak µm':>9} {'samples':>9}  worst at"]  # fmt: skip
+        lines = [
+            f"{self.samples} samples; y_um was measured in {self.residual_before.samples} of them",
+            f"{'':<{width}} {'rms µm':>9} {'peak µm':>9} {'samples':>9}  worst at",
+        ]
         for name, spread in rows:
             figures = f"{spread.rms:9.3f} {abs(spread.peak):9.3f}" if spread.samples else f"{'–':>9} {'–':>9}"
             worst = worst_utc(spread) if spread.samples else "–"
@@ -112,9 +124,13 @@ class Comparison:
 
 
 def compare(
-    paths: Sequence[Path], model: ThermalModel, *, told: Callable[[int, int], None] | None = None,
-    row: Callable[[Iterable[Any]], Any] | None = None, point: Callable[..., None] | None = None,
-) -> Comparison:  # fmt: skip
+    paths: Sequence[Path],
+    model: ThermalModel,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    row: Callable[[Iterable[Any]], Any] | None = None,
+    point: Callable[..., None] | None = None,
+) -> Comparison:
     """Run another model over recordings, in the order in which they were begun.
 
     Parameters
@@ -123,7 +139,7 @@ def compare(
         Recordings of one machine.
     model : ThermalModel
         The other model.
-    told : callable, optional
+    progress : callable, optional
         Called with the number of bytes worked off, and of all.
     row : callable, optional
         Takes the rows of the table of both offsets, see `COLUMNS`.
@@ -143,8 +159,8 @@ def compare(
         with Container(path) as container:
             for count, records in enumerate(recorded_groups(container)):
                 run.group(records, container, path.name)
-                if told is not None and count % 1000 == 0:
-                    told(done + container.position, whole)
+                if progress is not None and count % 1000 == 0:
+                    progress(done + container.position, whole)
         done += path.stat().st_size
     return run.result(ordered)
 
@@ -167,7 +183,7 @@ def _in_order(paths: Sequence[Path]) -> list[Path]:
 class _Run:
     def __init__(
         self, model: ThermalModel, row: Callable[[Iterable[Any]], Any] | None, point: Callable[..., None] | None
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._model, self._row, self._point = model, row, point
         self._compensation: Compensation | None = None
         self._config = self._recorded = b""
@@ -200,9 +216,7 @@ class _Run:
             raise DataError(f"{file}: /sample {sample.seq}: {error}; expected the configured channels") from error
         self._add(sample, estimate, offset, outcome)
 
-    def _ready(
-        self, container: Container, file: str, events: list[Event], estimate: _Estimate
-    ) -> Compensation:  # fmt: skip
+    def _ready(self, container: Container, file: str, events: list[Event], estimate: _Estimate) -> Compensation:
         """Return the compensation with the other model and the configuration of the file."""
         parts = [container.contents.attachments.get(name) for name in ("config.toml", "model.toml")]
         data, model = (part.data if part else b"" for part in parts)
@@ -216,8 +230,12 @@ class _Run:
         zero = any(event.kind == "zero" for event in events)
         if estimate.t_q_ref_degc is not None and estimate.at_ref_degc is not None and not zero:
             warm = estimate.y_base_um != 0.0
-            compensation.begin(t_q_ref_degc=estimate.t_q_ref_degc, at_ref_degc=estimate.at_ref_degc,
-                               y_ref_um=math.nan if warm else number(estimate.y_ref_um), y_base_um=0.0)  # fmt: skip
+            compensation.begin(
+                t_q_ref_degc=estimate.t_q_ref_degc,
+                at_ref_degc=estimate.at_ref_degc,
+                y_ref_um=math.nan if warm else number(estimate.y_ref_um),
+                y_base_um=0.0,
+            )
             figures = (
                 f"{file}: begins on a running machine, of which the other model knows no more than the zero; "
                 f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
@@ -269,6 +287,9 @@ def worst_utc(spread: Spread) -> str:
 
 def _spread_json(spread: Spread) -> dict[str, Any]:
     there = spread.samples > 0
-    return {"samples": spread.samples, "rms_um": spread.rms if there else None,
-            "peak_um": abs(spread.peak) if there else None,
-            "worst_time_utc": worst_utc(spread) if there else None}  # fmt: skip
+    return {
+        "samples": spread.samples,
+        "rms_um": spread.rms if there else None,
+        "peak_um": abs(spread.peak) if there else None,
+        "worst_time_utc": worst_utc(spread) if there else None,
+    }

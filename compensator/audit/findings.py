@@ -13,9 +13,20 @@ from typing import Any, Literal
 #: ends with. `unreadable`: intact, and yet not what its schema says. `index`: the index of the file does not lead to
 #: all that is in it, or to something else.
 Kind = Literal[
-    "altered", "removed", "inserted", "reordered", "truncated", "broken", "damaged", "missing_file", "unsigned",
-    "false_signature", "state", "unreadable", "index",
-]  # fmt: skip
+    "altered",
+    "removed",
+    "inserted",
+    "reordered",
+    "truncated",
+    "broken",
+    "damaged",
+    "missing_file",
+    "unsigned",
+    "false_signature",
+    "state",
+    "unreadable",
+    "index",
+]
 
 #: So many findings of one file are kept; the rest is counted.
 KEPT = 50
@@ -58,8 +69,14 @@ class Finding:
 
     def as_json(self) -> dict[str, Any]:
         """Return it as it stands in the result of `--json`."""
-        return {"kind": self.kind, "file": self.file, "topic": self.topic or None, "record": self.sequence,
-                "time_utc_ns": self.time_utc_ns, "text": self.text}  # fmt: skip
+        return {
+            "kind": self.kind,
+            "file": self.file,
+            "topic": self.topic or None,
+            "record": self.sequence,
+            "time_utc_ns": self.time_utc_ns,
+            "text": self.text,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,8 +121,13 @@ class Difference:
     def as_json(self) -> dict[str, Any]:
         """Return it as it stands in the result of `--json`."""
         fields = [{"field": f.name, "recorded": f.recorded, "recomputed": f.recomputed} for f in self.fields]
-        return {"file": self.file, "topic": self.topic, "seq": self.seq, "time_utc_ns": self.time_utc_ns,
-                "fields": fields}  # fmt: skip
+        return {
+            "file": self.file,
+            "topic": self.topic,
+            "seq": self.seq,
+            "time_utc_ns": self.time_utc_ns,
+            "fields": fields,
+        }
 
 
 class Findings:
@@ -122,8 +144,9 @@ class Findings:
         """Keep one, or count it where there are many."""
         self.count += 1
         if len(self.kept) < KEPT:
-            self.kept.append(Finding(kind=kind, file=self.file, text=text, topic=topic, sequence=sequence,
-                                     time_utc_ns=time_utc_ns))  # fmt: skip
+            self.kept.append(
+                Finding(kind=kind, file=self.file, text=text, topic=topic, sequence=sequence, time_utc_ns=time_utc_ns)
+            )
 
 
 def utc(time_ns: int) -> str:

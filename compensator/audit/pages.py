@@ -12,7 +12,7 @@ from compensator.audit.comparison import Comparison, worst_utc
 from compensator.audit.findings import Difference, Finding, utc
 from compensator.audit.recording_audit import RecordingAudit
 from compensator.audit.series import Audit
-from compensator.chain import NOTHING
+from compensator.recording.chain import NOTHING
 from compensator.report.envelope import Envelope, line_of
 from compensator.report.history import Spread
 from compensator.report.page import (
@@ -119,11 +119,17 @@ def _timeline(found: Audit) -> list[Block]:
     first, last = min(file.first_ns for file in files), max(file.last_ns for file in files)
     note = f"{len(spans['file: nothing found'])} of {len(files)} file(s) with samples: nothing found."
     return [
-        Figure(title="What was found, over time", x_label=_TIME, y_label="outcome", clock=True, note=note,
-               height=1.0 + 0.3 * sum(map(bool, spans.values())),
-               strips=tuple(strip for strip in strips if strip.spans),
-               x_limits=(first * 1e-9 - 60.0, last * 1e-9 + 60.0)),
-    ]  # fmt: skip
+        Figure(
+            title="What was found, over time",
+            x_label=_TIME,
+            y_label="outcome",
+            clock=True,
+            note=note,
+            height=1.0 + 0.3 * sum(map(bool, spans.values())),
+            strips=tuple(strip for strip in strips if strip.spans),
+            x_limits=(first * 1e-9 - 60.0, last * 1e-9 + 60.0),
+        ),
+    ]
 
 
 def _proven(found: Audit) -> Table:
@@ -139,24 +145,41 @@ def _proven(found: Audit) -> Table:
     index = sum(finding.kind == "index" for finding in found.findings)
     inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
-        ["Every estimate and every offset is what this program makes of the samples",
-         no if found.differing else yes if worked_out else open_,
-         f"{found.samples} samples worked out again, bit for bit; {found.differing} differ"],
-        ["No record was changed, removed, inserted or moved", no if inside > 0 else yes if whole else open_,
-         f"hash chain over {records} records in {len(chained)} of {len(found.files)} file(s)"],
-        ["No file is missing between the first and the last", no if of_files else yes if whole else open_,
-         "each chain begins with the last value of the file before"],
-        ["Readers that seek find every record, and nothing else", no if index else yes if whole and not ends else open_,
-         "index and summary of each file held against what is in it"],
-        ["Nobody wrote all of it anew from some point on",
-         (no if not_signed else yes) if found.signed else open_,
-         "signatures checked against the key given" if found.signed else "only a signature can exclude that: "
-         "--public-key, and [recording] signing_key on the machine"],
-        ["Nothing was cut off behind the last record", no if cut or ends else yes if whole else open_,
-         f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end"],
+        [
+            "Every estimate and every offset is what this program makes of the samples",
+            no if found.differing else yes if worked_out else open_,
+            f"{found.samples} samples worked out again, bit for bit; {found.differing} differ",
+        ],
+        [
+            "No record was changed, removed, inserted or moved",
+            no if inside > 0 else yes if whole else open_,
+            f"hash chain over {records} records in {len(chained)} of {len(found.files)} file(s)",
+        ],
+        [
+            "No file is missing between the first and the last",
+            no if of_files else yes if whole else open_,
+            "each chain begins with the last value of the file before",
+        ],
+        [
+            "Readers that seek find every record, and nothing else",
+            no if index else yes if whole and not ends else open_,
+            "index and summary of each file held against what is in it",
+        ],
+        [
+            "Nobody wrote all of it anew from some point on",
+            (no if not_signed else yes) if found.signed else open_,
+            "signatures checked against the key given"
+            if found.signed
+            else "only a signature can exclude that: --public-key, and [recording] signing_key on the machine",
+        ],
+        [
+            "Nothing was cut off behind the last record",
+            no if cut or ends else yes if whole else open_,
+            f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end",
+        ],
         ["What was before the first file", open_, "it was not given"],
         ["The sensors told the truth", open_, "no recording can show that"],
-    ]  # fmt: skip
+    ]
     return Table(title="What was proven, and what was not", head=["statement", "outcome", "how"], rows=rows)
 
 
@@ -166,7 +189,7 @@ def _difference(difference: Difference) -> Table:
         head=["field", "recorded", "worked out again"],
         rows=[[field.name, _shown(field.recorded), _shown(field.recomputed)] for field in difference.fields],
         note=f"{difference.file}: /{difference.topic} of sample {difference.seq}, {utc(difference.time_utc_ns)}.",
-    )  # fmt: skip
+    )
 
 
 def _shown(value: object) -> str:
@@ -189,20 +212,30 @@ def _findings(found: Audit) -> Block:
 def _files(files: Sequence[RecordingAudit]) -> Block:
     rows: list[list[Cell]] = [
         [
-            file.file, Code(file.end), str(file.samples), str(file.records), str(file.findings_count),
-            str(file.differing), f"{file.signed} seal(s)" if file.signed else "–",
+            file.file,
+            Code(file.end),
+            str(file.samples),
+            str(file.records),
+            str(file.findings_count),
+            str(file.differing),
+            f"{file.signed} seal(s)" if file.signed else "–",
         ]
         for file in files
-    ]  # fmt: skip
+    ]
     head = ["file", "end", "samples", "records", "findings", "differ", "signed"]
     return _folded("File by file", head, rows, "The values of the hash chain stand below, to open.")
 
 
 def _hashes(found: Audit) -> Details:
     rows: list[list[Cell]] = [
-        [file.file, "begins it" if file.previous == NOTHING.hex() else file.previous or "–", file.last or "–",
-         file.model or "–"] for file in found.files
-    ]  # fmt: skip
+        [
+            file.file,
+            "begins it" if file.previous == NOTHING.hex() else file.previous or "–",
+            file.last or "–",
+            file.model or "–",
+        ]
+        for file in found.files
+    ]
     keys = sorted({key for file in found.files for key in file.keys})
     blocks: list[Block] = [Table(head=["file", "chain goes on from", "chain ends with", "model, SHA-256"], rows=rows)]
     if keys:
@@ -264,15 +297,28 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
     recorded, other = f"{found.recorded} (recorded)", found.other
     ends = (curves.first_s, curves.last_s)
     offsets = Figure(
-        title="Offset of both models", x_label=_TIME, y_label="Y offset, µm", clock=True, x_limits=ends,
+        title="Offset of both models",
+        x_label=_TIME,
+        y_label="Y offset, µm",
+        clock=True,
+        x_limits=ends,
         lines=(curves.line(recorded, "recorded"), curves.line(other, "other")),
         note=f"They differ by {_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
-    )  # fmt: skip
+    )
     blocks: list[Block] = [offsets]
     if found.left_before.samples:
         left = (curves.line(recorded, "left recorded"), curves.line(other, "left other"))
-        blocks.append(Figure(title="What is left: measured deformation + offset", x_label=_TIME, y_label="Y, µm",
-                             clock=True, x_limits=ends, lines=left, height=2.8))  # fmt: skip
+        blocks.append(
+            Figure(
+                title="What is left: measured deformation + offset",
+                x_label=_TIME,
+                y_label="Y, µm",
+                clock=True,
+                x_limits=ends,
+                lines=left,
+                height=2.8,
+            )
+        )
     blocks.append(_before_and_after(found))
     if found.remarks:
         blocks.append(Words(title="What the figures depend on", lines=[sentence_of(one) for one in found.remarks]))
@@ -303,7 +349,8 @@ def _before_and_after(found: Comparison) -> Table:
         return [name, _um(spread.rms), _um(abs(spread.peak)), str(spread.samples), worst]
 
     return Table(
-        title="Before and after", head=["", "rms µm", "largest µm", "samples", "largest at"],
+        title="Before and after",
+        head=["", "rms µm", "largest µm", "samples", "largest at"],
         rows=[
             row(f"residual, {found.recorded} (recorded)", found.residual_before),
             row(f"residual, {found.other}", found.residual_after),
@@ -313,7 +360,7 @@ def _before_and_after(found: Comparison) -> Table:
         ],
         note="Residual: measured − predicted. Every recorded sample went through the service's own compensation with "
         "the other model, limits and losses included.",
-    )  # fmt: skip
+    )
 
 
 def _um(value: float) -> str:

@@ -10,11 +10,11 @@ import msgspec
 from compensator.audit.findings import Difference, Field
 from compensator.audit.verification import Record
 from compensator.config import Config, parse_config
-from compensator.container import PAYLOAD, Attachment, Contents
 from compensator.errors import CompensatorError, DataError
 from compensator.messages import Event, Offset, Sample, degraded, encode
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
+from compensator.recording.container import PAYLOAD, Attachment, Contents
 from compensator.service.compensation import Compensation
 from compensator.service.recording_thread import FAILED, LATE
 from compensator.service.retrace import obey
@@ -166,9 +166,7 @@ class Recomputation:
             if isinstance(removed, list):
                 self.removed += [name for name in removed[:1000] if isinstance(name, str)]
 
-    def _sample(
-        self, data: bytes, estimate: bytes, offset: bytes, events: list[Event], records: list[Record]
-    ) -> None:  # fmt: skip
+    def _sample(self, data: bytes, estimate: bytes, offset: bytes, events: list[Event], records: list[Record]) -> None:
         sample = self._decoded(_SAMPLE, data, "sample", records[0].sequence)
         if events:
             self._act(events, sample.seq)
@@ -194,8 +192,9 @@ class Recomputation:
         for topic, recorded, message in pairs:
             if not recorded:
                 nothing = (Field(name="message", recorded=None, recomputed=msgspec.to_builtins(message)),)
-                self._incomplete = Difference(file=self._file, topic=topic, seq=sample.seq,
-                                              time_utc_ns=sample.time_utc_ns, fields=nothing)  # fmt: skip
+                self._incomplete = Difference(
+                    file=self._file, topic=topic, seq=sample.seq, time_utc_ns=sample.time_utc_ns, fields=nothing
+                )
                 return
             if encode(message) != recorded:
                 self._differs(topic, sample.seq, sample.time_utc_ns, recorded, encode(message))
@@ -203,8 +202,15 @@ class Recomputation:
         for kind, text in outcome.notes:
             if not any(event.kind == kind and event.text == text for event in events):
                 said = next((event.text for event in events if event.kind == kind), None)
-                self._count(Difference(file=self._file, topic="event", seq=sample.seq, time_utc_ns=sample.time_utc_ns,
-                                       fields=(Field(name=kind, recorded=said, recomputed=text),)))  # fmt: skip
+                self._count(
+                    Difference(
+                        file=self._file,
+                        topic="event",
+                        seq=sample.seq,
+                        time_utc_ns=sample.time_utc_ns,
+                        fields=(Field(name=kind, recorded=said, recomputed=text),),
+                    )
+                )
 
     def _as_published(self, expected: Offset, recorded: bytes) -> Offset:
         """Return an offset with the reason of the disk where it was published with one."""

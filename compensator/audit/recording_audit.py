@@ -14,16 +14,16 @@ import msgspec
 from compensator.audit.findings import Difference, Finding, Findings
 from compensator.audit.recomputation import Recomputation
 from compensator.audit.verification import ChainCheck, Record
-from compensator.container import Container, Damaged, Torn
 from compensator.errors import CompensatorError, DataError
-from compensator.signature import Verifier
+from compensator.recording.container import Container, Damaged, Torn
+from compensator.recording.signature import Verifier
 
 #: `finished`: with its end. `recovered`: torn, and finished at the next start. `open`: no end, all groups whole: it is
 #: being written, or the service was killed, or the end was cut off. `torn`: the same within a group. `truncated`: a
 #: finished file of which the end is missing. `damaged`: no MCAP from some byte on.
 End = Literal["finished", "recovered", "open", "torn", "truncated", "damaged"]
 
-#: Messages between two calls of `told`.
+#: Messages between two calls of `progress`.
 _STEP = 2000
 _MESSAGE, _CHUNK, _ATTACHMENT, _METADATA = b"\x05", b"\x06", b"\x09", b"\x0c"
 #: Bytes of a message before its payload.
@@ -115,7 +115,7 @@ class RecordingAudit:
 
 
 def audit_recording(
-    path: Path, verifier: Verifier | None = None, *, told: Callable[[int], None] | None = None
+    path: Path, verifier: Verifier | None = None, *, progress: Callable[[int], None] | None = None
 ) -> RecordingAudit:
     """Audit one file.
 
@@ -125,7 +125,7 @@ def audit_recording(
         A recording.
     verifier : Verifier, optional
         Public key of the machine.
-    told : callable, optional
+    progress : callable, optional
         Called now and then with the number of bytes worked off since the last call.
 
     Raises
@@ -134,17 +134,17 @@ def audit_recording(
         If it is no recording; one line that says where and why.
     """
     with Container(path) as container:
-        return _Audit(path, container, verifier, told).run()
+        return _Audit(path, container, verifier, progress).run()
 
 
 class _Audit:
     def __init__(
-        self, path: Path, container: Container, verifier: Verifier | None, told: Callable[[int], None] | None
+        self, path: Path, container: Container, verifier: Verifier | None, progress: Callable[[int], None] | None
     ) -> None:
         self._name, self._size = path.name, path.stat().st_size
         self._container = container
         self._contents = container.contents
-        self._verifier, self._told = verifier, told
+        self._verifier, self._progress = verifier, progress
         self._findings = Findings(path.name)
         self._check: ChainCheck | None = None
         self._work: Recomputation | None = None
@@ -173,8 +173,8 @@ class _Audit:
             self._check.finish()
         if self._work is not None:
             self._work.finish()
-        if self._told is not None:
-            self._told(self._size - self._position)
+        if self._progress is not None:
+            self._progress(self._size - self._position)
         return self._result()
 
     # ------------------------------------------------------------------ reading
@@ -244,9 +244,9 @@ class _Audit:
         )
 
     def _tell(self) -> None:
-        if self._told is not None:
+        if self._progress is not None:
             position = self._container.position
-            self._told(position - self._position)
+            self._progress(position - self._position)
             self._position = position
 
     # ------------------------------------------------------------------ the end
@@ -263,12 +263,17 @@ class _Audit:
         if error is None:
             self._end = "recovered" if sealed == "recovered" else "finished"
             if self._check.head and unlisted:
-                self._findings.add("inserted", f"{unlisted} record(s) behind the last message of the chain",
-                                   topic=self._rest[0].topic, sequence=self._rest[0].sequence,
-                                   time_utc_ns=self._rest[0].time_ns)  # fmt: skip
+                self._findings.add(
+                    "inserted",
+                    f"{unlisted} record(s) behind the last message of the chain",
+                    topic=self._rest[0].topic,
+                    sequence=self._rest[0].sequence,
+                    time_utc_ns=self._rest[0].time_ns,
+                )
             elif self._check.head and not sealed:
-                self._findings.add("removed", "the file has its end, and not the seal that stands before it",
-                                   topic="seal")  # fmt: skip
+                self._findings.add(
+                    "removed", "the file has its end, and not the seal that stands before it", topic="seal"
+                )
         elif not isinstance(error, Torn):
             self._end = "damaged"
             self._findings.add("damaged", f"byte {error.offset}: {error.text}")
@@ -309,24 +314,39 @@ class _Audit:
             part = contents.attachments.get(name)
             identity.update(hashlib.sha256(part.data if part else b"").digest())
         return RecordingAudit(
-            file=self._name, original=run.get("file", self._name), machine=run.get("machine", ""),
-            began=run.get("began", ""), previous_file=run.get("previous_file", ""),
+            file=self._name,
+            original=run.get("file", self._name),
+            machine=run.get("machine", ""),
+            began=run.get("began", ""),
+            previous_file=run.get("previous_file", ""),
             previous=check.previous.hex() if check.head else "",
-            last=check.handed_on.hex(), end=self._end, records=check.records,
-            samples=work.samples if work else 0, skipped=work.skipped if work else 0,
-            first_seq=work.first_seq if work else -1, last_seq=work.last_seq if work else -1,
-            first_ns=work.first_ns if work else 0, last_ns=work.last_ns if work else 0,
-            restarted=work.restarted if work else False, differing=work.differing if work else 0,
-            difference=work.first if work else None, findings=tuple(self._findings.kept),
-            findings_count=self._findings.count, signed=check.seals.signed, unsigned_behind=check.seals.behind,
-            keys=tuple(sorted(check.seals.keys)), sealed_signed=check.seals.last_signed,
+            last=check.handed_on.hex(),
+            end=self._end,
+            records=check.records,
+            samples=work.samples if work else 0,
+            skipped=work.skipped if work else 0,
+            first_seq=work.first_seq if work else -1,
+            last_seq=work.last_seq if work else -1,
+            first_ns=work.first_ns if work else 0,
+            last_ns=work.last_ns if work else 0,
+            restarted=work.restarted if work else False,
+            differing=work.differing if work else 0,
+            difference=work.first if work else None,
+            findings=tuple(self._findings.kept),
+            findings_count=self._findings.count,
+            signed=check.seals.signed,
+            unsigned_behind=check.seals.behind,
+            keys=tuple(sorted(check.seals.keys)),
+            sealed_signed=check.seals.last_signed,
             identity=identity.hexdigest(),
             state_before=hashlib.sha256(state.data).hexdigest() if state else "",
             state_after=hashlib.sha256(work.compensation.state()).hexdigest() if work else "",
-            not_worked_out=self._why_not, model=work.compensation.model.sha256 if work else "",
+            not_worked_out=self._why_not,
+            model=work.compensation.model.sha256 if work else "",
             removed=tuple(work.removed) if work else (),
-            early=len(work.early) if work else 0, size=self._size,
-        )  # fmt: skip
+            early=len(work.early) if work else 0,
+            size=self._size,
+        )
 
 
 def _covers_others(rest: bytes) -> bool:

@@ -11,9 +11,9 @@ from typing import Any
 
 from compensator.audit.findings import Difference, Finding, Kind, utc
 from compensator.audit.recording_audit import RecordingAudit, audit_recording
-from compensator.chain import NOTHING
 from compensator.reasons import Caution
-from compensator.signature import Verifier
+from compensator.recording.chain import NOTHING
+from compensator.recording.signature import Verifier
 
 _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
 
@@ -63,27 +63,44 @@ class Audit:
     def as_json(self) -> dict[str, Any]:
         """Return it as it stands in the result of `--json`."""
         files = [
-            {"file": f.file, "machine": f.machine, "end": f.end, "samples": f.samples, "records": f.records,
-             "skipped_samples": f.skipped, "differing_samples": f.differing,
-             "published_early": f.early, "findings": f.findings_count,
-             "chained": bool(f.last), "last_value": f.last or None, "signed_seals": f.signed,
-             "model_sha256": f.model or None}
+            {
+                "file": f.file,
+                "machine": f.machine,
+                "end": f.end,
+                "samples": f.samples,
+                "records": f.records,
+                "skipped_samples": f.skipped,
+                "differing_samples": f.differing,
+                "published_early": f.early,
+                "findings": f.findings_count,
+                "chained": bool(f.last),
+                "last_value": f.last or None,
+                "signed_seals": f.signed,
+                "model_sha256": f.model or None,
+            }
             for f in self.files
-        ]  # fmt: skip
+        ]
         return {
-            "clean": self.clean, "signatures_checked": self.signed,
-            "samples": self.samples, "differing_samples": self.differing,
-            "findings_count": self.findings_count, "findings": [f.as_json() for f in self.findings],
-            "difference": self.difference.as_json() if self.difference else None, "remarks": list(self.remarks),
+            "clean": self.clean,
+            "signatures_checked": self.signed,
+            "samples": self.samples,
+            "differing_samples": self.differing,
+            "findings_count": self.findings_count,
+            "findings": [f.as_json() for f in self.findings],
+            "difference": self.difference.as_json() if self.difference else None,
+            "remarks": list(self.remarks),
             "remark_codes": [remark.code for remark in self.remarks],
             "files": files,
-        }  # fmt: skip
+        }
 
 
 def audit(
-    paths: Sequence[Path], *, public_key: Path | None = None, told: Callable[[int, int], None] | None = None,
+    paths: Sequence[Path],
+    *,
+    public_key: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
     executor: Executor | None = None,
-) -> Audit:  # fmt: skip
+) -> Audit:
     """Audit recordings.
 
     Parameters
@@ -92,7 +109,7 @@ def audit(
         Recordings, in any order.
     public_key : pathlib.Path, optional
         Key that they must be signed with.
-    told : callable, optional
+    progress : callable, optional
         Called with the number of bytes worked off, and of all.
     executor : Executor, optional
         Who audits the files; this process, one after the other, where there is none.
@@ -113,19 +130,19 @@ def audit(
     def add(size: int) -> None:
         nonlocal done
         done += size
-        if told is not None:
-            told(done, whole)
+        if progress is not None:
+            progress(done, whole)
 
     if executor is not None:
         audits = _side_by_side(executor, paths, public_key, lambda path: add(sizes[path]))
     else:
-        audits = [audit_recording(path, verifier, told=add) for path in paths]
+        audits = [audit_recording(path, verifier, progress=add) for path in paths]
     return judge(audits, signed=verifier is not None)
 
 
 def _side_by_side(
     executor: Executor, paths: Sequence[Path], public_key: Path | None, done: Callable[[Path], None]
-) -> list[RecordingAudit]:  # fmt: skip
+) -> list[RecordingAudit]:
     """Audit files side by side: each carries the state that it begins with, so none waits for another."""
     jobs = {executor.submit(_audit_one, path, public_key): path for path in paths}
     for job in as_completed(jobs):
@@ -157,8 +174,14 @@ def judge(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
     findings = [finding for file in files for finding in (*judged.own.get(file.file, ()), *file.findings)]
     count = sum(len(own) for own in judged.own.values()) + sum(file.findings_count for file in files)
     first = next((file.difference for file in files if file.difference), None)
-    return Audit(files=tuple(files), findings=tuple(findings), findings_count=count, difference=first,
-                 remarks=tuple(judged.remarks), signed=signed)  # fmt: skip
+    return Audit(
+        files=tuple(files),
+        findings=tuple(findings),
+        findings_count=count,
+        difference=first,
+        remarks=tuple(judged.remarks),
+        signed=signed,
+    )
 
 
 def _named(file: RecordingAudit) -> RecordingAudit:
@@ -260,8 +283,11 @@ class _Judge:
         named = self._names.get(after.previous_file)
         if named is None:
             lost = "removed by the limit of what is kept" if after.previous_file in self._removed else "missing"
-            self._find("missing_file", after, f"{after.previous_file}, which it goes on from, is {lost}; "
-                       f"it stood behind {before.file}")  # fmt: skip
+            self._find(
+                "missing_file",
+                after,
+                f"{after.previous_file}, which it goes on from, is {lost}; it stood behind {before.file}",
+            )
         elif named.original != before.original:
             self._find("reordered", after, f"goes on from {named.file}, and {before.file} stands between")
         elif before.end == "damaged":
@@ -310,8 +336,10 @@ def summary(found: Audit) -> str:
         records = sum(file.records for file in chained)
         lines.append(f"The hash chain holds over {records} records; nothing was changed, removed, inserted or moved.")
         if not found.signed:
-            lines.append("Who could write all of these files could compute the chain anew: only a signature, checked "
-                         "with --public-key, excludes that.")  # fmt: skip
+            lines.append(
+                "Who could write all of these files could compute the chain anew: only a signature, checked "
+                "with --public-key, excludes that."
+            )
     if found.findings_count:
         lines.append(f"{found.findings_count} finding(s):")
         lines += [f"  {finding.line()}" for finding in found.findings]

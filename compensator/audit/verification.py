@@ -1,6 +1,6 @@
 """Follows the hash chain of one file and names what breaks it.
 
-The rule is short (`compensator.chain`): compute the values, make the `/chain` message that must follow, compare its
+The rule is short (`recording/chain.py`): compute the values, make the `/chain` message that must follow, compare its
 bytes. Only where they differ is it asked what happened: a record that fits no more to the value before it was altered,
 one that the chain lists and the file has not was removed, one that the file has and the chain does not list was
 inserted, one that stands elsewhere was moved.
@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import msgspec
 
-from compensator import chain
 from compensator.audit.findings import Finding, Findings
-from compensator.container import PAYLOAD, Contents
 from compensator.messages import SCHEMA, Chain, ChainLink, Seal, encode
-from compensator.signature import Verifier
+from compensator.recording import chain
+from compensator.recording.container import PAYLOAD, Contents
+from compensator.recording.signature import Verifier
 
 _sha256 = hashlib.sha256
 
@@ -155,8 +155,9 @@ class ChainCheck:
     def finish(self) -> None:
         """Say what can only be said at the end."""
         for first, (last, time_ns) in sorted(self._gaps.items()):
-            self._findings.add("removed", f"{_numbers(first, last)} missing before it", sequence=last + 1,
-                               time_utc_ns=time_ns)  # fmt: skip
+            self._findings.add(
+                "removed", f"{_numbers(first, last)} missing before it", sequence=last + 1, time_utc_ns=time_ns
+            )
         self._pair_up()
         for text in self._contents.late:
             name, _, what = text.partition(": ")
@@ -171,8 +172,9 @@ class ChainCheck:
             message = _DECODER.decode(body[PAYLOAD:])
             self.previous = bytes.fromhex(message.before)
         except (msgspec.MsgspecError, UnicodeDecodeError, ValueError):
-            self._findings.add("altered", "the first message of the chain cannot be read", topic="chain",
-                               sequence=sequence)  # fmt: skip
+            self._findings.add(
+                "altered", "the first message of the chain cannot be read", topic="chain", sequence=sequence
+            )
             self.head = chain.opening(self.previous, chain.parts_of(self._contents))
             return
         stated = {part.name: part.sha256 for part in message.parts}
@@ -195,21 +197,29 @@ class ChainCheck:
             self._findings.add("altered", "a hash that is none", topic="chain", sequence=sequence)
             self.head = chain.opening(self.previous, chain.parts_of(self._contents))
         machine = self._contents.metadata.get("run", {}).get("machine", "")
-        expected = Chain(schema=SCHEMA, machine=machine, time_utc_ns=time_ns, before=message.before,
-                         parts=message.parts, records=[])  # fmt: skip
+        expected = Chain(
+            schema=SCHEMA, machine=machine, time_utc_ns=time_ns, before=message.before, parts=message.parts, records=[]
+        )
         if body[PAYLOAD:] != encode(expected) or body[4:12] != body[12:PAYLOAD]:
-            self._findings.add("altered", "says something else than follows from the file", topic="chain",
-                               sequence=sequence, time_utc_ns=time_ns)  # fmt: skip
+            self._findings.add(
+                "altered",
+                "says something else than follows from the file",
+                topic="chain",
+                sequence=sequence,
+                time_utc_ns=time_ns,
+            )
         stated_before = self._contents.metadata.get("run", {}).get("previous_chain", "")
         if (stated_before or chain.NOTHING.hex()) != message.before:
-            self._findings.add("altered", "names another last value of the file before than the metadata",
-                               topic="chain", sequence=sequence)  # fmt: skip
+            self._findings.add(
+                "altered",
+                "names another last value of the file before than the metadata",
+                topic="chain",
+                sequence=sequence,
+            )
 
     # ------------------------------------------------------------------ what happened
 
-    def _explain(
-        self, records: list[Record], computed: bytes, sequence: int, time_ns: int, body: bytes
-    ) -> None:  # fmt: skip
+    def _explain(self, records: list[Record], computed: bytes, sequence: int, time_ns: int, body: bytes) -> None:
         """Name what makes a group differ from its `/chain` message, and go on behind it."""
         try:
             message = _DECODER.decode(body[PAYLOAD:])
@@ -239,12 +249,20 @@ class ChainCheck:
         self._values(records, message.records, before, values, sequence, time_ns)
         if self._findings.count == count and before != self.head and not moved:
             self._findings.add(
-                "broken", "the values up to here and from here on do not belong together: one side was rewritten",
-                topic="chain", sequence=sequence, time_utc_ns=time_ns,
-            )  # fmt: skip
+                "broken",
+                "the values up to here and from here on do not belong together: one side was rewritten",
+                topic="chain",
+                sequence=sequence,
+                time_utc_ns=time_ns,
+            )
         elif self._findings.count == count and not moved:
-            self._findings.add("altered", "says something else than follows from the records", topic="chain",
-                               sequence=sequence, time_utc_ns=time_ns)  # fmt: skip
+            self._findings.add(
+                "altered",
+                "says something else than follows from the records",
+                topic="chain",
+                sequence=sequence,
+                time_utc_ns=time_ns,
+            )
         if sequence >= self._next:
             self.head, self._next = (values[-1] if values else before), sequence + 1
 
@@ -263,11 +281,16 @@ class ChainCheck:
                     self._gaps[start] = (first - 1, gap_time)
                 if sequence < last:
                     self._gaps[sequence + 1] = (last, gap_time)
-                self._findings.add("reordered", f"{_numbers(first, sequence)} standing behind later ones",
-                                   sequence=first, time_utc_ns=time_ns)  # fmt: skip
+                self._findings.add(
+                    "reordered",
+                    f"{_numbers(first, sequence)} standing behind later ones",
+                    sequence=first,
+                    time_utc_ns=time_ns,
+                )
                 return True
-        self._findings.add("inserted", f"{_numbers(first, sequence)} standing there again", sequence=first,
-                           time_utc_ns=time_ns)  # fmt: skip
+        self._findings.add(
+            "inserted", f"{_numbers(first, sequence)} standing there again", sequence=first, time_utc_ns=time_ns
+        )
         return True
 
     def _unlisted(self, records: list[Record], listed: list[ChainLink], before: bytes, time_ns: int) -> None:
@@ -281,16 +304,25 @@ class ChainCheck:
                 break
             value, prefix = chain.link(value, record.topic, record.body), prefix + 1
         if prefix and value == before:
-            self._findings.add("removed", "the message of the chain is missing", topic="chain",
-                               sequence=records[prefix - 1].sequence + 1,
-                               time_utc_ns=records[prefix - 1].time_ns)  # fmt: skip
+            self._findings.add(
+                "removed",
+                "the message of the chain is missing",
+                topic="chain",
+                sequence=records[prefix - 1].sequence + 1,
+                time_utc_ns=records[prefix - 1].time_ns,
+            )
             self.head = value
             unlisted = unlisted[prefix:]
         seen: set[int] = set()
         for record in records:
             if record in unlisted or record.sequence in seen:
-                self._findings.add("inserted", "the chain does not list it", topic=record.topic,
-                                   sequence=record.sequence, time_utc_ns=record.time_ns)  # fmt: skip
+                self._findings.add(
+                    "inserted",
+                    "the chain does not list it",
+                    topic=record.topic,
+                    sequence=record.sequence,
+                    time_utc_ns=record.time_ns,
+                )
             seen.add(record.sequence)
 
     def _listed(self, records: list[Record], listed: list[ChainLink], time_ns: int) -> None:
@@ -298,21 +330,36 @@ class ChainCheck:
         present = [record.sequence for record in records]
         for entry in listed:
             if entry.sequence not in present:
-                self._findings.add("removed", "the chain lists it, it is not there", topic=entry.topic,
-                                   sequence=entry.sequence, time_utc_ns=time_ns)  # fmt: skip
+                self._findings.add(
+                    "removed",
+                    "the chain lists it, it is not there",
+                    topic=entry.topic,
+                    sequence=entry.sequence,
+                    time_utc_ns=time_ns,
+                )
         numbers = [entry.sequence for entry in listed if entry.sequence in present]
         order = [number for number in dict.fromkeys(present) if number in numbers]
         for wanted, found in zip(numbers, order, strict=False):
             if wanted != found:
                 record = next(record for record in records if record.sequence == found)
-                self._findings.add("reordered", f"stands where record {wanted} stood", topic=record.topic,
-                                   sequence=found, time_utc_ns=record.time_ns)  # fmt: skip
+                self._findings.add(
+                    "reordered",
+                    f"stands where record {wanted} stood",
+                    topic=record.topic,
+                    sequence=found,
+                    time_utc_ns=record.time_ns,
+                )
                 return
 
     def _values(
-        self, records: list[Record], listed: list[ChainLink], before: bytes, values: list[bytes], sequence: int,
+        self,
+        records: list[Record],
+        listed: list[ChainLink],
+        before: bytes,
+        values: list[bytes],
+        sequence: int,
         time_ns: int,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Name records whose value is not the one stated."""
         there = {record.sequence: record for record in reversed(records)}
         last = len(listed) - 1
@@ -326,13 +373,23 @@ class ChainCheck:
                 continue
             after = there.get(listed[i + 1].sequence) if i < last else None
             if after is not None and chain.link(value, after.topic, after.body) == values[i + 1]:
-                self._findings.add("altered", f"its value of /{record.topic} record {record.sequence} is not that of "
-                                   "the record", topic="chain", sequence=sequence, time_utc_ns=time_ns)  # fmt: skip
+                self._findings.add(
+                    "altered",
+                    f"its value of /{record.topic} record {record.sequence} is not that of the record",
+                    topic="chain",
+                    sequence=sequence,
+                    time_utc_ns=time_ns,
+                )
                 continue
             if i and after is not None and chain.link(values[i], after.topic, after.body) != values[i + 1]:
                 pass  # The one behind is named by itself.
-            self._findings.add("altered", "does not fit to its value in the chain", topic=record.topic,
-                               sequence=record.sequence, time_utc_ns=record.time_ns)  # fmt: skip
+            self._findings.add(
+                "altered",
+                "does not fit to its value in the chain",
+                topic=record.topic,
+                sequence=record.sequence,
+                time_utc_ns=record.time_ns,
+            )
             if i == last:
                 self._suspect = (len(self._findings.kept) - 1, value)
 
@@ -363,8 +420,9 @@ class ChainCheck:
             return
         seals.last = "" if seal.reason == "hour" else seal.reason
         if (seal.sha256, seal.sequence) != (before.hex(), sequence - 1):
-            self._findings.add("altered", "does not seal what stands before it", topic="seal", sequence=sequence,
-                               time_utc_ns=time_ns)  # fmt: skip
+            self._findings.add(
+                "altered", "does not seal what stands before it", topic="seal", sequence=sequence, time_utc_ns=time_ns
+            )
         seals.last_signed = bool(seal.signature)
         if not seal.signature:
             seals.behind += 1
@@ -373,8 +431,9 @@ class ChainCheck:
         seals.keys.add(seal.public_key)
         if self._verifier is not None and not self._verifier.holds(seal):
             seals.false += 1
-            self._findings.add("false_signature", "not signed by the key given", topic="seal", sequence=sequence,
-                               time_utc_ns=time_ns)  # fmt: skip
+            self._findings.add(
+                "false_signature", "not signed by the key given", topic="seal", sequence=sequence, time_utc_ns=time_ns
+            )
         else:
             seals.behind = 0
 

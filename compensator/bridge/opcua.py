@@ -28,9 +28,14 @@ STATES = ("starting", "following", "holding", "fading", "trouble")
 HEARTBEAT_MODULUS = 2**15
 _REALS = (ua.VariantType.Float, ua.VariantType.Double)
 _INTEGERS = (
-    ua.VariantType.Byte, ua.VariantType.Int16, ua.VariantType.UInt16, ua.VariantType.Int32, ua.VariantType.UInt32,
-    ua.VariantType.Int64, ua.VariantType.UInt64,
-)  # fmt: skip
+    ua.VariantType.Byte,
+    ua.VariantType.Int16,
+    ua.VariantType.UInt16,
+    ua.VariantType.Int32,
+    ua.VariantType.UInt32,
+    ua.VariantType.Int64,
+    ua.VariantType.UInt64,
+)
 #: What a connection that is lost, refused or silent raises.
 _GONE = (OSError, ua.UaError, asyncio.TimeoutError, ConnectionError)
 
@@ -55,9 +60,12 @@ class Bridge:
         self._said = ""
         self._beat = 0
         self.register = Register(
-            receiver.follower, sign=settings.sign, unit_um=settings.unit_um,
-            tolerance_um=settings.readback_tolerance_um, resume_after_s=settings.resume_after_s,
-        )  # fmt: skip
+            receiver.follower,
+            sign=settings.sign,
+            unit_um=settings.unit_um,
+            tolerance_um=settings.readback_tolerance_um,
+            resume_after_s=settings.resume_after_s,
+        )
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until `stop` is set; what the PLC holds then stands.
@@ -86,10 +94,12 @@ class Bridge:
             # A server compares the certificate's name of the program with what the program calls itself.
             client.application_uri = _application_uri(Path(settings.certificate)) or client.application_uri
             await client.set_security(
-                getattr(security_policies, f"SecurityPolicy{settings.security_policy}"), settings.certificate,
-                settings.private_key, server_certificate=settings.server_certificate,
+                getattr(security_policies, f"SecurityPolicy{settings.security_policy}"),
+                settings.certificate,
+                settings.private_key,
+                server_certificate=settings.server_certificate,
                 mode=ua.MessageSecurityMode.SignAndEncrypt,
-            )  # fmt: skip
+            )
         return client
 
     async def _connected(self, client: Client, stop: asyncio.Event) -> None:
@@ -101,8 +111,12 @@ class Bridge:
 
     async def _nodes(self, client: Client) -> dict[str, tuple[Any, ua.VariantType]]:
         nodes = {}
-        wanted = {"offset_node": _REALS, "heartbeat_node": _INTEGERS, "state_node": _INTEGERS,
-                  "enable_node": (ua.VariantType.Boolean,)}  # fmt: skip
+        wanted = {
+            "offset_node": _REALS,
+            "heartbeat_node": _INTEGERS,
+            "state_node": _INTEGERS,
+            "enable_node": (ua.VariantType.Boolean,),
+        }
         for key, kinds in wanted.items():
             name = getattr(self._settings, key)
             if not name:

@@ -38,9 +38,15 @@ class Register:
     """
 
     def __init__(
-        self, follower: Follower, *, sign: int, unit_um: float, tolerance_um: float, resume_after_s: float,
+        self,
+        follower: Follower,
+        *,
+        sign: int,
+        unit_um: float,
+        tolerance_um: float,
+        resume_after_s: float,
         single: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._follower = follower
         self._per_um = sign / unit_um
         self._tolerance_um = tolerance_um
@@ -67,7 +73,7 @@ class Register:
             In the PLC's unit.
         """
         if not self._known:
-            # A first value is taken at once: nobody was told anything else before.
+            # A first value is taken at once: nobody was progress anything else before.
             return self._go_on_from(value)
         if self._written is None or self._same(value, self._written):
             return True

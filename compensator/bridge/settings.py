@@ -122,8 +122,13 @@ def _check(opcua: OpcUa, path: str) -> None:
         raise wrong("endpoint", "opc.tcp://HOST:PORT")
     if not opcua.offset_node:
         raise wrong("offset_node", "a node such as ns=2;s=/Plc/DB100.DBD0:REAL")
-    bounds = {"cycle_s": (0.05, 10.0), "readback_tolerance_um": (1e-4, 10.0), "resume_after_s": (1.0, 3600.0),
-              "retry_s": (0.1, 300.0), "timeout_s": (0.1, 60.0)}  # fmt: skip
+    bounds = {
+        "cycle_s": (0.05, 10.0),
+        "readback_tolerance_um": (1e-4, 10.0),
+        "resume_after_s": (1.0, 3600.0),
+        "retry_s": (0.1, 300.0),
+        "timeout_s": (0.1, 60.0),
+    }
     for key, (least, most) in bounds.items():
         if not least <= getattr(opcua, key) <= most:
             raise wrong(key, f"{least:g} to {most:g}")

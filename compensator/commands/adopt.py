@@ -12,7 +12,7 @@ from compensator.config import LoadedConfig
 from compensator.errors import ServiceError
 from compensator.model.model_file import read_model_bytes
 from compensator.service.adoption import check_model
-from compensator.service.asking import NotReached, Operator, ask, operator_of_file
+from compensator.service.command_client import NotReached, Operator, ask, operator_of_file
 from compensator.service.composition import load
 from compensator.service.model_store import ModelStore
 

@@ -8,7 +8,7 @@ import logging
 from compensator.commands import Answer
 from compensator.service.compensation import Compensation
 from compensator.service.composition import load
-from compensator.service.precautions import precautions
+from compensator.service.configuration_warnings import precautions
 
 log = logging.getLogger("compensator")
 
@@ -32,7 +32,14 @@ def run(arguments: argparse.Namespace) -> Answer:
         f"{len(fleet.devices)} device(s), {len(loaded.config.channel)} channel(s). Nothing was opened.\n"
         f"plausibility: {checks}"
     )
-    result = {"ok": True, "machine": machine, "model": model.name, "model_sha256": model.sha256,
-              "devices": list(fleet.devices), "warnings": list(warnings),
-              "warning_codes": [warning.code for warning in warnings], "checks": checks}  # fmt: skip
+    result = {
+        "ok": True,
+        "machine": machine,
+        "model": model.name,
+        "model_sha256": model.sha256,
+        "devices": list(fleet.devices),
+        "warnings": list(warnings),
+        "warning_codes": [warning.code for warning in warnings],
+        "checks": checks,
+    }
     return Answer(result, text)

@@ -6,7 +6,7 @@ import argparse
 
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_file
-from compensator.export import export
+from compensator.data.export import export
 
 
 def run(arguments: argparse.Namespace) -> Answer:

@@ -16,22 +16,20 @@ import numpy as np
 from compensator import __version__
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_file
-from compensator.commands.progress import progress
+from compensator.commands.progress import progress_bar
+from compensator.data.record import Data, require
+from compensator.data.runs import SHORTEST_RUN, Run, runs_of
+from compensator.data.screening import screen_temperatures
+from compensator.data.tables import load_data, load_recordings, roles_of
 from compensator.errors import DataError, UsageError
 from compensator.identify.calibration import Calibration, calibrate
 from compensator.identify.comparison import Row, compare
 from compensator.identify.criticism import Criticism, criticise
-from compensator.identify.runs import SHORTEST_RUN, Run, runs_of
-from compensator.identify.screening import screen_temperatures
 from compensator.identify.settings import Settings
 from compensator.identify.summary import figures, text
 from compensator.model.model_file import BUILT_IN, load_model
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.tables import Data, load_data, load_recordings, require, roles_of
-
-#: `progress` is used from here by the other commands, too.
-__all__ = ["Request", "finished", "identify", "progress", "provenance", "read_runs", "run", "write"]
 
 log = logging.getLogger("compensator")
 
@@ -95,15 +93,27 @@ def run(arguments: argparse.Namespace) -> Answer:
     """
     given = arguments
     settings = Settings(
-        kind=given.kind, method=given.method, ttf=tuple(given.ttf), order=tuple(given.order) if given.order else None,
-        drive=given.drive, given_tdtf=tuple(given.tdtf) if given.tdtf else None, etve_end_h=given.etve_end_h,
+        kind=given.kind,
+        method=given.method,
+        ttf=tuple(given.ttf),
+        order=tuple(given.order) if given.order else None,
+        drive=given.drive,
+        given_tdtf=tuple(given.tdtf) if given.tdtf else None,
+        etve_end_h=given.etve_end_h,
         folds=given.folds,
-    )  # fmt: skip
+    )
     request = Request(
-        data=given.data, out=given.out, name=given.name or given.out.stem, settings=settings, etve=given.etve,
-        validate=given.validate, columns=given.column, fit_until_h=given.fit_until, reference=given.reference,
+        data=given.data,
+        out=given.out,
+        name=given.name or given.out.stem,
+        settings=settings,
+        etve=given.etve,
+        validate=given.validate,
+        columns=given.column,
+        fit_until_h=given.fit_until,
+        reference=given.reference,
         page=_checked(given.page),
-    )  # fmt: skip
+    )
     return identify(request)
 
 
@@ -121,15 +131,20 @@ def identify(request: Request) -> Answer:
     etve, validation = (read_runs(paths, roles, remarks) for paths in (request.etve, request.validate))
     for run in validation:
         screen_temperatures(run.name, [run], quiet_air=True)
-    with progress("fitting") as told:
+    with progress_bar("fitting") as progress:
         calibration = calibrate(
-            runs, request.settings, period_s=PERIOD_S, name=request.name, etve=etve, validation=validation,
+            runs,
+            request.settings,
+            period_s=PERIOD_S,
+            name=request.name,
+            etve=etve,
+            validation=validation,
             fit_until_s=None if request.fit_until_h is None else request.fit_until_h * 3600.0,
-            provenance=provenance(request), remarks=remarks, told=told,
-        )  # fmt: skip
-    return write(
-        calibration, criticise(calibration), request.out, reference=request.reference, also=request.page
-    )  # fmt: skip
+            provenance=provenance(request),
+            remarks=remarks,
+            progress=progress,
+        )
+    return write(calibration, criticise(calibration), request.out, reference=request.reference, also=request.page)
 
 
 def _checked(page: Path | None) -> Path | None:

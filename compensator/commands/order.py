@@ -11,7 +11,7 @@ import msgspec
 from compensator.commands import Answer
 from compensator.config import Zenoh, load_config
 from compensator.errors import ServiceError, UsageError
-from compensator.service.asking import ask, operator_of_file
+from compensator.service.command_client import ask, operator_of_file
 
 
 def zero(arguments: argparse.Namespace) -> Answer:

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def progress(words: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on a terminal; yield what it is told with: steps done, of how many."""
+def progress_bar(words: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar on a terminal; yield what reports its progress: steps done, of how many."""
     from rich.console import Console
     from rich.progress import Progress
 

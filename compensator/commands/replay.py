@@ -8,15 +8,15 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from compensator.atomic_write import whole_file
 from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_file
-from compensator.commands.progress import progress
+from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
 from compensator.model.model_file import load_model
-from compensator.whole import whole_file
 
 if TYPE_CHECKING:
     from compensator.report.page import Page
@@ -53,8 +53,8 @@ def run(arguments: argparse.Namespace) -> Answer:
         # The workers look for the same files, from other folders.
         paths, public_key = [path.resolve() for path in paths], public_key and public_key.resolve()
     worth = len(paths) if sum(path.stat().st_size for path in paths if path.exists()) > ALONE else 1
-    with progress("auditing") as told, workers(worth, arguments.scheduler) as executor:
-        found = audit(paths, public_key=public_key, told=told, executor=executor)
+    with progress_bar("auditing") as progress, workers(worth, arguments.scheduler) as executor:
+        found = audit(paths, public_key=public_key, progress=progress, executor=executor)
     answer = Answer(found.as_json(), summary(found), 0 if found.clean else FOUND)
     if page is None:
         return answer
@@ -70,12 +70,12 @@ def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) 
         from compensator.audit.pages import Curves
 
         curves = Curves()
-    with progress("comparing") as told, whole_file(out) if out else nullcontext() as file:
+    with progress_bar("comparing") as progress, whole_file(out) if out else nullcontext() as file:
         row = None
         if file is not None:
             row = csv.writer(file, lineterminator="\n").writerow
             row(COLUMNS)
-        found = compare(paths, model, told=told, row=row, point=curves.add if curves is not None else None)
+        found = compare(paths, model, progress=progress, row=row, point=curves.add if curves is not None else None)
     text = found.text() + (f"\nboth offsets: {out}" if out else "")
     answer = Answer(found.as_json() | ({"out": str(out)} if out else {}), text)
     if page is None or curves is None:

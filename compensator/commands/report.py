@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from compensator.commands import Answer
-from compensator.commands.progress import progress
+from compensator.commands.progress import progress_bar
 from compensator.errors import UsageError
 
 
@@ -33,8 +33,8 @@ def _recordings(paths: Sequence[Path], out: Path) -> Answer:
     from compensator.report.gathering import read_history
     from compensator.report.recordings import figures, page_of, verdict
 
-    with progress("reading") as told:
-        history = read_history(paths, told=told)
+    with progress_bar("reading") as progress:
+        history = read_history(paths, progress=progress)
     write(out, page_of(history))
     return Answer({**figures(history), "report": str(out)}, f"{verdict(history)}\npage: {out}")
 

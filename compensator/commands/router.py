@@ -89,8 +89,10 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
         log.warning("%s: warning: %s", path, caution.marked)
         return
     if access.get("default_permission") != "deny":
-        raise ConfigError(f"{path}: access_control/default_permission = {access.get('default_permission')!r}, expected "
-                          f"deny: one rule that is missing would open everything")  # fmt: skip
+        raise ConfigError(
+            f"{path}: access_control/default_permission = {access.get('default_permission')!r}, expected "
+            f"deny: one rule that is missing would open everything"
+        )
     named = any(subject.get("cert_common_names") for subject in access.get("subjects") or [])
     if not named:
         return
@@ -98,8 +100,9 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
         raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true; the list goes by certificates")
     for endpoint in endpoints:
         if not endpoint.startswith(_SECURED):
-            raise ConfigError(f"{path}: listen/endpoints: {endpoint!r}, expected tls/HOST:PORT; the access list goes "
-                              f"by certificates")  # fmt: skip
+            raise ConfigError(
+                f"{path}: listen/endpoints: {endpoint!r}, expected tls/HOST:PORT; the access list goes by certificates"
+            )
 
 
 async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None:

@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from compensator.atomic_write import whole_file
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_file
-from compensator.identify.screening import DEAD_SAMPLES, check_scale
+from compensator.data.record import Record, require
+from compensator.data.screening import DEAD_SAMPLES, check_scale
+from compensator.data.tables import load_data, roles_of
 from compensator.model.model_file import load_model
+from compensator.model.simulation import csv_rows, scores, simulate
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Caution
-from compensator.simulation import csv_rows, scores, simulate
-from compensator.tables import Record, load_data, require, roles_of
-from compensator.whole import whole_file
 
 log = logging.getLogger("compensator")
 

@@ -145,8 +145,12 @@ class _Watch:
 
     def status(self) -> dict[str, Any]:
         """Return how the watch itself is."""
-        return {"connected": self._connected, "where": self._source.where, "prefix": self._source.prefix,
-                "ignored": self._shop.ignored}  # fmt: skip
+        return {
+            "connected": self._connected,
+            "where": self._source.where,
+            "prefix": self._source.prefix,
+            "ignored": self._shop.ignored,
+        }
 
     def show(self, *, terminal: bool, lines: bool) -> None:
         """Draw on the terminal, or write a line for each change, until it is stopped."""
@@ -170,7 +174,14 @@ class _Watch:
         with Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
                 live.update(
-                    view(self._shop, prefix=self._source.prefix, where=self._source.where, connected=self._connected,
-                         console=console), refresh=True)  # fmt: skip
+                    view(
+                        self._shop,
+                        prefix=self._source.prefix,
+                        where=self._source.where,
+                        connected=self._connected,
+                        console=console,
+                    ),
+                    refresh=True,
+                )
                 if self._stopped.wait(REFRESH_S):
                     return

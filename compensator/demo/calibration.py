@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.commands.identify import Request, identify
 from compensator.demo.machine import MACHINES
 from compensator.identify.settings import Settings
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
-
-Vector = npt.NDArray[np.float64]
 
 PERIOD_S = 60.0
 CALIBRATION_H = 36.0

@@ -27,9 +27,12 @@ class LateClock:
     """
 
     def __init__(
-        self, behind_s: float, on_advance: Callable[[float], Awaitable[None]], on_time: Callable[[], None],
+        self,
+        behind_s: float,
+        on_advance: Callable[[float], Awaitable[None]],
+        on_time: Callable[[], None],
         wall: Clock | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._wall: Clock = wall or SystemClock()
         self._start_ns = self._now_ns = self._wall.monotonic_ns() - round(behind_s * NS)
         # Kept, so that time stands still while work is done.

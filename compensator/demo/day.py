@@ -18,25 +18,22 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 import zenoh
 from rich.console import Console
 from rich.progress import Progress
 
+from compensator.arrays import Vector
 from compensator.clock import NS, VirtualClock
 from compensator.config import Zenoh, load_config
 from compensator.demo.machine import MACHINES, configuration, hardware
 from compensator.errors import ServiceError
 from compensator.messages import Offset
-from compensator.service.asking import ask
+from compensator.service.command_client import ask
 from compensator.service.compensation import Outcome
 from compensator.service.composition import run_service
 from compensator.service.session import session_config
 from sim_hardware.physics import Duty, World, usual_sensors
 from sim_hardware.physics.effects.base import Effect
-
-Vector = npt.NDArray[np.float64]
 
 #: 2026-01-05 06:00 UTC, a Monday's early shift.
 START_NS = 1_767_592_800 * NS
@@ -70,9 +67,15 @@ class Day:
 
 
 def run_day(
-    folder: Path, *, machine: str, hours: float, seed: int, model: str = "quill", effects: Sequence[Effect] = (),
+    folder: Path,
+    *,
+    machine: str,
+    hours: float,
+    seed: int,
+    model: str = "quill",
+    effects: Sequence[Effect] = (),
     adopt: Path | None = None,
-) -> Day:  # fmt: skip
+) -> Day:
     """Run one simulated machine through its devices, the service, disk and Zenoh.
 
     Parameters
@@ -133,9 +136,12 @@ def run_day(
 
             asyncio.run(_serve(config, clock, samples, took, received, port))
     return Day(
-        outcomes=outcomes, received=received, truth=world.history(), seconds=time.perf_counter() - began,
+        outcomes=outcomes,
+        received=received,
+        truth=world.history(),
+        seconds=time.perf_counter() - began,
         adopted_at=_adopted_at(outcomes) if adopt is not None else 0,
-    )  # fmt: skip
+    )
 
 
 def _ask_to_adopt(config: Path, model: Path) -> dict[str, Any] | None:

@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.demo.day import START_NS, Day
 from compensator.messages import number
+from compensator.model.simulation import scores
 from compensator.report.demonstration import MachineDay
-from compensator.simulation import scores
-
-Vector = npt.NDArray[np.float64]
 
 
 def errors_of(day: Day) -> dict[str, Vector]:
@@ -28,9 +26,11 @@ def errors_of(day: Day) -> dict[str, Vector]:
     value = np.array([number(o.offset.y_offset_um) for o in day.outcomes])[index]
     rate = np.array([number(o.offset.y_offset_rate_um_per_min) for o in day.outcomes])[index]
     return {
-        "t_h": t / 3600.0, "without": y, "held": y + value,
+        "t_h": t / 3600.0,
+        "without": y,
+        "held": y + value,
         "followed": y + value + rate * (t - np.array(offsets)[index]) / 60.0,
-    }  # fmt: skip
+    }
 
 
 def figures_of(day: Day, errors: Mapping[str, Vector]) -> dict[str, Any]:
@@ -46,10 +46,13 @@ def figures_of(day: Day, errors: Mapping[str, Vector]) -> dict[str, Any]:
         for name in ("without", "held", "followed")
     }
     part |= {
-        "samples": len(day.outcomes), "received": len(day.received), "seconds": round(day.seconds, 1),
-        "fit_pct": fit.fit_pct, "removed_pct": 100.0 * (1.0 - float(np.std(still)) / float(np.std(errors["without"]))),
+        "samples": len(day.outcomes),
+        "received": len(day.received),
+        "seconds": round(day.seconds, 1),
+        "fit_pct": fit.fit_pct,
+        "removed_pct": 100.0 * (1.0 - float(np.std(still)) / float(np.std(errors["without"]))),
         "states": {s: sum(o.offset.state == s for o in day.outcomes) for s in {o.offset.state for o in day.outcomes}},
-    }  # fmt: skip
+    }
     return part
 
 
@@ -59,9 +62,11 @@ def shown(name: str, day: Day) -> MachineDay:
     heat = [number(o.estimate.heat_w) for o in day.outcomes]
     errors = errors_of(day)
     return MachineDay(
-        name=name, figures=figures_of(day, errors), errors=errors,
+        name=name,
+        figures=figures_of(day, errors),
+        errors=errors,
         heat=(day.truth["t_s"] / 3600.0, day.truth["heat_w"], np.array(hours), np.array(heat)),
-    )  # fmt: skip
+    )
 
 
 def table(results: Mapping[str, Any]) -> list[list[str]]:
@@ -74,11 +79,17 @@ def table(results: Mapping[str, Any]) -> list[list[str]]:
             ("followed", "rate followed"),
         ):
             first = key == "without"
-            rows.append([
-                machine if first else "", words, f"{figures[key]['rms_um']:.2f}",
-                f"{figures[key]['peak_to_peak_um']:.2f}", f"{figures['fit_pct']:.1f}" if key == "followed" else "",
-                str(figures["samples"]) if first else "", f"{figures['seconds']:.1f}" if first else "",
-            ])  # fmt: skip
+            rows.append(
+                [
+                    machine if first else "",
+                    words,
+                    f"{figures[key]['rms_um']:.2f}",
+                    f"{figures[key]['peak_to_peak_um']:.2f}",
+                    f"{figures['fit_pct']:.1f}" if key == "followed" else "",
+                    str(figures["samples"]) if first else "",
+                    f"{figures['seconds']:.1f}" if first else "",
+                ]
+            )
     return rows
 
 

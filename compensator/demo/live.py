@@ -106,7 +106,7 @@ def _clear(recordings: Path) -> None:
 
 async def _serve(
     config: Path, world: World, devices: Hardware, hours: float, explain: Callable[[], None], typed: IO[str]
-) -> None:  # fmt: skip
+) -> None:
     loop = asyncio.get_running_loop()
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
         bar = progress.add_task("the hours before now", total=hours * 3600.0)

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.commands.diagnose import diagnose_files
 from compensator.demo.calibration import PERIOD_S
 from compensator.demo.day import run_day
@@ -17,15 +17,11 @@ from compensator.model.model_file import load_model
 from compensator.model.model_writer import dump_model
 from sim_hardware.physics import draw_effect
 
-Vector = npt.NDArray[np.float64]
-
 #: About how much the undeclared effect moves Y, µm standard deviation.
 EFFECT_UM = 5.0
 
 
-def close_the_loop(
-    folder: Path, *, hours: float, seed: int
-) -> tuple[dict[str, Any], dict[str, tuple[Vector, Vector]]]:  # fmt: skip
+def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], dict[str, tuple[Vector, Vector]]]:
     """Let an effect act that the calibration never saw, find it in the service's own recordings, and run with it.
 
     The effect is drawn by the seed and sealed: nothing here knows what it is until the table is written.
@@ -54,10 +50,17 @@ def close_the_loop(
     # A model that was left as it was: there is nothing to take over.
     adopt = extended if _acting(extended) != _acting(first_model) else None
     days = {
-        name: run_day(folder / f"second-day-{name}", machine="conduction", hours=hours, seed=seed + 2, model=first,
-                      effects=[effect], adopt=model)
+        name: run_day(
+            folder / f"second-day-{name}",
+            machine="conduction",
+            hours=hours,
+            seed=seed + 2,
+            model=first,
+            effects=[effect],
+            adopt=model,
+        )
         for name, model in (("first", None), ("extended", adopt))
-    }  # fmt: skip
+    }
     adopted_h = days["extended"].adopted_at * PERIOD_S / 3600.0
     errors, curves = {}, {}
     for name, day in days.items():
@@ -69,12 +72,14 @@ def close_the_loop(
     return {
         "drawn": " ".join(str(drawn[key]) for key in ("kind", "path", "channel") if drawn.get(key)),
         "found": [" ".join(filter(None, (e["kind"], e["path"], e["channel"]))) for e in found["effects"]],
-        "verdict": found["verdict"], "report": found["report"],
+        "verdict": found["verdict"],
+        "report": found["report"],
         "explanation": [e["explanation"] for e in found["effects"]],
         "held_out_rms_um": {"before": found["before"]["rms_um"], "after": found["after"]["rms_um"]},
-        "adopted": adopt is not None, "adopted_after_h": adopted_h,
+        "adopted": adopt is not None,
+        "adopted_after_h": adopted_h,
         "second_day_rms_um": {name: float(np.std(values)) for name, values in errors.items()},
-    }, curves  # fmt: skip
+    }, curves
 
 
 def _acting(model: Path) -> str:

@@ -57,23 +57,35 @@ def hardware(world: World) -> Iterator[Hardware]:
         cabinet = IcpDas("et-7018z", couples="T", sources={0: source("at_degc")})
         rtu = rack.add(ModbusRtuLine({1: spindle}))
         tcp = rack.add(ModbusTcpServer({1: cabinet}))
-        plc = rack.add(ModbusTcpServer({1: RegisterMap({
-            0: Register(source=source("spindle_rpm")),
-            1: Register(source=source("coolant_degc"), per_unit=100.0),
-        })}))  # fmt: skip
+        plc = rack.add(
+            ModbusTcpServer(
+                {
+                    1: RegisterMap(
+                        {
+                            0: Register(source=source("spindle_rpm")),
+                            1: Register(source=source("coolant_degc"), per_unit=100.0),
+                        }
+                    )
+                }
+            )
+        )
         dcon = rack.add(DconLine({2: IcpDas("m-7018r", couples="K", sources={0: source("base_degc")})}))
         capa = rack.add(CapaNcdt({1: lambda: PROBE_RANGE_UM / 2 + source("y_um")()}, PROBE_RANGE_UM))
         lines = {
-            "rtu": rtu.port, "tcp": tcp.port, "plc": plc.port, "dcon": dcon.port,
-            "data": capa.data_port, "command": capa.command_port,
-        }  # fmt: skip
+            "rtu": rtu.port,
+            "tcp": tcp.port,
+            "plc": plc.port,
+            "dcon": dcon.port,
+            "data": capa.data_port,
+            "command": capa.command_port,
+        }
         faults = {"t_q": (spindle.faults, 0), "at": (cabinet.faults, 0), "y": (capa.faults, 1)}
         yield Hardware(lines, capa, faults)
 
 
 def configuration(
     machine: str, lines: Mapping[str, Any], zenoh_port: int, model: str = "quill", *, prefix: str = "shop/sim"
-) -> str:  # fmt: skip
+) -> str:
     """Write the configuration of the simulated machine, as an engineer would write it."""
     return f"""# Configuration of a simulated machine.
 [machine]

@@ -7,14 +7,15 @@ again without it, and what that finds is applied to the block.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import repeat
 
 import numpy as np
-import numpy.typing as npt
 
-from compensator.diagnose.anew import FAR_OFF, diagnose_anew, is_far_off
+from compensator.arrays import Vector
+from compensator.data.runs import Run
+from compensator.diagnose.base_refit import FAR_OFF, diagnose_anew, is_far_off
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.joint import Part, response, standard_errors, summed
 from compensator.diagnose.outcome import (
@@ -24,35 +25,27 @@ from compensator.diagnose.outcome import (
     RIVAL_TIMES,
     Diagnosis,
     Effect,
-    Mapped,
     Rival,
     Verdict,
     how_to_tell_apart,
     rms_of,
     table_of,
     warnings_of,
-)  # fmt: skip
+)
 from compensator.diagnose.search import Found, Search, Tried
-from compensator.identify.runs import Run
 from compensator.model.effects.unobserved import Unobserved
+from compensator.model.simulation import scores
 from compensator.model.thermal_model import ThermalModel
+from compensator.progress import ExecutorMap, Progress, unreported
 from compensator.reasons import Caution
-from compensator.simulation import scores
-
-Vector = npt.NDArray[np.float64]
-Told = Callable[[int, int], None]
 
 #: A model whose paths were fitted anew is taken instead of a search's answer where it leaves no more than this share.
 ANEW_LEAVES = 0.5
 
 
-def _silent(done: int, total: int) -> None:
-    """Tell nobody."""
-
-
 def diagnose(
-    model: ThermalModel, runs: Sequence[Run], *, told: Told = _silent, mapped: Mapped = map
-) -> Diagnosis:  # fmt: skip
+    model: ThermalModel, runs: Sequence[Run], *, progress: Progress = unreported, executor_map: ExecutorMap = map
+) -> Diagnosis:
     """Find what a model lacks.
 
     Parameters
@@ -61,9 +54,9 @@ def diagnose(
         The base model.
     runs : sequence of Run
         Measured data with y and every channel that was logged.
-    told : callable
-        Is told how many searches of how many are done.
-    mapped : callable
+    progress : callable
+        Called with how many searches of how many are done.
+    executor_map : callable
         Does the searches for the held-out blocks: `map`, or that of an executor.
 
     Raises
@@ -72,14 +65,14 @@ def diagnose(
         If there is too little data.
     """
     evidence = evidence_of(model, runs)
-    told(0, FOLDS + 1)
+    progress(0, FOLDS + 1)
     if is_far_off(model, evidence):
-        return diagnose_anew(model, evidence, told, mapped)
-    searched = _by_search(model, evidence, told, mapped)
+        return diagnose_anew(model, evidence, progress, executor_map)
+    searched = _by_search(model, evidence, progress, executor_map)
     if not _doubtful(searched, evidence):
         return searched
     # What was found in the residual holds nowhere else, or nothing was: perhaps the paths themselves are bent.
-    anew = diagnose_anew(model, evidence, told, mapped)
+    anew = diagnose_anew(model, evidence, progress, executor_map)
     better = rms_of(anew.held_out_after) < ANEW_LEAVES * rms_of(searched.held_out_before)
     return anew if anew.effects and better else searched
 
@@ -91,9 +84,9 @@ def _doubtful(searched: Diagnosis, evidence: Evidence) -> bool:
     return searched.verdict == "unexplained" and rms_of(searched.held_out_before) > FAR_OFF * evidence.spread_um
 
 
-def _by_search(model: ThermalModel, evidence: Evidence, told: Told, mapped: Mapped) -> Diagnosis:
+def _by_search(model: ThermalModel, evidence: Evidence, progress: Progress, executor_map: ExecutorMap) -> Diagnosis:
     found = Search(evidence).run()
-    before, after = _held_out(evidence, found, told, mapped)
+    before, after = _held_out(evidence, found, progress, executor_map)
     helps = rms_of(after) <= rms_of(before)
     everything = _effects(evidence, found)
     effects = tuple(effect for effect in everything if not effect.part.companion)
@@ -105,20 +98,27 @@ def _by_search(model: ThermalModel, evidence: Evidence, told: Told, mapped: Mapp
         extended = dataclasses.replace(extended, y_std_um=_stated(model, rms_of(after), evidence.noise_um, kept_out))
     y = evidence.y_um
     return Diagnosis(
-        verdict=_verdict(evidence, found, helps=helps), effects=effects,
-        before=scores(y, y - before), after=scores(y, y - after), held_out=HELD_OUT,
-        noise_floor_um=evidence.noise_um, model=extended, evidence=evidence,
+        verdict=_verdict(evidence, found, helps=helps),
+        effects=effects,
+        before=scores(y, y - before),
+        after=scores(y, y - after),
+        held_out=HELD_OUT,
+        noise_floor_um=evidence.noise_um,
+        model=extended,
+        evidence=evidence,
         residual_before=np.where(evidence.used, found.before.residual, np.nan),
-        residual_after=np.where(evidence.used, found.joint.residual, np.nan), held_out_before=before,
-        held_out_after=after, tried=_tried(found, evidence),
+        residual_after=np.where(evidence.used, found.joint.residual, np.nan),
+        held_out_before=before,
+        held_out_after=after,
+        tried=_tried(found, evidence),
         warnings=(*warnings_of(effects, before, after), *_rounded(everything)),
-    )  # fmt: skip
+    )
 
 
 # ---------------------------------------------------------------------------- held out
 
 
-def _held_out(evidence: Evidence, found: Found, told: Told, mapped: Mapped) -> tuple[Vector, Vector]:
+def _held_out(evidence: Evidence, found: Found, progress: Progress, executor_map: ExecutorMap) -> tuple[Vector, Vector]:
     """Return the residual before and after on every block, each by a search that did not see it.
 
     Whether a run's initial state is taken as unknown or as rest is what serves the first model better.
@@ -127,14 +127,14 @@ def _held_out(evidence: Evidence, found: Found, told: Told, mapped: Mapped) -> t
     hidden = [isinstance(part.hypothesis, Unobserved) for part in found.joint.parts]
     before = {rest: np.full(raw.size, np.nan) for rest in (True, False)}
     after = {rest: np.full(raw.size, np.nan) for rest in (True, False)}
-    told(1, FOLDS + 1)
+    progress(1, FOLDS + 1)
     blocks = list(evidence.blocks(FOLDS))
     views = [evidence.hidden(block) for block in blocks]
     # Nobody knows what a hidden source does in a block that was not seen.
     unknown = bool(hidden) and all(hidden)
-    found_without = repeat(nothing) if unknown else mapped(partial(_found_in, hidden=any(hidden)), views)
+    found_without = repeat(nothing) if unknown else executor_map(partial(_found_in, hidden=any(hidden)), views)
     for done, (block, seen, effects) in enumerate(zip(blocks, views, found_without, strict=False), start=2):
-        told(done, FOLDS + 1)
+        progress(done, FOLDS + 1)
         for rest in (True, False):
             before[rest][block] = seen.left(raw, nothing, at_rest=rest)[block]
             after[rest][block] = seen.left(raw, effects, at_rest=rest)[block]
@@ -163,11 +163,15 @@ def _effects(evidence: Evidence, found: Found) -> tuple[Effect, ...]:
         rms = float(np.std(wave[evidence.used]))
         effects.append(
             Effect(
-                part=part, std=std, explanation=part.hypothesis.explain(part.named, rms),
-                rms_before_um=float(np.sqrt(without @ without / count)), rms_after_um=after, wave=wave,
+                part=part,
+                std=std,
+                explanation=part.hypothesis.explain(part.named, rms),
+                rms_before_um=float(np.sqrt(without @ without / count)),
+                rms_after_um=after,
+                wave=wave,
                 rivals=_rivals(found.rivals[i], part, after, count),
             )
-        )  # fmt: skip
+        )
     return tuple(sorted(effects, key=lambda e: -e.rms_before_um))
 
 

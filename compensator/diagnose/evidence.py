@@ -14,20 +14,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import lfilter
 
+from compensator.arrays import Mask, Matrix, Vector
+from compensator.data.runs import Run, noise_std
 from compensator.errors import DataError
 from compensator.identify.output_error import low_frequency_ratio
-from compensator.identify.runs import Run, noise_std
-from compensator.model.effects.hypothesis import Setting, Waves
+from compensator.model.effects.hypothesis import Setting, RecordSignals
 from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
-
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 #: An initial state moves y by no more than about this many times its spread, with the weight of one sample.
 STATE_PRIOR = 1e-3
@@ -53,7 +49,7 @@ class Evidence:
     ----------
     runs : tuple of Run
         Measured data.
-    waves : tuple of Waves
+    waves : tuple of RecordSignals
         Signals of the base model on each run.
     residual : numpy.ndarray, shape (n,)
         Of all runs, one after another, µm; 0 where it is not used.
@@ -72,7 +68,7 @@ class Evidence:
     """
 
     runs: tuple[Run, ...]
-    waves: tuple[Waves, ...]
+    waves: tuple[RecordSignals, ...]
     residual: Vector
     used: Mask
     nuisances: Matrix
@@ -168,18 +164,22 @@ class Evidence:
         return max(1.0, low_frequency_ratio(self.parts(values)))
 
 
-def waves_of(model: ThermalModel, run: Run) -> Waves:
+def waves_of(model: ThermalModel, run: Run) -> RecordSignals:
     """Run the base model's paths over a run, the heat by the plain inverse: without lag, and linear."""
     drive = run.difference_k
     if model.ttf is not None:
         drive = np.asarray(lfilter(model.ttf.sampled.a, model.ttf.sampled.b, drive))
     tdtf = model.tdtf.sampled if model.tdtf else SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=model.period_s)
-    return Waves(
-        period_min=model.period_s / 60.0, drive=drive, ambient_k=run.ambient_k,
-        y_dtf_um=model.dtf.sampled.response(drive), y_tdtf_um=tdtf.response(run.ambient_k),
+    return RecordSignals(
+        period_min=model.period_s / 60.0,
+        drive=drive,
+        ambient_k=run.ambient_k,
+        y_dtf_um=model.dtf.sampled.response(drive),
+        y_tdtf_um=tdtf.response(run.ambient_k),
         channels={name: values for name, values in run.channels.items() if np.isfinite(values).all()},
-        dtf=model.dtf.sampled, tdtf=tdtf,
-    )  # fmt: skip
+        dtf=model.dtf.sampled,
+        tdtf=tdtf,
+    )
 
 
 def effects_of(model: ThermalModel, run: Run) -> Vector:
@@ -222,9 +222,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     own = float(np.sqrt(max(float(folds) ** 2 - noise_um**2, 0.0))) if isinstance(folds, float) else 0.0
     # A calibration that misses by more than this has not merely an error of its own, it lacks something.
     own = min(own, OWN_SHARE * float(np.nanstd(_measured(runs))))
-    return gathered(
-        runs, waves, residual, used, _setting(model, runs, waves), noise_um=noise_um, own_error_um=own
-    )  # fmt: skip
+    return gathered(runs, waves, residual, used, _setting(model, runs, waves), noise_um=noise_um, own_error_um=own)
 
 
 def _measured(runs: Sequence[Run]) -> Vector:
@@ -232,9 +230,15 @@ def _measured(runs: Sequence[Run]) -> Vector:
 
 
 def gathered(
-    runs: Sequence[Run], waves: Sequence[Waves], residual: Vector, used: Mask, setting: Setting, *, noise_um: float,
+    runs: Sequence[Run],
+    waves: Sequence[RecordSignals],
+    residual: Vector,
+    used: Mask,
+    setting: Setting,
+    *,
+    noise_um: float,
     own_error_um: float,
-) -> Evidence:  # fmt: skip
+) -> Evidence:
     """Put runs and their residual together with the basis of their nuisances."""
     blocks = [_nuisances(wave, setting) for wave in waves]
     sizes = [wave.size for wave in waves]
@@ -247,12 +251,19 @@ def gathered(
     u, s, _ = np.linalg.svd(seen, full_matrices=False)
     basis = u[:, s > STATE_PRIOR * s[0]]
     return Evidence(
-        runs=tuple(runs), waves=tuple(waves), residual=np.where(used, residual, 0.0), used=used, nuisances=table,
-        basis=basis, setting=setting, noise_um=noise_um, own_error_um=own_error_um,
-    )  # fmt: skip
+        runs=tuple(runs),
+        waves=tuple(waves),
+        residual=np.where(used, residual, 0.0),
+        used=used,
+        nuisances=table,
+        basis=basis,
+        setting=setting,
+        noise_um=noise_um,
+        own_error_um=own_error_um,
+    )
 
 
-def _nuisances(wave: Waves, setting: Setting) -> Matrix:
+def _nuisances(wave: RecordSignals, setting: Setting) -> Matrix:
     """Return a constant and the decay of every mode, each of size 1."""
     minutes = np.arange(wave.size) * wave.period_min
     taus: list[float] = []
@@ -262,7 +273,7 @@ def _nuisances(wave: Waves, setting: Setting) -> Matrix:
     return np.column_stack([np.ones(wave.size), *(np.exp(-minutes / tau) for tau in taus)])
 
 
-def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -> Setting:
+def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[RecordSignals]) -> Setting:
     common = [name for name in waves[0].channels if all(name in wave.channels for wave in waves)]
     moving, zeroed = {}, set()
     for name in common:
@@ -275,8 +286,11 @@ def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -
                 zeroed.add(name)
     paths = {"DTF": model.dtf, "TDTF": model.tdtf}
     return Setting(
-        channels=tuple(moving), has_ambient=model.tdtf is not None, has_ttf=model.ttf is not None,
-        minutes=max(wave.size for wave in waves) * waves[0].period_min, period_min=waves[0].period_min,
+        channels=tuple(moving),
+        has_ambient=model.tdtf is not None,
+        has_ttf=model.ttf is not None,
+        minutes=max(wave.size for wave in waves) * waves[0].period_min,
+        period_min=waves[0].period_min,
         sizes_um={
             "DTF": max(float(np.ptp(wave.y_dtf_um)) for wave in waves),
             "TDTF": max(float(np.ptp(wave.y_tdtf_um)) for wave in waves),
@@ -286,10 +300,11 @@ def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[Waves]) -
             for name, path in paths.items()
             if path is not None
         },
-        spans=moving, zeroed=frozenset(zeroed),
+        spans=moving,
+        zeroed=frozenset(zeroed),
         rough="folds_rms_um" in model.provenance,
         functions={name: (path.sampled.b, path.sampled.a) for name, path in paths.items() if path is not None},
-    )  # fmt: skip
+    )
 
 
 def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:

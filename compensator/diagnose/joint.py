@@ -7,14 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.model.effects.hypothesis import Free, Hypothesis
-
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,11 +171,14 @@ def fit_joint(
     begin = [v for _, values in starts for v in values]
     x = np.array([to_search(free, v) for free, v in zip(problem.free, begin, strict=True)])
     if x.size:
-        low, high = (np.array([to_search(free, bound) for free, bound in
-                               ((f, getattr(f, side)) for f in problem.free)]) for side in ("low", "high"))  # fmt: skip
+        low, high = (
+            np.array([to_search(free, bound) for free, bound in ((f, getattr(f, side)) for f in problem.free)])
+            for side in ("low", "high")
+        )
         inside = np.clip(x, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
-        found = least_squares(problem.fun, inside, bounds=(low, high), diff_step=1e-4, xtol=1e-6, ftol=1e-7,
-                              max_nfev=evaluations)  # fmt: skip
+        found = least_squares(
+            problem.fun, inside, bounds=(low, high), diff_step=1e-4, xtol=1e-6, ftol=1e-7, max_nfev=evaluations
+        )
         x = np.asarray(found.x)
     residual, amplitudes = problem.solve(x)
     residual = np.where(evidence.used, residual, 0.0)

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.joint import Part
+from compensator.model.simulation import Scores
 from compensator.model.thermal_model import EffectTable, ThermalModel
 from compensator.reasons import Caution
-from compensator.simulation import Scores
 
-Vector = npt.NDArray[np.float64]
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 
 #: Blocks that are held out in turn, and how that is told.
 FOLDS = 3
-#: What does a function for each of some values, like `map`: here, or side by side.
-Mapped = Callable[..., Iterable[Any]]
 HELD_OUT = (
     f"each of {FOLDS} blocks of time predicted after choosing and fitting on the others; zero and initial state from "
     "the others, too"
@@ -174,6 +171,4 @@ def table_of(effect: Effect) -> EffectTable:
     """Return an effect as the model file holds it."""
     part = effect.part
     table: dict[str, Any] = part.hypothesis.table(part.values, part.amplitudes)
-    return EffectTable(
-        kind=part.hypothesis.kind, table={**table, "std": effect.std, "explanation": effect.explanation}
-    )  # fmt: skip
+    return EffectTable(kind=part.hypothesis.kind, table={**table, "std": effect.std, "explanation": effect.explanation})

@@ -20,16 +20,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Indices, Mask, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.joint import Part
 from compensator.model.effects.hypothesis import ROW, lag_pole, row
 from compensator.model.effects.input import RowHypothesis, rows
 from compensator.model.transfer_function import SampledTransferFunction
-
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
 
 #: Weight of the ridge, as a share of the samples.
 RIDGE = 0.03
@@ -153,18 +150,18 @@ class _Fitting:
         self.blocks = [self._grams(mask) for mask in self._masks()]
         self.all = self._grams([evidence.used])
 
-    def _masks(self) -> list[list[npt.NDArray[np.bool_]]]:
+    def _masks(self) -> list[list[Mask]]:
         hours = self.evidence.count * self.evidence.setting.period_min / 60.0
         return [list(self.evidence.blocks(max(2, round(hours / length)))) for length in BLOCKS_H]
 
-    def _grams(self, masks: Sequence[npt.NDArray[np.bool_]]) -> list[tuple[Matrix, Vector, float, int]]:
+    def _grams(self, masks: Sequence[Mask]) -> list[tuple[Matrix, Vector, float, int]]:
         found = []
         for mask in masks:
             x, y = self.table[mask], self.y[mask]
             found.append((x.T @ x, x.T @ y, float(y @ y), int(mask.sum())))
         return found
 
-    def columns_of(self, chosen: Sequence[RowHypothesis]) -> npt.NDArray[np.int_]:
+    def columns_of(self, chosen: Sequence[RowHypothesis]) -> Indices:
         """Return which columns a fit has: zeros and paths, then each channel's."""
         at = [np.arange(self.base)]
         for hypothesis in chosen:
@@ -210,14 +207,18 @@ class _Fitting:
             parts.append(Part(hypothesis=hypothesis, values=(), amplitudes=tuple(gains[own].tolist())))
             std.append(_jackknife(parts[-1], [other[own] for other in others]))
         paths = [
-            self._function(gains[first : first + ROW])
-            for first in range(len(self.evidence.waves), self.base, ROW)
-        ]  # fmt: skip
+            self._function(gains[first : first + ROW]) for first in range(len(self.evidence.waves), self.base, ROW)
+        ]
         return Refit(
-            parts=tuple(parts), std=tuple(std), dtf=paths[0], tdtf=paths[1] if len(paths) > 1 else None,
+            parts=tuple(parts),
+            std=tuple(std),
+            dtf=paths[0],
+            tdtf=paths[1] if len(paths) > 1 else None,
             predicted=self.table[:, at] @ w,
-            by_paths=self.table[:, : self.base] @ self.weights([], RIDGE), rms_um=errors, rivals=rivals,
-        )  # fmt: skip
+            by_paths=self.table[:, : self.base] @ self.weights([], RIDGE),
+            rms_um=errors,
+            rivals=rivals,
+        )
 
     def _function(self, gains: Vector) -> SampledTransferFunction:
         """Return a row of lags as one transfer function."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +26,6 @@ from compensator.model.effects.dynamics import ChangedPaths, changed_paths
 from compensator.model.effects.hypothesis import Hypothesis, proposals
 from compensator.model.effects.unobserved import Unobserved
 
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
 Rough = npt.NDArray[np.float32]
 Start = tuple[Hypothesis, Sequence[float]]
 
@@ -45,8 +43,6 @@ FORM_LEAVES = 0.08
 HIDDEN_LEAVES = 0.5
 #: A residual with less colour than this is noise, and no hidden source is looked for in it.
 CLEAN = 1.3
-
-Told = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import Any
 from compensator.diagnose.joint import Part
 from compensator.diagnose.outcome import Diagnosis, Effect
 from compensator.identify.summary import with_std
-from compensator.simulation import Scores
+from compensator.model.simulation import Scores
 
 _VERDICTS = {
     "adequate": "The model is adequate: what is left is noise.",
@@ -36,8 +36,10 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
                 "parameters": {
                     name: {"value": value, "std": effect.std[name]} for name, value in effect.part.named.items()
                 },
-                "deployable": effect.deployable, "explanation": effect.explanation,
-                "rms_before_um": effect.rms_before_um, "rms_after_um": effect.rms_after_um,
+                "deployable": effect.deployable,
+                "explanation": effect.explanation,
+                "rms_before_um": effect.rms_before_um,
+                "rms_after_um": effect.rms_after_um,
             }
             for effect in diagnosis.effects
         ],
@@ -46,16 +48,23 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
             for effect in diagnosis.effects
             for rival in effect.rivals
         ],
-        "before": _scores(diagnosis.before), "after": _scores(diagnosis.after), "held_out": diagnosis.held_out,
-        "noise_floor_um": diagnosis.noise_floor_um, "warnings": list(map(str, diagnosis.warnings)),
+        "before": _scores(diagnosis.before),
+        "after": _scores(diagnosis.after),
+        "held_out": diagnosis.held_out,
+        "noise_floor_um": diagnosis.noise_floor_um,
+        "warnings": list(map(str, diagnosis.warnings)),
         "warning_codes": [warning.code for warning in diagnosis.warnings],
-    }  # fmt: skip
+    }
 
 
 def _place(part: Part) -> dict[str, Any]:
     hypothesis = part.hypothesis
-    return {"kind": hypothesis.kind, "path": hypothesis.path or None, "channel": hypothesis.channel or None,
-            "form": hypothesis.form}  # fmt: skip
+    return {
+        "kind": hypothesis.kind,
+        "path": hypothesis.path or None,
+        "channel": hypothesis.channel or None,
+        "form": hypothesis.form,
+    }
 
 
 def _scores(scores: Scores) -> dict[str, float | None]:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.model.effects.hypothesis import Free, lowpass
 from compensator.model.effects.unobserved import Unobserved
 
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
 Time = tuple[int, float]
 
 #: Most switchings looked for.
@@ -58,10 +56,12 @@ def switchings(evidence: Evidence, residual: Vector) -> tuple[Unobserved, tuple[
         return None
     found = tuple(sorted(best[2]))
     hypothesis = Unobserved(
-        form="switched", free=(Free(name="tau_min", low=tau.low, high=high, grid=()),),
-        amplitudes=tuple(f"size_{i}_um" for i in range(1, len(found) + 1)), times=found,
+        form="switched",
+        free=(Free(name="tau_min", low=tau.low, high=high, grid=()),),
+        amplitudes=tuple(f"size_{i}_um" for i in range(1, len(found) + 1)),
+        times=found,
         order=tuple(id(wave) for wave in evidence.waves),
-    )  # fmt: skip
+    )
     return hypothesis, (best[1],)
 
 

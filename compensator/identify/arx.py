@@ -13,12 +13,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from compensator.identify.output_error import Segment, Structure
 from compensator.model.transfer_function import SampledTransferFunction
-
-Vector = npt.NDArray[np.float64]
 
 
 def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: float) -> list[SampledTransferFunction]:

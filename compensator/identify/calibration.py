@@ -7,22 +7,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Mask, Vector
+from compensator.data.runs import Run, noise_std, walk_std
+from compensator.data.screening import screen
 from compensator.errors import DataError
 from compensator.identify.arx import free_run_rms
-from compensator.identify.choice import Told, silent
 from compensator.identify.deformation import DeformationFit, PathFit, fit_deformation
-from compensator.identify.runs import Run, noise_std, walk_std
-from compensator.identify.screening import screen
 from compensator.identify.settings import Settings
 from compensator.identify.temperature import TemperatureFit, fit_temperature
 from compensator.model.engine import Engine
+from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import PATH_UNITS, Estimator, Kind, Path, ThermalModel
-from compensator.simulation import Scores, scores
-
-Vector = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from compensator.progress import Progress, unreported
 
 #: Least noise that a temperature is taken to have, K: less than a converter's step is no knowledge.
 LEAST_NOISE_K = 0.005
@@ -126,11 +123,18 @@ class Calibration:
 
 
 def calibrate(
-    runs: Sequence[Run], settings: Settings, *, period_s: float, name: str, fit_until_s: float | None = None,
-    etve: Sequence[Run] = (), validation: Sequence[Run] = (), provenance: Mapping[str, Any] | None = None,
+    runs: Sequence[Run],
+    settings: Settings,
+    *,
+    period_s: float,
+    name: str,
+    fit_until_s: float | None = None,
+    etve: Sequence[Run] = (),
+    validation: Sequence[Run] = (),
+    provenance: Mapping[str, Any] | None = None,
     remarks: Sequence[str] = (),
-    told: Told = silent,
-) -> Calibration:  # fmt: skip
+    progress: Progress = unreported,
+) -> Calibration:
     """Make a thermal model of measured runs.
 
     Parameters
@@ -151,8 +155,8 @@ def calibrate(
         What goes into the model file beside the figures: files and their hashes.
     remarks : sequence of str
         What reading the data had to put right.
-    told : callable
-        Is told how many structures of how many are done.
+    progress : callable
+        Called with how many structures of how many are done.
 
     Returns
     -------
@@ -172,10 +176,11 @@ def calibrate(
         raise DataError(f"{data}: less than 2 h of samples left for the fit")
     temperature = None
     if kind == "heat":
-        temperature = fit_temperature(runs, _until(runs, fit_until_s), settings.ttf, period_s=period_s,
-                                      folds=settings.folds)  # fmt: skip
+        temperature = fit_temperature(
+            runs, _until(runs, fit_until_s), settings.ttf, period_s=period_s, folds=settings.folds
+        )
     drives = [_drive(run, temperature, settings) for run in runs]
-    deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, told=told)
+    deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
     chosen = next(c for c in deformation.candidates if c.chosen)
     noise = {
         "t_q_degc": max(LEAST_NOISE_K, *(noise_std(run.t_q_degc) for run in runs)),
@@ -183,20 +188,31 @@ def calibrate(
         "y_um": max(noise_std(run.y_um) for run in runs),
     }
     model = ThermalModel(
-        name=name, kind=kind, period_s=period_s,
+        name=name,
+        kind=kind,
+        period_s=period_s,
         ttf=_path("TTF", kind, PathFit.of("TTF", temperature.fit)) if temperature else None,
-        dtf=_path("DTF", kind, deformation.dtf), tdtf=_path("TDTF", kind, deformation.tdtf),
-        estimator=_estimator(runs, drives, noise, kind), validity=_validity(runs, used, kind),
+        dtf=_path("DTF", kind, deformation.dtf),
+        tdtf=_path("TDTF", kind, deformation.tdtf),
+        estimator=_estimator(runs, drives, noise, kind),
+        validity=_validity(runs, used, kind),
         y_std_um=float(np.sqrt(max(chosen.rms**2 - noise["y_um"] ** 2, (0.3 * noise["y_um"]) ** 2))),
         provenance=dict(provenance or {}),
-    )  # fmt: skip
+    )
     fixed = (temperature.remark,) if temperature and temperature.remark else ()
     return Calibration(
-        model=model, settings=settings, runs=tuple(runs), used=tuple(used), drives=tuple(drives),
-        temperature=temperature, deformation=deformation,
-        parts=tuple(_parts(model, deformation, runs, used, validation)), folds_rms_um=chosen.rms, noise=noise,
+        model=model,
+        settings=settings,
+        runs=tuple(runs),
+        used=tuple(used),
+        drives=tuple(drives),
+        temperature=temperature,
+        deformation=deformation,
+        parts=tuple(_parts(model, deformation, runs, used, validation)),
+        folds_rms_um=chosen.rms,
+        noise=noise,
         remarks=(*remarks, *fixed, *deformation.remarks),
-    )  # fmt: skip
+    )
 
 
 def _kind(runs: Sequence[Run], settings: Settings) -> Kind:
@@ -239,9 +255,12 @@ def _estimator(runs: Sequence[Run], drives: Sequence[Vector], noise: Mapping[str
     else:
         walk = walk_std(drives, max(noise_std(drive) for drive in drives))
     return Estimator(
-        method="kalman", t_q_noise_std_k=noise["t_q_degc"], at_noise_std_k=noise["at_degc"], drive_walk_std=walk,
+        method="kalman",
+        t_q_noise_std_k=noise["t_q_degc"],
+        at_noise_std_k=noise["at_degc"],
+        drive_walk_std=walk,
         at_walk_std_k=max(walk_std([run.ambient_k for run in runs], noise["at_degc"]), LEAST_AT_WALK_K),
-    )  # fmt: skip
+    )
 
 
 def _validity(runs: Sequence[Run], used: Sequence[Mask], kind: Kind) -> dict[str, tuple[float, float]]:
@@ -266,9 +285,12 @@ def _validity(runs: Sequence[Run], used: Sequence[Mask], kind: Kind) -> dict[str
 
 
 def _parts(
-    model: ThermalModel, deformation: DeformationFit, runs: Sequence[Run], used: Sequence[Mask],
+    model: ThermalModel,
+    deformation: DeformationFit,
+    runs: Sequence[Run],
+    used: Sequence[Mask],
     validation: Sequence[Run],
-) -> list[Part]:  # fmt: skip
+) -> list[Part]:
     parts = []
     for i, (run, mask) in enumerate(zip(runs, used, strict=True)):
         predicted = predict(model, run) + deformation.main.free_decay(i, run.t_s.size)
@@ -299,7 +321,12 @@ def _part(run: Run, predicted: Vector, mask: Mask, role: str) -> Part:
     start = float(np.mean(run.y_um[known[:5]]))
     held = float(run.y_um[before[-1]]) if before.size else start
     return Part(
-        name=run.name, role=role, t_s=run.t_s[mask], y_um=y, y_pred_um=predicted[mask],
-        model=scores(y, predicted[mask]), nothing=scores(y, np.full(y.size, start)),
+        name=run.name,
+        role=role,
+        t_s=run.t_s[mask],
+        y_um=y,
+        y_pred_um=predicted[mask],
+        model=scores(y, predicted[mask]),
+        nothing=scores(y, np.full(y.size, start)),
         persistence=scores(y, np.full(y.size, held)),
-    )  # fmt: skip
+    )

@@ -9,23 +9,17 @@ the data does not determine does not take part.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.errors import DataError
 from compensator.identify.arx import starts
 from compensator.identify.output_error import OutputErrorFit, Segment, Structure, fit_output_error
-
-#: Is told how many steps of how many are done.
-Told = Callable[[int, int], None]
-
-
-def silent(done: int, total: int) -> None:
-    """Tell nobody."""
+from compensator.progress import Progress, unreported
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,9 +67,7 @@ def folds_of(segments: Sequence[Segment], count: int) -> Iterator[list[Segment]]
         ]
 
 
-def held_out_errors(
-    segments: Sequence[Segment], structure: Structure, period_s: float, folds: int
-) -> list[npt.NDArray[np.float64]]:
+def held_out_errors(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> list[Vector]:
     """Return the free-run errors on each fold, of the fit to the others."""
     whole = fit(segments, structure, period_s)
     errors = []
@@ -89,7 +81,12 @@ def held_out_errors(
 
 
 def choose(
-    segments: Sequence[Segment], structures: Sequence[Structure], *, period_s: float, folds: int, told: Told = silent
+    segments: Sequence[Segment],
+    structures: Sequence[Structure],
+    *,
+    period_s: float,
+    folds: int,
+    progress: Progress = unreported,
 ) -> list[Candidate]:
     """Try structures on folds and mark the one to take.
 
@@ -103,8 +100,8 @@ def choose(
         Sample period, s.
     folds : int
         Number of blocks.
-    told : callable
-        Is told how many structures of how many are done.
+    progress : callable
+        Called with how many structures of how many are done.
 
     Returns
     -------
@@ -118,7 +115,7 @@ def choose(
     """
     tried: list[Candidate] = []
     for done, structure in enumerate(structures):
-        told(done, len(structures))
+        progress(done, len(structures))
         try:
             tried.append(_tried(segments, structure, period_s, folds))
         except DataError:
@@ -137,9 +134,11 @@ def _tried(segments: Sequence[Segment], structure: Structure, period_s: float, f
     whole = fit(segments, structure, period_s)
     errors = held_out_errors(segments, structure, period_s, folds)
     return Candidate(
-        structure=structure, rms=float(np.sqrt(np.mean(np.concatenate(errors) ** 2))),
-        fold_rms=tuple(float(np.sqrt(np.mean(e**2))) for e in errors), supported=whole.rank_deficit == 0,
-    )  # fmt: skip
+        structure=structure,
+        rms=float(np.sqrt(np.mean(np.concatenate(errors) ** 2))),
+        fold_rms=tuple(float(np.sqrt(np.mean(e**2))) for e in errors),
+        supported=whole.rank_deficit == 0,
+    )
 
 
 def no_worse(fold_rms: Sequence[float], best: Sequence[float]) -> bool:

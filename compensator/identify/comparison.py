@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.errors import ModelError
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction, continuous_image
-
-Vector = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import freqz
 from scipy.special import gammaincc
 
+from compensator.arrays import ComplexVector, Mask, Vector
+from compensator.data.runs import Run, noise_std
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
-from compensator.identify.runs import Run, noise_std
 from compensator.reasons import Caution
-
-Vector = npt.NDArray[np.float64]
 
 #: Lags of the correlations, samples.
 LAGS = 60
@@ -60,8 +58,8 @@ class PathView:
     frequency_per_h: Vector
     magnitude: Vector
     phase_deg: Vector
-    poles: npt.NDArray[np.complex128]
-    zeros: npt.NDArray[np.complex128]
+    poles: ComplexVector
+    zeros: ComplexVector
     gain: float
     gain_std: float
     taus_min: tuple[float, ...]
@@ -122,11 +120,22 @@ def view_path(path: PathFit, unit: str, period_s: float) -> PathView:
     gain, gain_std = path.fit.gain(path.column) if path.fit else (function.dc_gain, 0.0)
     taus = tuple(path.fit.taus_min.tolist()) if path.fit else (slowest,)
     return PathView(
-        name=path.name, unit=unit, t_min=t_min, step=step, step_std=std, impulse=np.asarray(function.response(pulse)),
-        frequency_per_h=frequency, magnitude=np.abs(response), phase_deg=np.degrees(np.unwrap(np.angle(response))),
-        poles=poles, zeros=function.zeros(), gain=gain, gain_std=gain_std, taus_min=taus,
+        name=path.name,
+        unit=unit,
+        t_min=t_min,
+        step=step,
+        step_std=std,
+        impulse=np.asarray(function.response(pulse)),
+        frequency_per_h=frequency,
+        magnitude=np.abs(response),
+        phase_deg=np.degrees(np.unwrap(np.angle(response))),
+        poles=poles,
+        zeros=function.zeros(),
+        gain=gain,
+        gain_std=gain_std,
+        taus_min=taus,
         taus_std_min=tuple(path.fit.taus_std_min.tolist()) if path.fit else (0.0,) * len(taus),
-    )  # fmt: skip
+    )
 
 
 def view_residual(name: str, residuals: Sequence[Vector], inputs: dict[str, Sequence[Vector]]) -> ResidualView:
@@ -152,9 +161,12 @@ def view_residual(name: str, residuals: Sequence[Vector], inputs: dict[str, Sequ
         spread = np.sqrt(max(1.0 + 2.0 * float(np.sum(own[1:] * input_own[1:])), 1.0))
         cross[input_name] = (_correlation(filled, moved), float(NORMAL_99 * spread / np.sqrt(count)))
     return ResidualView(
-        name=name, autocorrelation=own[1:], limit=float(NORMAL_99 / np.sqrt(count)),
-        white_chance=float(gammaincc(LAGS / 2.0, statistic / 2.0)), cross=cross,
-    )  # fmt: skip
+        name=name,
+        autocorrelation=own[1:],
+        limit=float(NORMAL_99 / np.sqrt(count)),
+        white_chance=float(gammaincc(LAGS / 2.0, statistic / 2.0)),
+        cross=cross,
+    )
 
 
 def _correlation(first: Sequence[Vector], second: Sequence[Vector]) -> Vector:
@@ -201,10 +213,11 @@ def criticise(calibration: Calibration) -> Criticism:
     drive = "heat" if model.kind == "heat" else "T_Q − AT"
     residuals = [
         view_residual(
-            "deformation", calibration.deformation.main.residuals,
+            "deformation",
+            calibration.deformation.main.residuals,
             {drive: calibration.drives, "AT": [run.ambient_k for run in calibration.runs]},
         )
-    ]  # fmt: skip
+    ]
     if calibration.temperature is not None:
         known = [run.heat_w for run in calibration.runs if run.heat_w is not None]
         residuals.insert(0, view_residual("T_Q − AT", calibration.temperature.fit.residuals, {"heat": known}))
@@ -222,10 +235,19 @@ class _Warnings:
 
     def all(self) -> tuple[Caution, ...]:
         found = [
-            self.worse_than_nothing(), self.quiet_ambient(), self.short_record(), self.ramp(), self.common_cause(),
-            *self.undetermined_gain(), *self.odd_zero(), *self.wrong_way(), *self.twin_modes(), self.inverse_noise(),
-            self.coloured(), self.narrow_range(),
-        ]  # fmt: skip
+            self.worse_than_nothing(),
+            self.quiet_ambient(),
+            self.short_record(),
+            self.ramp(),
+            self.common_cause(),
+            *self.undetermined_gain(),
+            *self.odd_zero(),
+            *self.wrong_way(),
+            *self.twin_modes(),
+            self.inverse_noise(),
+            self.coloured(),
+            self.narrow_range(),
+        ]
         return tuple(words for words in found if words is not None)
 
     def worse_than_nothing(self) -> Caution | None:
@@ -383,7 +405,7 @@ class _Warnings:
             "and a third more); outside, the service holds.",
         )
 
-    def _pairs(self) -> list[tuple[Run, npt.NDArray[np.bool_]]]:
+    def _pairs(self) -> list[tuple[Run, Mask]]:
         return list(zip(self.calibration.runs, self.calibration.used, strict=True))
 
 

@@ -14,18 +14,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Mask, Vector
+from compensator.data.runs import Run
 from compensator.errors import DataError
-from compensator.identify.choice import Candidate, Told, choose, fit, silent
+from compensator.identify.choice import Candidate, choose, fit
 from compensator.identify.output_error import OutputErrorFit, Segment, Structure
 from compensator.identify.rest import settle_starts
-from compensator.identify.runs import Run
 from compensator.identify.settings import Settings
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
-
-Vector = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+from compensator.progress import Progress, unreported
 
 #: Modes of an ETVE that are tried; the paper's own had five.
 ETVE_ORDERS = (1, 2, 3, 4, 5)
@@ -91,10 +89,15 @@ class DeformationFit:
 
 
 def fit_deformation(
-    runs: Sequence[Run], used: Sequence[Mask], drives: Sequence[Vector], settings: Settings, *, period_s: float,
+    runs: Sequence[Run],
+    used: Sequence[Mask],
+    drives: Sequence[Vector],
+    settings: Settings,
+    *,
+    period_s: float,
     etve: Sequence[Run] = (),
-    told: Told = silent,
-) -> DeformationFit:  # fmt: skip
+    progress: Progress = unreported,
+) -> DeformationFit:
     """Fit DTF and TDTF by one of the four methods.
 
     Parameters
@@ -111,8 +114,8 @@ def fit_deformation(
         Sample period, s.
     etve : sequence of Run
         Runs without a heat source, for methods II and III.
-    told : callable
-        Is told how many structures of how many are done.
+    progress : callable
+        Called with how many structures of how many are done.
 
     Raises
     ------
@@ -120,13 +123,13 @@ def fit_deformation(
         If the method needs an ETVE and there is none, or an order cannot be fitted.
     """
     if settings.method == "IV":
-        return _together(runs, used, drives, settings, period_s, told)
+        return _together(runs, used, drives, settings, period_s, progress)
     etve_candidates: tuple[Candidate, ...] = ()
     if settings.method == "I":
         assert settings.given_tdtf is not None
         tdtf = _given(settings.given_tdtf, period_s)
     else:
-        tdtf, etve_candidates = _from_etve(etve, settings, period_s, told)
+        tdtf, etve_candidates = _from_etve(etve, settings, period_s, progress)
     rest = [
         Segment.of(drive, run.y_um - tdtf.function.response(run.ambient_k), mask)
         for run, mask, drive in zip(runs, used, drives, strict=True)
@@ -135,20 +138,27 @@ def fit_deformation(
         structures = [Structure(order=settings.order[0], terms=(settings.order[1],))]
     else:
         structures = [Structure(order=n, terms=(m,)) for n in range(1, settings.max_order + 1) for m in _terms(n)]
-    segments, candidates, result = _chosen(rest, structures, settings, period_s, told)
+    segments, candidates, result = _chosen(rest, structures, settings, period_s, progress)
     return DeformationFit(
-        dtf=PathFit.of("DTF", result), tdtf=tdtf, segments=tuple(segments), candidates=tuple(candidates),
+        dtf=PathFit.of("DTF", result),
+        tdtf=tdtf,
+        segments=tuple(segments),
+        candidates=tuple(candidates),
         etve_candidates=etve_candidates,
-    )  # fmt: skip
+    )
 
 
 def _together(
-    runs: Sequence[Run], used: Sequence[Mask], drives: Sequence[Vector], settings: Settings, period_s: float, told: Told
+    runs: Sequence[Run],
+    used: Sequence[Mask],
+    drives: Sequence[Vector],
+    settings: Settings,
+    period_s: float,
+    progress: Progress,
 ) -> DeformationFit:
     data = [
-        Segment.of([drive, run.ambient_k], run.y_um, mask)
-        for run, mask, drive in zip(runs, used, drives, strict=True)
-    ]  # fmt: skip
+        Segment.of([drive, run.ambient_k], run.y_um, mask) for run, mask, drive in zip(runs, used, drives, strict=True)
+    ]
     if settings.order is not None:
         n, nb_dtf, nb_tdtf = settings.order
         structures = [Structure(order=n, terms=(nb_dtf, nb_tdtf))]
@@ -159,11 +169,13 @@ def _together(
             for m in _terms(n)
             for k in range(1, n + 1)
         ]
-    segments, candidates, result = _chosen(data, structures, settings, period_s, told)
+    segments, candidates, result = _chosen(data, structures, settings, period_s, progress)
     return DeformationFit(
-        dtf=PathFit.of("DTF", result, 0), tdtf=PathFit.of("TDTF", result, 1), segments=tuple(segments),
+        dtf=PathFit.of("DTF", result, 0),
+        tdtf=PathFit.of("TDTF", result, 1),
+        segments=tuple(segments),
         candidates=tuple(candidates),
-    )  # fmt: skip
+    )
 
 
 def _terms(order: int) -> tuple[int, ...]:
@@ -172,12 +184,12 @@ def _terms(order: int) -> tuple[int, ...]:
 
 
 def _chosen(
-    data: Sequence[Segment], structures: Sequence[Structure], settings: Settings, period_s: float, told: Told
+    data: Sequence[Segment], structures: Sequence[Structure], settings: Settings, period_s: float, progress: Progress
 ) -> tuple[list[Segment], list[Candidate], OutputErrorFit]:
     """Settle how the runs start, choose a structure on the folds and fit it to everything."""
     largest = structures[-1] if len(structures) == 1 else structures[len(structures) // 2]
     segments = settle_starts(data, largest, period_s, settings.folds)
-    candidates = choose(segments, structures, period_s=period_s, folds=settings.folds, told=told)
+    candidates = choose(segments, structures, period_s=period_s, folds=settings.folds, progress=progress)
     winner = next(c for c in candidates if c.chosen).structure
     return segments, candidates, fit(segments, winner, period_s)
 
@@ -189,7 +201,7 @@ def _given(tdtf: tuple[float, float], period_s: float) -> PathFit:
 
 
 def _from_etve(
-    etve: Sequence[Run], settings: Settings, period_s: float, told: Told
+    etve: Sequence[Run], settings: Settings, period_s: float, progress: Progress
 ) -> tuple[PathFit, tuple[Candidate, ...]]:
     if not etve:
         raise DataError(f"method {settings.method} needs an ETVE (a run without any heat source): name it with --etve")
@@ -202,5 +214,5 @@ def _from_etve(
     orders = ETVE_ORDERS if settings.order is None else (settings.order[0],)
     terms = None if settings.order is None else settings.order[2]
     structures = [Structure(order=n, terms=(terms or m,)) for n in orders for m in ((n, 1) if n > 1 else (1,))]
-    _, candidates, result = _chosen(data, structures, settings, period_s, told)
+    _, candidates, result = _chosen(data, structures, settings, period_s, progress)
     return PathFit.of("TDTF", result), tuple(candidates)

@@ -28,11 +28,9 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from compensator.arrays import Mask, Matrix, Vector
 from compensator.errors import DataError
 from compensator.model.transfer_function import SampledTransferFunction
-
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
 
 #: Amplitudes whose direction carries less than this share of the largest are left at zero.
 RANK_TOLERANCE = 1e-10
@@ -61,7 +59,7 @@ class Segment:
 
     inputs: Matrix
     y: Vector
-    used: npt.NDArray[np.bool_]
+    used: Mask
     rest: bool = False
 
     @classmethod
@@ -433,9 +431,17 @@ def fit_output_error(
         at = np.clip(np.log(np.sort(np.asarray(start, dtype=float))), low + 1e-6, high - 1e-6)
         if structure.order:
             found = least_squares(
-                problem.fun, at, jac=problem.jac, bounds=(low, high), method="trf", x_scale="jac",
-                xtol=1e-7, ftol=_TOLERANCE, gtol=1e-12, max_nfev=60,
-            )  # fmt: skip
+                problem.fun,
+                at,
+                jac=problem.jac,
+                bounds=(low, high),
+                method="trf",
+                x_scale="jac",
+                xtol=1e-7,
+                ftol=_TOLERANCE,
+                gtol=1e-12,
+                max_nfev=60,
+            )
             at = np.sort(np.asarray(found.x))
         problem.solve(at)
         cost = float(problem.residual @ problem.residual)
@@ -456,7 +462,7 @@ def _bounds(problem: _Problem, period_s: float) -> tuple[float, float]:
     return float(np.log(low)), float(np.log(max(longest, 10.0 * low)))
 
 
-def _span(used: npt.NDArray[np.bool_]) -> int:
+def _span(used: Mask) -> int:
     at = np.flatnonzero(used)
     return int(at[-1] - at[0]) + 1 if at.size else 0
 
@@ -474,18 +480,23 @@ def _result(problem: _Problem) -> OutputErrorFit:
     freedom = problem.count - coefficients.size - structure.order
     error = problem.residual[: problem.count]
     sigma = float(np.sqrt(error @ error / freedom))
-    colour = max(
-        1.0, low_frequency_ratio([r[s.used] for r, s in zip(residuals, problem.segments, strict=True)])
-    )  # fmt: skip
+    colour = max(1.0, low_frequency_ratio([r[s.used] for r, s in zip(residuals, problem.segments, strict=True)]))
     covariance = _covariance(problem, sigma * float(np.sqrt(colour)))
     keep = structure.order + width
     return OutputErrorFit(
-        structure=structure, period_s=problem.period_s, taus_min=problem.taus.copy(),
+        structure=structure,
+        period_s=problem.period_s,
+        taus_min=problem.taus.copy(),
         longest_min=float(np.exp(_bounds(problem, problem.period_s)[1])),
-        amplitudes=coefficients[:width].copy(), nuisances=tuple(nuisances), covariance=covariance[:keep, :keep],
-        residuals=tuple(residuals), sigma=sigma, colour=colour, rank_deficit=problem.deficit,
+        amplitudes=coefficients[:width].copy(),
+        nuisances=tuple(nuisances),
+        covariance=covariance[:keep, :keep],
+        residuals=tuple(residuals),
+        sigma=sigma,
+        colour=colour,
+        rank_deficit=problem.deficit,
         evaluations=problem.evaluations,
-    )  # fmt: skip
+    )
 
 
 def _covariance(problem: _Problem, sigma: float) -> Matrix:

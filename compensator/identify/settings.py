@@ -62,5 +62,7 @@ class Settings:
         if self.given_tdtf is not None and self.given_tdtf[1] <= 0.0:
             raise DataError(f"given TDTF: time constant {self.given_tdtf[1]:g} min, expected a number above 0")
         if self.folds < 2 or self.max_order < 1 or self.etve_end_h <= 0.0:
-            raise DataError(f"folds {self.folds}, max order {self.max_order}, ETVE end {self.etve_end_h:g} h: "
-                            "expected at least 2, at least 1 and above 0")  # fmt: skip
+            raise DataError(
+                f"folds {self.folds}, max order {self.max_order}, ETVE end {self.etve_end_h:g} h: "
+                "expected at least 2, at least 1 and above 0"
+            )

@@ -27,19 +27,21 @@ def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
             path.name: {
                 "unit": path.unit,
                 "gain": {"value": path.gain, "std": path.gain_std},
-                "tau_min": [
-                    {"value": t, "std": s} for t, s in zip(path.taus_min, path.taus_std_min, strict=True)
-                ],
+                "tau_min": [{"value": t, "std": s} for t, s in zip(path.taus_min, path.taus_std_min, strict=True)],
                 "structure": str(fit.fit.structure) if fit.fit else "given",
             }
             for path, fit in zip(criticism.paths, calibration.paths, strict=True)
         },
         "parts": [
             {
-                "name": part.name, "role": part.role, "samples": int(part.y_um.size),
-                "fit_pct": part.model.fit_pct, "rms_um": part.model.rms_um,
+                "name": part.name,
+                "role": part.role,
+                "samples": int(part.y_um.size),
+                "fit_pct": part.model.fit_pct,
+                "rms_um": part.model.rms_um,
                 "peak_to_peak_um": part.model.peak_to_peak_um,
-                "no_compensation_rms_um": part.nothing.rms_um, "persistence_rms_um": part.persistence.rms_um,
+                "no_compensation_rms_um": part.nothing.rms_um,
+                "persistence_rms_um": part.persistence.rms_um,
             }
             for part in calibration.parts
         ],
@@ -48,13 +50,14 @@ def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
         "warnings": [str(warning) for warning in criticism.warnings],
         "warning_codes": [warning.code for warning in criticism.warnings],
         "remarks": list(calibration.remarks),
-    }  # fmt: skip
+    }
     temperature = calibration.temperature
     if temperature is not None:
         result["ttf"] = {
-            "fit_pct": calibration.ttf_fit_pct, "held_out_rms_k": temperature.held_out_k,
+            "fit_pct": calibration.ttf_fit_pct,
+            "held_out_rms_k": temperature.held_out_k,
             "inverse_noise_gain_w_per_k": temperature.noise_gain_w_per_k,
-        }  # fmt: skip
+        }
     return result
 
 
@@ -66,8 +69,9 @@ def verdict(calibration: Calibration) -> str:
         return (
             f"On data that took no part in the fit: {worst.model.rms_um:.2f} µm rms "
             f"({worst.nothing.rms_um:.1f} without compensation), fit {worst.model.fit_pct:.1f} %"
-            + (f", worst of {len(held_out)}" if len(held_out) > 1 else "") + "."
-        )  # fmt: skip
+            + (f", worst of {len(held_out)}" if len(held_out) > 1 else "")
+            + "."
+        )
     fitted = calibration.parts[0]
     return (
         f"On blocks of time held out in turn: {calibration.folds_rms_um:.2f} µm rms in free run "
@@ -131,12 +135,17 @@ def _table(calibration: Calibration) -> list[str]:
     period_h = calibration.model.period_s / 3600.0
     rows += [
         [
-            part.name, part.role, f"{part.y_um.size * period_h:.1f}", f"{part.model.fit_pct:.2f}",
-            f"{part.model.rms_um:.2f}", f"{part.model.peak_to_peak_um:.2f}", f"{part.nothing.rms_um:.2f}",
+            part.name,
+            part.role,
+            f"{part.y_um.size * period_h:.1f}",
+            f"{part.model.fit_pct:.2f}",
+            f"{part.model.rms_um:.2f}",
+            f"{part.model.peak_to_peak_um:.2f}",
+            f"{part.nothing.rms_um:.2f}",
             f"{part.persistence.rms_um:.2f}",
         ]
         for part in calibration.parts
-    ]  # fmt: skip
+    ]
     rows.append(["folds", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""])
     arx = calibration.arx_rms_um
     rows.append(["ARX, to compare", "fitted", "", "", f"{arx:.2f}" if math.isfinite(arx) else "unstable", "", "", ""])

@@ -6,18 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import lfilter
 
+from compensator.arrays import Mask, Vector
+from compensator.data.runs import Run
 from compensator.errors import DataError, ModelError
 from compensator.identify.choice import fit, held_out_errors
 from compensator.identify.output_error import OutputErrorFit, Segment, Structure
 from compensator.identify.rest import settle_starts
-from compensator.identify.runs import Run
 from compensator.model.thermal_model import check_inverse
 from compensator.model.transfer_function import SampledTransferFunction
-
-Vector = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +55,7 @@ class TemperatureFit:
 
 def fit_temperature(
     runs: Sequence[Run],
-    used: Sequence[npt.NDArray[np.bool_]],
+    used: Sequence[Mask],
     ttf: tuple[int, int, int],
     *,
     period_s: float,
@@ -105,9 +103,12 @@ def fit_temperature(
             continue
         errors = np.concatenate(held_out_errors(segments, structure, period_s, folds))
         return TemperatureFit(
-            fit=result, segments=tuple(segments), held_out_k=float(np.sqrt(np.mean(errors**2))),
-            noise_gain_w_per_k=noise_gain(function), remark=remark,
-        )  # fmt: skip
+            fit=result,
+            segments=tuple(segments),
+            held_out_k=float(np.sqrt(np.mean(errors**2))),
+            noise_gain_w_per_k=noise_gain(function),
+            remark=remark,
+        )
     raise DataError(f"no usable inverse: {remark}. Is t_q_degc near the heat source, and heat_w its heat?")
 
 

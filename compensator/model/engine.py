@@ -14,14 +14,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.errors import ModelError
 from compensator.model.effects import Effect, Signals, kinds
 from compensator.model.observer import Observer, ObserverState
 from compensator.model.thermal_model import ThermalModel
 
-Vector = npt.NDArray[np.float64]
 NAN = float("nan")
 
 #: Longest run of incomplete samples that is walked over again once both temperatures are back.
@@ -310,9 +309,11 @@ class Engine:
         return self._advance(inputs, unknown=unknown)
 
     def run(
-        self, t_q_degc: Sequence[float] | Vector, at_degc: Sequence[float] | Vector,
+        self,
+        t_q_degc: Sequence[float] | Vector,
+        at_degc: Sequence[float] | Vector,
         channels: Mapping[str, Sequence[float] | Vector] | None = None,
-    ) -> list[Estimate]:  # fmt: skip
+    ) -> list[Estimate]:
         """Take a whole record in, sample by sample.
 
         Parameters

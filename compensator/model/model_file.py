@@ -21,8 +21,21 @@ from compensator.model.transfer_function import SampledTransferFunction, Transfe
 #: Models that ship with the package.
 BUILT_IN = ("quill",)
 
-_TOP = ("schema", "name", "kind", "sample_period_s", "inputs", "paths", "alternatives", "estimator", "validity",
-        "uncertainty", "provenance", "effect", "description")  # fmt: skip
+_TOP = (
+    "schema",
+    "name",
+    "kind",
+    "sample_period_s",
+    "inputs",
+    "paths",
+    "alternatives",
+    "estimator",
+    "validity",
+    "uncertainty",
+    "provenance",
+    "effect",
+    "description",
+)
 _ESTIMATOR = ("method", "t_q_noise_std_k", "at_noise_std_k", "at_walk_std_k")
 _FORMS = {"continuous": ("numerator", "denominator"), "sampled": ("b", "a")}
 
@@ -174,7 +187,7 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
         alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
         provenance=dict(_Table("provenance", table.get("provenance", {})).table),
         sha256=sha256,
-    )  # fmt: skip
+    )
 
 
 def _path(where: str, value: object, period_s: float, extra: Sequence[str] = ()) -> Path:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from compensator.atomic_write import whole_file
 from compensator.errors import ModelError
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
-from compensator.whole import whole_file
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -88,9 +88,15 @@ def _lines(model: ThermalModel) -> Iterator[str]:
     yield _comment(f"Thermal model {model.name}. The DTF is driven by {drive}; the deformation is in um.")
     yield "# Functions of s: ascending powers, time in minutes. b and a: powers of 1/z at the sample period."
     yield "schema = 1"
-    yield from _pairs("", {
-        "name": model.name, "kind": model.kind, "sample_period_s": model.period_s, "inputs": model.inputs,
-    })  # fmt: skip
+    yield from _pairs(
+        "",
+        {
+            "name": model.name,
+            "kind": model.kind,
+            "sample_period_s": model.period_s,
+            "inputs": model.inputs,
+        },
+    )
     purposes = {
         "TTF": "Heat to T_Q - AT; its inverse gives the heat",
         "DTF": f"{'Heat' if model.kind == 'heat' else 'T_Q - AT'} to deformation",
@@ -120,8 +126,11 @@ def _lines(model: ThermalModel) -> Iterator[str]:
 def _path(where: str, path: Path, purpose: str, extra: Mapping[str, Any]) -> Iterator[str]:
     table: dict[str, Any] = {**extra, "unit": path.unit}
     if path.continuous is not None:
-        table |= {"form": "continuous", "numerator": path.continuous.numerator,
-                  "denominator": path.continuous.denominator}  # fmt: skip
+        table |= {
+            "form": "continuous",
+            "numerator": path.continuous.numerator,
+            "denominator": path.continuous.denominator,
+        }
     else:
         table |= {"form": "sampled", "b": path.sampled.b, "a": path.sampled.a}
         if path.covariance is not None:
@@ -166,11 +175,16 @@ def _estimator(kind: str, estimator: Estimator) -> Iterator[str]:
     yield "# t_q_noise, at_noise: standard deviation of the noise of one sample, K."
     yield f"# {key}: standard deviation of the change of {drive}, in one sample; at_walk: of the ambient, K."
     yield "[estimator]"
-    yield from _pairs("estimator", {
-        "method": estimator.method, "t_q_noise_std_k": estimator.t_q_noise_std_k,
-        "at_noise_std_k": estimator.at_noise_std_k, key: estimator.drive_walk_std,
-        "at_walk_std_k": estimator.at_walk_std_k,
-    })  # fmt: skip
+    yield from _pairs(
+        "estimator",
+        {
+            "method": estimator.method,
+            "t_q_noise_std_k": estimator.t_q_noise_std_k,
+            "at_noise_std_k": estimator.at_noise_std_k,
+            key: estimator.drive_walk_std,
+            "at_walk_std_k": estimator.at_walk_std_k,
+        },
+    )
 
 
 def _effect(where: str, effect: EffectTable) -> Iterator[str]:

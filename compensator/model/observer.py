@@ -28,12 +28,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Matrix
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
-
-Matrix = npt.NDArray[np.float64]
 
 #: P counts as settled when no element moves by more than this, relative to its standard deviations.
 SETTLED = 1e-7
@@ -247,10 +245,13 @@ class Observer:
         terms = [
             (index, weight)
             for index, weight in (
-                (self._first[1], 1.0), (self._q, self._d[1]), (self._first[2], 1.0), (self._a, self._d[2])
+                (self._first[1], 1.0),
+                (self._q, self._d[1]),
+                (self._first[2], 1.0),
+                (self._a, self._d[2]),
             )
             if index < self.size
-        ]  # fmt: skip
+        ]
         total = 0.0
         for i, wi in terms:
             for j, wj in terms:
@@ -333,9 +334,11 @@ class Observer:
     def snapshot(self) -> ObserverState:
         """Return what must be kept to go on from here with the same bits."""
         return ObserverState(
-            x=tuple(self._x[: self.size]), p=tuple(self._P[self._upper].tolist()), settled=self._settled,
+            x=tuple(self._x[: self.size]),
+            p=tuple(self._P[self._upper].tolist()),
+            settled=self._settled,
             started=self._started,
-        )  # fmt: skip
+        )
 
     def restore(self, state: ObserverState) -> None:
         """Go on from a snapshot.

@@ -204,8 +204,10 @@ def check_runnable(model: ThermalModel) -> None:
     if not (math.isfinite(model.period_s) and model.period_s > 0):
         raise ModelError(f"model {model.name}: sample_period_s = {model.period_s!r}, expected a number above 0")
     if (model.ttf is None) != (model.kind == "direct"):
-        raise ModelError(f"model {model.name}: kind {model.kind!r} and its paths do not fit: TTF "
-                         f"{'missing' if model.ttf is None else 'present'}")  # fmt: skip
+        raise ModelError(
+            f"model {model.name}: kind {model.kind!r} and its paths do not fit: TTF "
+            f"{'missing' if model.ttf is None else 'present'}"
+        )
     for name in ("TTF", "DTF", "TDTF"):
         path: Path | None = getattr(model, name.lower())
         if path is not None:

@@ -22,9 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from compensator.arrays import ComplexVector, Vector
 from compensator.errors import ModelError
-
-Vector = npt.NDArray[np.float64]
 
 
 def _trimmed(coefficients: Sequence[float]) -> tuple[float, ...]:
@@ -95,11 +94,11 @@ class SampledTransferFunction:
         """Gain at rest, Σb / Σa."""
         return math.fsum(self.b) / math.fsum(self.a)
 
-    def poles(self) -> npt.NDArray[np.complex128]:
+    def poles(self) -> ComplexVector:
         """Return the poles in the z plane."""
         return np.roots(self.a).astype(np.complex128)
 
-    def zeros(self) -> npt.NDArray[np.complex128]:
+    def zeros(self) -> ComplexVector:
         """Return the zeros in the z plane."""
         return np.roots(self.b).astype(np.complex128)
 
@@ -208,11 +207,11 @@ class TransferFunction:
         """Gain at rest, in `unit`."""
         return self.numerator[0] / self.denominator[0] if self.denominator[0] else math.inf
 
-    def poles_per_min(self) -> npt.NDArray[np.complex128]:
+    def poles_per_min(self) -> ComplexVector:
         """Return the poles, 1/min."""
         return np.roots(self.denominator[::-1]).astype(np.complex128)
 
-    def zeros_per_min(self) -> npt.NDArray[np.complex128]:
+    def zeros_per_min(self) -> ComplexVector:
         """Return the zeros, 1/min."""
         return np.roots(self.numerator[::-1]).astype(np.complex128)
 

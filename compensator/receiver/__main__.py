@@ -15,9 +15,10 @@ from .subscriber import Receiver
 def main() -> int:
     """Print a line whenever state, reasons or number change, until SIGINT or SIGTERM."""
     parser = argparse.ArgumentParser(
-        prog="compensator.receiver", description="Shows what a control would apply; writes to none.",
+        prog="compensator.receiver",
+        description="Shows what a control would apply; writes to none.",
         epilog="example: python -m compensator.receiver --config receiver.toml",
-    )  # fmt: skip
+    )
     parser.add_argument("--config", required=True, metavar="FILE", help="TOML with a table [receiver]")
     arguments = parser.parse_args()
     ended = threading.Event()

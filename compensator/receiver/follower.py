@@ -281,11 +281,14 @@ class Follower:
                 reasons.append(Reason("catching_up", f"to {target_um:+.2f} µm"))
         held = self._held
         return Applied(
-            offset_um=self.applied_um, state=state, reasons=tuple(reasons), arrived=arrived,
+            offset_um=self.applied_um,
+            state=state,
+            reasons=tuple(reasons),
+            arrived=arrived,
             age_s=None if held is None else max(now_s - held.measured_s, 0.0),
             seq=None if held is None else held.message.seq,
             service_state=None if held is None else held.message.state,
-        )  # fmt: skip
+        )
 
     def _move(self, target_um: float, step_um: float) -> None:
         way = target_um - self.applied_um

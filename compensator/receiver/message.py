@@ -100,10 +100,15 @@ def parse_offset(payload: bytes) -> OffsetMessage:
     if std_um is not None and std_um < 0.0:
         raise _malformed("y_offset_std_um", std_um, "0 or more")
     return OffsetMessage(
-        machine=machine, seq=_integer(table, "seq"), time_utc_ns=_integer(table, "time_utc_ns"),
-        valid_for_s=valid_for_s, y_offset_um=offset_um, y_offset_rate_um_per_min=rate or 0.0, state=state,
+        machine=machine,
+        seq=_integer(table, "seq"),
+        time_utc_ns=_integer(table, "time_utc_ns"),
+        valid_for_s=valid_for_s,
+        y_offset_um=offset_um,
+        y_offset_rate_um_per_min=rate or 0.0,
+        state=state,
         reasons=tuple(reasons),
-    )  # fmt: skip
+    )
 
 
 def _decode(payload: bytes) -> dict[str, Any]:

@@ -52,8 +52,11 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "catching_up": ("The offset is still under way at the permitted rate.", "Wait before the next precise cut."),
     "limit_reached": ("The followed offset has reached offset_max_um.", "Check sensors and model."),
     "held_here": ("Somebody has frozen the offset here.", "Allow it to follow again."),
-    "fading": ("Told to take the offset away, the receiver moves it to zero.", "Allow it to follow again when wanted."),
-    "faded": ("Told to take the offset away, the receiver applies zero.", "Allow it to follow again when wanted."),
+    "fading": (
+        "Asked to take the offset away, the receiver moves it to zero.",
+        "Allow it to follow again when wanted.",
+    ),
+    "faded": ("Asked to take the offset away, the receiver applies zero.", "Allow it to follow again when wanted."),
     "state_not_saved": (
         "The number of the last message cannot be kept over a restart.",
         "Check the state file's folder: space, permissions, disk.",

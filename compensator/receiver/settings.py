@@ -64,9 +64,12 @@ class Settings:
             Longest time between two calls that counts for moving, s.
         """
         return Limits(
-            offset_max_um=self.offset_max_um, offset_rate_max_um_per_min=self.offset_rate_max_um_per_min,
-            valid_max_s=self.valid_max_s, step_max_s=step_max_s, clock_tolerance_s=self.clock_tolerance_s,
-        )  # fmt: skip
+            offset_max_um=self.offset_max_um,
+            offset_rate_max_um_per_min=self.offset_rate_max_um_per_min,
+            valid_max_s=self.valid_max_s,
+            step_max_s=step_max_s,
+            clock_tolerance_s=self.clock_tolerance_s,
+        )
 
 
 def load_settings(path: str | Path) -> tuple[Settings, dict[str, Any]]:
@@ -161,9 +164,12 @@ def read_table(kind: type[T], table: Mapping[str, Any], *, source: str, name: st
 
 
 _EXPECTED = {
-    "str": "a text", "bool": "true or false", "int": "a whole number", "float": "a number",
+    "str": "a text",
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a number",
     "tuple[str, ...]": "a list of texts",
-}  # fmt: skip
+}
 
 
 def _value(value: Any, kind: str, where: str) -> Any:

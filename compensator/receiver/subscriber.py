@@ -93,9 +93,14 @@ class Receiver:
     """
 
     def __init__(
-        self, settings: Settings, *, applied_um: float = 0.0, step_max_s: float = 1.0,
-        clock: Callable[[], float] = monotonic_s, utc_ns: Callable[[], int] = time.time_ns,
-    ) -> None:  # fmt: skip
+        self,
+        settings: Settings,
+        *,
+        applied_um: float = 0.0,
+        step_max_s: float = 1.0,
+        clock: Callable[[], float] = monotonic_s,
+        utc_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
         self._settings = settings
         self._config = client_config(settings)
         self._clock, self._utc_ns = clock, utc_ns
@@ -158,9 +163,14 @@ class Receiver:
         if not remarks:
             return applied
         return Applied(
-            offset_um=applied.offset_um, state=applied.state, reasons=applied.reasons + remarks,
-            arrived=applied.arrived, age_s=applied.age_s, seq=applied.seq, service_state=applied.service_state,
-        )  # fmt: skip
+            offset_um=applied.offset_um,
+            state=applied.state,
+            reasons=applied.reasons + remarks,
+            arrived=applied.arrived,
+            age_s=applied.age_s,
+            seq=applied.seq,
+            service_state=applied.service_state,
+        )
 
     def _take(self, now_s: float, sample: Any, *, judge: bool, asked: bool) -> None:
         payload = sample.payload.to_bytes() if sample.kind == zenoh.SampleKind.PUT else b""

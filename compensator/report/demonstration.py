@@ -6,12 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
+from compensator.arrays import Vector
 from compensator.report.page import Block, Cell, Details, Figure, Line, Link, Page, Section, Table
-
-Vector = npt.NDArray[np.float64]
 
 #: What a machine is called in a sentence.
 _KINDS = {"conduction": "heat-conduction machine", "published": "machine of the published equations"}
@@ -41,9 +37,12 @@ class MachineDay:
 
 
 def page_of(
-    days: Sequence[MachineDay], table: Sequence[Sequence[str]], loop: Mapping[str, Any],
-    second_day: Mapping[str, tuple[Vector, Vector]], paper: Mapping[str, Any],
-) -> Page:  # fmt: skip
+    days: Sequence[MachineDay],
+    table: Sequence[Sequence[str]],
+    loop: Mapping[str, Any],
+    second_day: Mapping[str, tuple[Vector, Vector]],
+    paper: Mapping[str, Any],
+) -> Page:
     """Make the page.
 
     Parameters
@@ -61,13 +60,17 @@ def page_of(
     """
     blocks: list[Block] = [_error(day) for day in days]
     blocks += [
-        Table(title="Errors in Y", head=table[0], rows=table[1:],
-              note="Fit: of measured and predicted deformation, 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖)."),
+        Table(
+            title="Errors in Y",
+            head=table[0],
+            rows=table[1:],
+            note="Fit: of measured and predicted deformation, 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖).",
+        ),
         _loop(loop, second_day),
         _pages(days),
         Details(title="Heat, as it was and as it was estimated", blocks=[_heat(day) for day in days]),
         Details(title="The paper's own case, beside what is printed", blocks=[_beside_the_print(paper)]),
-    ]  # fmt: skip
+    ]
     return Page(title="A simulated day, compensated", verdict=f"{verdict(days)} {closed(loop)}", blocks=blocks)
 
 
@@ -103,19 +106,23 @@ def closed(loop: Mapping[str, Any]) -> str:
 def _error(day: MachineDay) -> Figure:
     t, figures = day.errors["t_h"], day.figures
     return Figure(
-        title=f"{day.name}: thermal error with and without compensation", x_label=_TIME, y_label="error in Y, µm",
+        title=f"{day.name}: thermal error with and without compensation",
+        x_label=_TIME,
+        y_label="error in Y, µm",
         lines=(Line("without", t, day.errors["without"]), Line("with", t, day.errors["followed"])),
         note=f"{figures['without']['rms_um']:.1f} µm rms without, {figures['followed']['rms_um']:.2f} with, as the "
         "simulated machine itself knows it.",
-    )  # fmt: skip
+    )
 
 
 def _heat(day: MachineDay) -> Figure:
     t, true, at, estimated = day.heat
     return Figure(
-        title=f"{day.name}: heat", x_label=_TIME, y_label="heat, W",
+        title=f"{day.name}: heat",
+        x_label=_TIME,
+        y_label="heat, W",
         lines=(Line("true", t, true), Line("estimated from T_Q and AT", at, estimated)),
-    )  # fmt: skip
+    )
 
 
 def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector]]) -> Section:
@@ -125,28 +132,39 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
     lines = tuple(Line(names[key], *second_day[key]) for key in ("first", "extended"))
     taken = (
         f"The running service took the extended model over; judged from {loop['adopted_after_h']:.1f} h on."
-        if loop["adopted"] else "The model was left as it was: both days are the same."
-    )  # fmt: skip
+        if loop["adopted"]
+        else "The model was left as it was: both days are the same."
+    )
     return Section(
         title="The loop closed: an effect the calibration never saw, on a second day with another duty",
         blocks=[
-            Figure(title="Second day, error in Y with each model", x_label=_TIME, y_label="error in Y, µm", lines=lines,
-                   height=2.6, note=f"{rms['first']:.2f} µm rms with the first model, {rms['extended']:.2f} with the "
-                   "extended one."),
-            Table(head=["conduction machine", "rms µm"], rows=rows,
-                  note=f"Found in the recordings of the first day: {', '.join(loop['found']) or 'nothing'} "
-                  f"({str(loop['verdict']).replace('_', ' ')}). Drawn by the seed and not passed on: {loop['drawn']}. "
-                  + taken),
+            Figure(
+                title="Second day, error in Y with each model",
+                x_label=_TIME,
+                y_label="error in Y, µm",
+                lines=lines,
+                height=2.6,
+                note=f"{rms['first']:.2f} µm rms with the first model, {rms['extended']:.2f} with the extended one.",
+            ),
+            Table(
+                head=["conduction machine", "rms µm"],
+                rows=rows,
+                note=f"Found in the recordings of the first day: {', '.join(loop['found']) or 'nothing'} "
+                f"({str(loop['verdict']).replace('_', ' ')}). Drawn by the seed and not passed on: {loop['drawn']}. "
+                + taken,
+            ),
         ],
-    )  # fmt: skip
+    )
 
 
 def _pages(days: Sequence[MachineDay]) -> Table:
     rows: list[list[Cell]] = [
-        [Link(f"{day.name}/calibration/report.html", f"{day.name}/calibration/report.html"),
-         f"how the model of the {_KINDS.get(day.name, day.name)} was made"]
+        [
+            Link(f"{day.name}/calibration/report.html", f"{day.name}/calibration/report.html"),
+            f"how the model of the {_KINDS.get(day.name, day.name)} was made",
+        ]
         for day in days
-    ]  # fmt: skip
+    ]
     rows.append([Link("conduction/diagnosis/report.html", "conduction/diagnosis/report.html"), "what the model lacked"])
     rows.append([Link("paper/report.html", "paper/report.html"), "the paper's own case"])
     return Table(title="Pages of this demo", head=["page", "about"], rows=rows)
@@ -158,7 +176,8 @@ def _beside_the_print(paper: Mapping[str, Any]) -> Table:
         for r in paper["comparison"]
     ]
     return Table(
-        head=["path and figure", "identified", "standard error", "printed"], rows=rows,
+        head=["path and figure", "identified", "standard error", "printed"],
+        rows=rows,
         note="Identified from a run with 1 % measuring error. One step of 90 W in quiet air: the TTF comes back, the "
         "slow part of DTF and TDTF only within its errors.",
-    )  # fmt: skip
+    )

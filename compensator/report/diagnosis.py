@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.diagnose.outcome import Diagnosis, Effect
 from compensator.diagnose.summary import name, verdict
 from compensator.identify.summary import with_std
@@ -27,14 +27,22 @@ from compensator.report.page import (
     write_page,
 )
 
-Vector = npt.NDArray[np.float64]
-
 #: Parameters of an effect that are shown at once; the others are there to open.
 SHOWN = 6
 
 #: Units as they stand in the names of parameters, and on a page.
-_UNITS = {"um": "µm", "k": "K", "w": "W", "min": "min", "h": "h", "s": "s", "degc": "°C", "rpm": "(1/min)", "pct": "%",
-          "bar": "bar"}  # fmt: skip
+_UNITS = {
+    "um": "µm",
+    "k": "K",
+    "w": "W",
+    "min": "min",
+    "h": "h",
+    "s": "s",
+    "degc": "°C",
+    "rpm": "(1/min)",
+    "pct": "%",
+    "bar": "bar",
+}
 
 _TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
 
@@ -80,12 +88,15 @@ def _before_and_after(t: Vector, diagnosis: Diagnosis) -> Figure:
     count = len(diagnosis.effects)
     found = name(diagnosis.effects[0]) if count == 1 else f"all {count} effects" if count else "nothing to add"
     return Figure(
-        title="Error that the compensation leaves, before and after", x_label="time, h", y_label="residual, µm",
+        title="Error that the compensation leaves, before and after",
+        x_label="time, h",
+        y_label="residual, µm",
         lines=(
-            Line("before", t, diagnosis.held_out_before), Line(f"after: {found}", t, diagnosis.held_out_after),
+            Line("before", t, diagnosis.held_out_before),
+            Line(f"after: {found}", t, diagnosis.held_out_after),
         ),
         note="Measured − predicted, on the same scale. Every block is shown by a search that did not see it.",
-    )  # fmt: skip
+    )
 
 
 def _errors(diagnosis: Diagnosis) -> Table:
@@ -95,9 +106,11 @@ def _errors(diagnosis: Diagnosis) -> Table:
     ]
     rows.append(["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""])
     return Table(
-        title="Errors on held-out data", head=["", "rms µm", "peak to peak µm", "fit %"], rows=rows,
+        title="Errors on held-out data",
+        head=["", "rms µm", "peak to peak µm", "fit %"],
+        rows=rows,
         note=f"Measured so: {diagnosis.held_out}.",
-    )  # fmt: skip
+    )
 
 
 def _effect(t: Vector, effect: Effect) -> Section:
@@ -108,10 +121,15 @@ def _effect(t: Vector, effect: Effect) -> Section:
     deploy = "Runs in the service." if effect.deployable else "Cannot be deployed; the extended model leaves it out."
     blocks: list[Block] = [
         Words(title="In words", lines=[effect.explanation, deploy]),
-        Figure(title=f"What it adds: {name(effect)}", x_label="time, h", y_label="Y, µm",
-               lines=(Line("effect", t, effect.wave),), height=2.6),
+        Figure(
+            title=f"What it adds: {name(effect)}",
+            x_label="time, h",
+            y_label="Y, µm",
+            lines=(Line("effect", t, effect.wave),),
+            height=2.6,
+        ),
         Table(head=["parameter", "value ± standard error"], rows=rows),
-    ]  # fmt: skip
+    ]
     if len(parameters) > SHOWN:
         head = ["parameter", "value ± standard error"]
         blocks.append(Details(title=f"All {len(parameters)} parameters", blocks=[Table(head=head, rows=parameters)]))
@@ -159,9 +177,12 @@ def _details(t: Vector, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequ
     rows = [["extended model, SHA-256", model.sha256]]
     rows += [[f"data: {d['file']}", d["sha256"]] for d in model.provenance.get("diagnosis", {}).get("data", [])]
     figure = Figure(
-        title="Residual of the fit to everything", x_label="time, h", y_label="residual, µm",
-        lines=(Line("before", t, diagnosis.residual_before), Line("after", t, diagnosis.residual_after)), height=2.6,
-    )  # fmt: skip
+        title="Residual of the fit to everything",
+        x_label="time, h",
+        y_label="residual, µm",
+        lines=(Line("before", t, diagnosis.residual_before), Line("after", t, diagnosis.residual_after)),
+        height=2.6,
+    )
     blocks: list[Block] = [figure, Table(head=["", ""], rows=rows)]
     if remarks:
         blocks.append(Words(title="Remarks on the data", lines=remarks))

@@ -84,10 +84,18 @@ def style(palette: Palette) -> dict[Any, Any]:
     """Return matplotlib's settings for pictures in some colours."""
     ink = palette.ink
     return {
-        "font.family": "sans-serif", "font.size": 10, "text.color": ink, "axes.labelcolor": ink, "axes.edgecolor": ink,
-        "xtick.color": ink, "ytick.color": ink, "grid.color": palette.grid, "figure.facecolor": "none",
-        "axes.facecolor": "none", "legend.framealpha": 0.0,
-    }  # fmt: skip
+        "font.family": "sans-serif",
+        "font.size": 10,
+        "text.color": ink,
+        "axes.labelcolor": ink,
+        "axes.edgecolor": ink,
+        "xtick.color": ink,
+        "ytick.color": ink,
+        "grid.color": palette.grid,
+        "figure.facecolor": "none",
+        "axes.facecolor": "none",
+        "legend.framealpha": 0.0,
+    }
 
 
 def draw(canvas: Canvas | SubFigure, figure: Figure, width: float, palette: Palette) -> None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Indices, Vector
 from compensator.report.figure import Line
-
-Vector = npt.NDArray[np.float64]
 
 #: Columns of pixels that a curve has at least; each keeps its lowest and its highest point.
 COLUMNS = 1000
@@ -136,7 +134,7 @@ class Envelope:
         self._sums, self._new, self._summed_s = np.array([number, *sums]), [], self._width_s
 
 
-def _extremes(column: Vector, y: Vector) -> npt.NDArray[np.int_]:
+def _extremes(column: Vector, y: Vector) -> Indices:
     """Return where the lowest and the highest value of each column stand; of one without any, its first."""
     order = np.lexsort((y, column))
     starts = np.concatenate([[0], np.flatnonzero(np.diff(column[order])) + 1])

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-Vector = npt.NDArray[np.float64]
+from compensator.arrays import Indices, Vector
 
 #: Buckets that a longer curve is thinned to; each keeps its lowest and highest point.
 _BUCKETS = 700
@@ -127,7 +126,7 @@ class Figure:
     height: float = 3.4
 
 
-def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> npt.NDArray[np.int_]:
+def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> Indices:
     """Return the indices that keep a curve's look: lowest and highest of each bucket, its ends, and its gaps.
 
     A gap narrower than a bucket is narrower than the line that is drawn. Where there are many such, they are left

@@ -15,9 +15,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from compensator.container import PAYLOAD, Container, Contents, Damaged, Torn
 from compensator.errors import DataError, UsageError
 from compensator.messages import number
+from compensator.recording.container import PAYLOAD, Container, Contents, Damaged, Torn
 from compensator.report.envelope import Envelope, Stretches
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, File, History, Missed, Period
 
@@ -78,14 +78,14 @@ _DECODERS: dict[str, msgspec.json.Decoder[Any]] = {
 }
 
 
-def read_history(paths: Sequence[Path], *, told: Callable[[int, int], None] | None = None) -> History:
+def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] | None = None) -> History:
     """Read recordings of one machine.
 
     Parameters
     ----------
     paths : sequence of pathlib.Path
         In any order.
-    told : callable, optional
+    progress : callable, optional
         Called with the number of bytes read, and of all.
 
     Raises
@@ -101,8 +101,8 @@ def read_history(paths: Sequence[Path], *, told: Callable[[int, int], None] | No
     for path in ordered:
         with Container(path) as container:
             for i in reader.file(path.name, container):
-                if told is not None and i % 1000 == 0:
-                    told(done + container.position, whole)
+                if progress is not None and i % 1000 == 0:
+                    progress(done + container.position, whole)
         done += path.stat().st_size
     return reader.result()
 
@@ -225,8 +225,12 @@ class _Reader:
         for name, value in shares.items():
             self._put(f"share {name}", t, value)
         y, residual = number(estimate.y_um), number(estimate.residual_um)
-        for name, value in (("heat", number(estimate.heat_w)), ("predicted", number(estimate.y_pred_um)),
-                            ("measured", y), ("residual", residual)):  # fmt: skip
+        for name, value in (
+            ("heat", number(estimate.heat_w)),
+            ("predicted", number(estimate.y_pred_um)),
+            ("measured", y),
+            ("residual", residual),
+        ):
             self._put(name, t, value)
         for period in (self.history.whole, self._day(t)):
             period.residual.add(residual, t)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.identify.calibration import Calibration, Part
 from compensator.identify.choice import Candidate
 from compensator.identify.comparison import Row as Comparison
@@ -33,13 +33,16 @@ from compensator.report.page import (
     write_page,
 )
 
-Vector = npt.NDArray[np.float64]
-
 
 def write_report(
-    path: Path, calibration: Calibration, criticism: Criticism, model: ThermalModel, comparison: Sequence[Comparison],
-    *, also: Path | None = None,
-) -> Path:  # fmt: skip
+    path: Path,
+    calibration: Calibration,
+    criticism: Criticism,
+    model: ThermalModel,
+    comparison: Sequence[Comparison],
+    *,
+    also: Path | None = None,
+) -> Path:
     """Write the page.
 
     Parameters
@@ -107,28 +110,42 @@ def _joined(parts: Sequence[Part]) -> tuple[Vector, Vector, Vector, tuple[Span, 
 def _prediction(calibration: Calibration) -> Figure:
     t, y, predicted, spans = _joined(calibration.parts)
     return Figure(
-        title="Measured and predicted deformation, free run from T_Q and AT", x_label="time, h", y_label="Y, µm",
-        lines=(Line("measured", t, y), Line("predicted", t, predicted)), spans=spans,
+        title="Measured and predicted deformation, free run from T_Q and AT",
+        x_label="time, h",
+        y_label="Y, µm",
+        lines=(Line("measured", t, y), Line("predicted", t, predicted)),
+        spans=spans,
         note="Nothing measured of Y is fed back." + (" Shaded: took no part in fitting or choosing." if spans else ""),
-    )  # fmt: skip
+    )
 
 
 def _residuals(calibration: Calibration) -> Figure:
     t, y, predicted, spans = _joined(calibration.parts)
-    return Figure(title="Residual, measured − predicted", x_label="time, h", y_label="residual, µm",
-                  lines=(Line("residual", t, y - predicted),), spans=spans, height=2.6)  # fmt: skip
+    return Figure(
+        title="Residual, measured − predicted",
+        x_label="time, h",
+        y_label="residual, µm",
+        lines=(Line("residual", t, y - predicted),),
+        spans=spans,
+        height=2.6,
+    )
 
 
 def _errors(calibration: Calibration) -> Table:
     hours = calibration.model.period_s / 3600.0
     rows = [
         [
-            part.name, part.role, f"{part.y_um.size * hours:.1f}", f"{part.model.fit_pct:.2f}",
-            f"{part.model.rms_um:.2f}", f"{part.model.peak_to_peak_um:.2f}", f"{part.nothing.rms_um:.2f}",
+            part.name,
+            part.role,
+            f"{part.y_um.size * hours:.1f}",
+            f"{part.model.fit_pct:.2f}",
+            f"{part.model.rms_um:.2f}",
+            f"{part.model.peak_to_peak_um:.2f}",
+            f"{part.nothing.rms_um:.2f}",
             f"{part.persistence.rms_um:.2f}",
         ]
         for part in calibration.parts
-    ]  # fmt: skip
+    ]
     rows.append(
         ["blocks of the fitted data, in turn", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""]
     )
@@ -141,7 +158,7 @@ def _errors(calibration: Calibration) -> Table:
         rows=rows,
         note="Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖). Persistence holds the last value before the part. A run "
         "that was not fitted is zeroed on its first hour.",
-    )  # fmt: skip
+    )
 
 
 def _parameters(calibration: Calibration, criticism: Criticism) -> list[Block]:
@@ -167,11 +184,13 @@ def _parameters(calibration: Calibration, criticism: Criticism) -> list[Block]:
         main.append(["TTF: fit in free run from the known heat", f"{calibration.ttf_fit_pct:.2f}", "%"])
     return [
         Table(
-            title="Parameters and their standard errors", head=["parameter", "value", "unit"], rows=main,
+            title="Parameters and their standard errors",
+            head=["parameter", "value", "unit"],
+            rows=main,
             note="One standard error. Where the residual is not white, its low-frequency power is counted in.",
         ),
         Details(title="Coefficients of 1/z", blocks=[Table(head=["coefficient", "value"], rows=coefficients)]),
-    ]  # fmt: skip
+    ]
 
 
 def _path_section(view: PathView) -> Block:
@@ -180,22 +199,48 @@ def _path_section(view: PathView) -> Block:
     band = (view.step - 2 * view.step_std, view.step + 2 * view.step_std)
     zeros = tuple([Marks("zeros", view.zeros.real, view.zeros.imag, marker="o")] if view.zeros.size else [])
     step = Figure(
-        title=f"{view.name}: step response", x_label="time, h", y_label=unit,
-        lines=(Line("step, ± 2 standard errors", hours, view.step, band=band),), limits=(view.gain,), height=3.2,
+        title=f"{view.name}: step response",
+        x_label="time, h",
+        y_label=unit,
+        lines=(Line("step, ± 2 standard errors", hours, view.step, band=band),),
+        limits=(view.gain,),
+        height=3.2,
         note=f"Settles at {with_std(view.gain, view.gain_std)} {unit} (dashed).",
-    )  # fmt: skip
-    impulse = Figure(title=f"{view.name}: impulse response", x_label="time, h", y_label=f"{unit} per sample",
-                     lines=(Line("impulse", hours, view.impulse),), height=3.2)  # fmt: skip
+    )
+    impulse = Figure(
+        title=f"{view.name}: impulse response",
+        x_label="time, h",
+        y_label=f"{unit} per sample",
+        lines=(Line("impulse", hours, view.impulse),),
+        height=3.2,
+    )
     bode = (
-        Figure(title=f"{view.name}: magnitude", x_label="frequency, 1/h", y_label=unit, x_log=True, y_log=True,
-               lines=(Line("magnitude", view.frequency_per_h, view.magnitude),), height=3.2),
-        Figure(title=f"{view.name}: phase", x_label="frequency, 1/h", y_label="degrees", x_log=True,
-               lines=(Line("phase", view.frequency_per_h, view.phase_deg),), height=3.2),
-    )  # fmt: skip
+        Figure(
+            title=f"{view.name}: magnitude",
+            x_label="frequency, 1/h",
+            y_label=unit,
+            x_log=True,
+            y_log=True,
+            lines=(Line("magnitude", view.frequency_per_h, view.magnitude),),
+            height=3.2,
+        ),
+        Figure(
+            title=f"{view.name}: phase",
+            x_label="frequency, 1/h",
+            y_label="degrees",
+            x_log=True,
+            lines=(Line("phase", view.frequency_per_h, view.phase_deg),),
+            height=3.2,
+        ),
+    )
     plane = Figure(
-        title=f"{view.name}: poles and zeros, z plane", x_label="real part", y_label="imaginary part", unit_circle=True,
-        marks=(Marks("poles", view.poles.real, view.poles.imag), *zeros), height=3.2,
-    )  # fmt: skip
+        title=f"{view.name}: poles and zeros, z plane",
+        x_label="real part",
+        y_label="imaginary part",
+        unit_circle=True,
+        marks=(Marks("poles", view.poles.real, view.poles.imag), *zeros),
+        height=3.2,
+    )
     return Section(
         title=f"{view.name}",
         blocks=[
@@ -208,18 +253,26 @@ def _path_section(view: PathView) -> Block:
 def _still(view: ResidualView) -> Block:
     lags = np.arange(1, view.autocorrelation.size + 1, dtype=np.float64)
     own = Figure(
-        title=f"{view.name}: autocorrelation of the residual", x_label="lag, samples", y_label="correlation",
-        stems=(Stems("residual", lags, view.autocorrelation),), limits=(-view.limit, view.limit), height=3.0,
+        title=f"{view.name}: autocorrelation of the residual",
+        x_label="lag, samples",
+        y_label="correlation",
+        stems=(Stems("residual", lags, view.autocorrelation),),
+        limits=(-view.limit, view.limit),
+        height=3.0,
         note=f"Dashed: 99 % of white noise. Chance of so much in white noise: {_chance(view.white_chance)}.",
-    )  # fmt: skip
+    )
     both = np.arange(-LAGS, LAGS + 1, dtype=np.float64)
     cross = tuple(
         Figure(
-            title=f"{view.name}: correlation of the residual with {name}", x_label="lag, samples",
-            y_label="correlation", stems=(Stems(name, both, values),), limits=(-limit, limit), height=3.0,
+            title=f"{view.name}: correlation of the residual with {name}",
+            x_label="lag, samples",
+            y_label="correlation",
+            stems=(Stems(name, both, values),),
+            limits=(-limit, limit),
+            height=3.0,
         )
         for name, (values, limit) in view.cross.items()
-    )  # fmt: skip
+    )
     return Row(figures=(own, *cross))
 
 
@@ -230,14 +283,19 @@ def _chance(share: float) -> str:
 def _choice(calibration: Calibration) -> Block:
     def table(title: str, candidates: Sequence[Candidate]) -> Table:
         return Table(
-            title=title, head=["structure", "held-out rms, µm", "worst block, µm", ""],
+            title=title,
+            head=["structure", "held-out rms, µm", "worst block, µm", ""],
             rows=[
-                [str(c.structure), f"{c.rms:.3f}", f"{max(c.fold_rms):.3f}",
-                 "chosen" if c.chosen else "" if c.supported else "not determined by the data"]
+                [
+                    str(c.structure),
+                    f"{c.rms:.3f}",
+                    f"{max(c.fold_rms):.3f}",
+                    "chosen" if c.chosen else "" if c.supported else "not determined by the data",
+                ]
                 for c in candidates
             ],
             note="The simplest whose held-out error is not worse than the best one's by more than its standard error.",
-        )  # fmt: skip
+        )
 
     blocks = [
         table("DTF and TDTF" if calibration.settings.method == "IV" else "DTF", calibration.deformation.candidates)
@@ -256,12 +314,16 @@ def _compared(rows: Sequence[Comparison]) -> Table:
             for r in rows
         ],
         note="Functions of s (1/min), highest denominator coefficient 1.",
-    )  # fmt: skip
+    )
 
 
 def _provenance(calibration: Calibration, model: ThermalModel) -> Block:
-    rows = [["model", model.name], ["kind", model.kind], ["method", calibration.settings.method],
-            ["SHA-256 of the model file", model.sha256]]  # fmt: skip
+    rows = [
+        ["model", model.name],
+        ["kind", model.kind],
+        ["method", calibration.settings.method],
+        ["SHA-256 of the model file", model.sha256],
+    ]
     for entry in model.provenance.get("data", []):
         rows.append([f"{entry['role']}: {entry['file']}", entry["sha256"]])
     for name, (low, high) in model.validity.items():

@@ -297,13 +297,11 @@ def _classes(table: Table) -> str:
     """Return the classes that set columns of words left, and break lines in those of sentences."""
     words = sorted(columns_of_words(table))
     long = [
-        i for i in words
-        if max((len(text_of(row[i])) for row in table.rows if i < len(row)), default=0) > _SENTENCE
-    ]  # fmt: skip
+        i for i in words if max((len(text_of(row[i])) for row in table.rows if i < len(row)), default=0) > _SENTENCE
+    ]
     broken = [
-        i for i in words
-        if i not in long and any(_has_long_word(text_of(row[i])) for row in table.rows if i < len(row))
-    ]  # fmt: skip
+        i for i in words if i not in long and any(_has_long_word(text_of(row[i])) for row in table.rows if i < len(row))
+    ]
     return " ".join(
         [*(f"text-{i + 1}" for i in words), *(f"long-{i + 1}" for i in long), *(f"name-{i + 1}" for i in broken)]
     )

@@ -167,9 +167,13 @@ def _sheet(pieces: Sequence[_Piece], height: float, whole: float) -> Canvas:
     room = max(height - sum(heights), 1e-3)
     # Margins are rows and columns of their own: parts of a figure know no others.
     grid = canvas.add_gridspec(
-        len(pieces) + 3, 3, height_ratios=[_MARGIN_IN, *heights, room, _MARGIN_IN], hspace=0.0, wspace=0.0,
+        len(pieces) + 3,
+        3,
+        height_ratios=[_MARGIN_IN, *heights, room, _MARGIN_IN],
+        hspace=0.0,
+        wspace=0.0,
         width_ratios=[_MARGIN_IN, _WIDTH_IN, _MARGIN_IN],
-    )  # fmt: skip
+    )
     for i, piece in enumerate(pieces, start=1):
         piece.draw(canvas.add_subfigure(grid[i, 1]), piece.height)
     return canvas
@@ -240,8 +244,9 @@ def _framed(part: SubFigure, figure: Figure, width: float, height: float) -> Non
         rows = sum(name.count("\n") + 1 for name in names) / max(getattr(legend, "_ncols", 1), 1)
     labels = [label.get_text() for label in axes.get_yticklabels()] if figure.strips else []
     left = max([0.62, *(_width(label, 9.0) + 0.45 for label in labels)])
-    axes.set_position((left / width, 0.5 / height, 1.0 - (left + 0.15) / width,
-                       max(1.0 - (0.6 + 0.2 * -(-rows // 1)) / height, 0.2)))  # fmt: skip
+    axes.set_position(
+        (left / width, 0.5 / height, 1.0 - (left + 0.15) / width, max(1.0 - (0.6 + 0.2 * -(-rows // 1)) / height, 0.2))
+    )
 
 
 def _beside(columns: Sequence[Sequence[str]], width: float, size: float, *, bold: bool = False) -> Iterator[_Piece]:

@@ -43,9 +43,18 @@ _ROWS = 12
 _ENDS: Mapping[str, Cell] = {"finished": Code("finished"), "no end": Code("open")}
 #: Curves in a picture of channels, and pieces of time shaded in one.
 _CURVES, _SHADED = 5, 100
-_UNITS = (("_degc", "temperature, °C"), ("_um", "displacement, µm"), ("_w", "power, W"), ("_rpm", "speed, 1/min"),
-          ("_k", "temperature difference, K"), ("_pct", "share, %"), ("_a", "current, A"), ("_v", "voltage, V"),
-          ("_bar", "pressure, bar"), ("_l_per_min", "flow, l/min"))  # fmt: skip
+_UNITS = (
+    ("_degc", "temperature, °C"),
+    ("_um", "displacement, µm"),
+    ("_w", "power, W"),
+    ("_rpm", "speed, 1/min"),
+    ("_k", "temperature difference, K"),
+    ("_pct", "share, %"),
+    ("_a", "current, A"),
+    ("_v", "voltage, V"),
+    ("_bar", "pressure, bar"),
+    ("_l_per_min", "flow, l/min"),
+)
 
 
 def page_of(history: History) -> Page:
@@ -71,22 +80,31 @@ def page_of(history: History) -> Page:
     blocks += [_shares(history), *_residual(history), *_temperatures(history), *_days(history), _missed(history)]
     blocks += [_events(history), *_other_channels(history), _files(history)]
     return Page(
-        title=f"{history.machine or 'Recordings'}: {span(history)}", verdict=verdict(history), blocks=blocks,
+        title=f"{history.machine or 'Recordings'}: {span(history)}",
+        verdict=verdict(history),
+        blocks=blocks,
         tone=_tone(history),
-    )  # fmt: skip
+    )
 
 
 def figures(history: History) -> dict[str, object]:
     """Return the figures of the page, for `--json`."""
     whole = history.whole
     return {
-        "machine": history.machine, "from_utc": _utc(history.first_s), "to_utc": _utc(history.last_s),
-        "samples": whole.samples, "files": len(history.files),
+        "machine": history.machine,
+        "from_utc": _utc(history.first_s),
+        "to_utc": _utc(history.last_s),
+        "samples": whole.samples,
+        "files": len(history.files),
         "minutes": {state: round(seconds / 60.0, 1) for state, seconds in whole.seconds.items()},
-        "largest_offset_um": _null(whole.offset.peak), "residual_rms_um": _null(whole.residual.rms),
-        "measured_rms_um": _null(whole.measured.rms), "left_rms_um": _null(whole.left.rms),
-        "models": list(history.models), "events": history.events_count, "alarms": history.episodes_count,
-    }  # fmt: skip
+        "largest_offset_um": _null(whole.offset.peak),
+        "residual_rms_um": _null(whole.residual.rms),
+        "measured_rms_um": _null(whole.measured.rms),
+        "left_rms_um": _null(whole.left.rms),
+        "models": list(history.models),
+        "events": history.events_count,
+        "alarms": history.episodes_count,
+    }
 
 
 def span(history: History) -> str:
@@ -153,21 +171,39 @@ def _tone(history: History) -> Tone:
 # ---------------------------------------------------------------------------- pictures
 
 
-def _picture(history: History, title: str, y_label: str, curves: Mapping[str, str], note: str = "", height: float = 2.8,
-             spans: tuple[Span, ...] = ()) -> Figure:  # fmt: skip
+def _picture(
+    history: History,
+    title: str,
+    y_label: str,
+    curves: Mapping[str, str],
+    note: str = "",
+    height: float = 2.8,
+    spans: tuple[Span, ...] = (),
+) -> Figure:
     drawn = [(name, history.curves[key]) for name, key in curves.items() if key in history.curves]
     lines = tuple(line_of(name, curve) for name, curve in drawn)
     if any(line.band is not None for line in lines):
         note = f"{note} Lines are means, shaded is what lies between the lowest and the highest.".strip()
-    return Figure(title=title, x_label=TIME, y_label=y_label, lines=lines, clock=True, height=height, note=note,
-                  x_limits=(history.first_s, history.last_s), spans=spans)  # fmt: skip
+    return Figure(
+        title=title,
+        x_label=TIME,
+        y_label=y_label,
+        lines=lines,
+        clock=True,
+        height=height,
+        note=note,
+        x_limits=(history.first_s, history.last_s),
+        spans=spans,
+    )
 
 
 def _offset(history: History) -> Figure:
     stood = [
-        Span("offset held", *piece) for state in ("hold", "fault") if state in history.states
+        Span("offset held", *piece)
+        for state in ("hold", "fault")
+        if state in history.states
         for piece in history.states[state].pieces
-    ]  # fmt: skip
+    ]
     curves = {"offset": "offset"}
     words = f"Largest offset {_um(history.whole.offset.peak, 1)} µm."
     if history.whole.left.samples:
@@ -179,16 +215,23 @@ def _offset(history: History) -> Figure:
 def _band(history: History) -> Figure:
     strips = [
         Strip(state, tuple(history.states[state].pieces), 1 if state == "ok" else 0)
-        for state in STATES if state in history.states
-    ]  # fmt: skip
+        for state in STATES
+        if state in history.states
+    ]
     strips += [Strip(reason, tuple(stretch.pieces), 3) for reason, stretch in history.reasons.items()]
     if history.events:
         strips.append(Strip("events", tuple((t, t) for t, _, _ in history.events), 4))
     shares = [f"{state} {_share(history, state)}" for state in STATES if state in history.states]
     return Figure(
-        title="States and reasons", x_label=TIME, y_label="state, reason", strips=tuple(strips), clock=True,
-        x_limits=(history.first_s, history.last_s), height=1.1 + 0.27 * len(strips), note=f"{', '.join(shares)}.",
-    )  # fmt: skip
+        title="States and reasons",
+        x_label=TIME,
+        y_label="state, reason",
+        strips=tuple(strips),
+        clock=True,
+        x_limits=(history.first_s, history.last_s),
+        height=1.1 + 0.27 * len(strips),
+        note=f"{', '.join(shares)}.",
+    )
 
 
 def _shares(history: History) -> Figure:
@@ -220,10 +263,16 @@ def _other_channels(history: History) -> list[Block]:
             unit = next((words for ending, words in _UNITS if name.endswith(ending)), f"{name}, unit as in its name")
             groups[unit].append(name)
     pictures = [
-        _picture(history, f"Other channels: {unit.partition(',')[0]}", unit,
-                 {name: f"channel {name}" for name in names[i : i + _CURVES]}, height=2.4)
-        for unit, names in groups.items() for i in range(0, len(names), _CURVES)
-    ]  # fmt: skip
+        _picture(
+            history,
+            f"Other channels: {unit.partition(',')[0]}",
+            unit,
+            {name: f"channel {name}" for name in names[i : i + _CURVES]},
+            height=2.4,
+        )
+        for unit, names in groups.items()
+        for i in range(0, len(names), _CURVES)
+    ]
     return [Details(title="Other channels", blocks=pictures)] if pictures else []
 
 
@@ -281,8 +330,17 @@ def _episodes(history: History) -> Block:
 def _days(history: History) -> list[Block]:
     if len(history.days) < 2:
         return []
-    head = ["day", "samples", "ok, min", "degraded, min", "held, min", "away, min", "largest offset, µm",
-            "left, µm rms", "residual, µm rms"]  # fmt: skip
+    head = [
+        "day",
+        "samples",
+        "ok, min",
+        "degraded, min",
+        "held, min",
+        "away, min",
+        "largest offset, µm",
+        "left, µm rms",
+        "residual, µm rms",
+    ]
     days = [_day(date, period) for date, period in sorted(history.days.items())]
     if len(days) <= _DAYS:
         return [Table(title="Day by day", head=head, rows=days)]
@@ -300,8 +358,14 @@ def _day(name: str, period: Period) -> list[Cell]:
     seconds = period.seconds
     held = sum(seconds[state] for state in ("starting", "hold", "fault"))
     times = (seconds["ok"], seconds["degraded"], held, seconds[NO_RECORDING])
-    return [name, str(period.samples), *map(_minutes, times), _um(period.offset.peak, 1), _plain(period.left.rms, 2),
-            _plain(period.residual.rms, 2)]  # fmt: skip
+    return [
+        name,
+        str(period.samples),
+        *map(_minutes, times),
+        _um(period.offset.peak, 1),
+        _plain(period.left.rms, 2),
+        _plain(period.residual.rms, 2),
+    ]
 
 
 def _missed(history: History) -> Block:
@@ -309,18 +373,26 @@ def _missed(history: History) -> Block:
     for name, missed in history.channels.items():
         if missed.missing or missed.errors:
             why = _codes(missed.qualities)
-            rows.append([name, f"{missed.missing}", f"{100.0 * missed.missing / missed.samples:.1f} %", why,
-                         _codes(missed.errors)])  # fmt: skip
+            rows.append(
+                [
+                    name,
+                    f"{missed.missing}",
+                    f"{100.0 * missed.missing / missed.samples:.1f} %",
+                    why,
+                    _codes(missed.errors),
+                ]
+            )
     if not rows:
         return Words(
             title="What the devices missed", lines=["Nothing: every channel had a good value in every sample."]
         )
     whole = len(history.channels) - len(rows)
     return Table(
-        title="What the devices missed", rows=rows,
+        title="What the devices missed",
+        rows=rows,
         head=["channel", "samples missing", "share", "why", "single bad readings"],
         note=f"{whole} other channel(s) had a good value in every sample." if whole else "",
-    )  # fmt: skip
+    )
 
 
 def _codes(counts: Mapping[str, int]) -> Cell:
@@ -345,11 +417,15 @@ def _files(history: History) -> Details:
     return Details(
         title=f"{len(files)} recording(s), {len(models)} model(s)",
         blocks=[
-            Table(title="Recordings", head=["file", "samples", "first, UTC", "last, UTC", "end"], rows=files,
-                  note="Whether anything was changed is not looked at here: compensator replay does."),
+            Table(
+                title="Recordings",
+                head=["file", "samples", "first, UTC", "last, UTC", "end"],
+                rows=files,
+                note="Whether anything was changed is not looked at here: compensator replay does.",
+            ),
             Table(title="Models", head=["model", "from, UTC", "SHA-256"], rows=models),
         ],
-    )  # fmt: skip
+    )
 
 
 def _folded(title: str, head: Sequence[str], rows: Sequence[Sequence[Cell]], note: str) -> Block:

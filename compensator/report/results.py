@@ -99,9 +99,10 @@ def overview(folder: Path, pages: Sequence[Found], *, beside: Path) -> Page:
     if folders:
         blocks.append(
             Table(
-                title="Recordings", head=["folder", "files"],
+                title="Recordings",
+                head=["folder", "files"],
                 rows=[[str(path.relative_to(folder)), str(len(list(path.glob("*.mcap"))))] for path in folders],
                 note="compensator report FOLDER makes a page of each.",
             )
-        )  # fmt: skip
+        )
     return Page(title=f"{folder.resolve().name}: {first.title}", verdict=first.verdict, tone=first.tone, blocks=blocks)

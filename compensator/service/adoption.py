@@ -89,9 +89,11 @@ class Wanted:
                 expected = "sha256 and model (texts), force (true or false)"
                 raise ServiceError(f"{action}: {key!r} = {str(value)[:40]!r}, expected {expected}")
         wanted = cls(
-            action=action, sha256=arguments.get("sha256", ""), text=arguments.get("model", ""),
+            action=action,
+            sha256=arguments.get("sha256", ""),
+            text=arguments.get("model", ""),
             force=arguments.get("force", False),
-        )  # fmt: skip
+        )
         if action == "adopt" and not (wanted.sha256 or wanted.text):
             raise ServiceError("adopt: expected model, the text of a model file, or sha256, that of one adopted before")
         if wanted.text and wanted.sha256 and sha256_of(wanted.text.encode()) != wanted.sha256:

@@ -119,12 +119,18 @@ class Compensation:
         """Return the message that the last offset stands, for a sample that could not be worked on."""
         stands = self._limiter.offset_um if self._memory.estimate else NAN
         return Offset(
-            schema=SCHEMA, machine=machine, seq=seq, time_utc_ns=time_utc_ns,
-            valid_for_s=VALID_SAMPLES * self.model.period_s, y_offset_um=stands,
-            y_offset_rate_um_per_min=0.0 if self._memory.estimate else NAN, y_offset_std_um=NAN,
-            state="hold" if self._memory.estimate else "fault", reasons=["internal_error"],
+            schema=SCHEMA,
+            machine=machine,
+            seq=seq,
+            time_utc_ns=time_utc_ns,
+            valid_for_s=VALID_SAMPLES * self.model.period_s,
+            y_offset_um=stands,
+            y_offset_rate_um_per_min=0.0 if self._memory.estimate else NAN,
+            y_offset_std_um=NAN,
+            state="hold" if self._memory.estimate else "fault",
+            reasons=["internal_error"],
             model_sha256=self.model.sha256,
-        )  # fmt: skip
+        )
 
     # ------------------------------------------------------------------ state
 
@@ -169,9 +175,11 @@ class Compensation:
         """The zero, as `begin` takes it."""
         reference = self._engine.reference
         return {
-            "t_q_ref_degc": reference.t_q_degc, "at_ref_degc": reference.at_degc,
-            "y_ref_um": self._zero.y_ref, "y_base_um": self._zero.y_base,
-        }  # fmt: skip
+            "t_q_ref_degc": reference.t_q_degc,
+            "at_ref_degc": reference.at_degc,
+            "y_ref_um": self._zero.y_ref,
+            "y_base_um": self._zero.y_base,
+        }
 
     @property
     def is_cold(self) -> bool:
@@ -186,12 +194,19 @@ class Compensation:
 
     def state(self) -> bytes:
         """Return everything that decides the next outcome, as JSON that keeps every bit."""
-        return encode_state(CompensationState(
-            schema=STATE_SCHEMA, model_sha256=self.model.sha256, alternative=self._config.model.alternative,
-            engine=self._engine.snapshot(), guards=self._guards.snapshot(), offset_um=self._limiter.offset_um,
-            zero=self._zero, memory=self._memory,
-            plausibility=self.plausibility.state if self.plausibility.is_on else None,
-        ))  # fmt: skip
+        return encode_state(
+            CompensationState(
+                schema=STATE_SCHEMA,
+                model_sha256=self.model.sha256,
+                alternative=self._config.model.alternative,
+                engine=self._engine.snapshot(),
+                guards=self._guards.snapshot(),
+                offset_um=self._limiter.offset_um,
+                zero=self._zero,
+                memory=self._memory,
+                plausibility=self.plausibility.state if self.plausibility.is_on else None,
+            )
+        )
 
     def restore(self, state: bytes) -> None:
         """Go on from a state; all further outcomes are those that would have followed, bit for bit.
@@ -379,12 +394,14 @@ class Compensation:
             zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
         self.plausibility.zeroed(at_rest=not warm)
-        notes.append((
-            "zero",
-            f"zero on a {'warm machine' if warm else 'machine at rest'}: "
-            f"T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C, "
-            + ("Y not measured" if math.isnan(values.y) else f"Y {values.y:.3f} µm"),
-        ))  # fmt: skip
+        notes.append(
+            (
+                "zero",
+                f"zero on a {'warm machine' if warm else 'machine at rest'}: "
+                f"T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C, "
+                + ("Y not measured" if math.isnan(values.y) else f"Y {values.y:.3f} µm"),
+            )
+        )
 
     def _is_warm(self, mode: ZeroMode) -> bool:
         if mode != "auto" or not self._memory.rates:
@@ -435,9 +452,10 @@ class Compensation:
         outside = [
             f"outside_validity:{name}"
             for name, value in (("t_q_degc", values.t_q), ("at_degc", values.at), ("heat_w", heat))
-            if name in self._validity and not math.isnan(value)
+            if name in self._validity
+            and not math.isnan(value)
             and not self._validity[name][0] <= value <= self._validity[name][1]
-        ]  # fmt: skip
+        ]
         flags = (
             ("prediction_expired", expired),
             ("residual_too_large", self.plausibility.too_large),

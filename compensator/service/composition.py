@@ -15,20 +15,20 @@ from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Caution
-from compensator.recording import first_sequence
+from compensator.recording.finishing import Retention
+from compensator.recording.reading import first_sequence
+from compensator.recording.recorder import Recorder
+from compensator.recording.signature import Signer
 from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Outcome
+from compensator.service.configuration_warnings import precautions
 from compensator.service.daemon import Daemon
-from compensator.service.early import EarlyNote
-from compensator.service.finishing import Retention
 from compensator.service.model_store import ModelStore
-from compensator.service.precautions import precautions
+from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.presence import sole_user
 from compensator.service.publisher import Publisher, Reply, Sender
-from compensator.service.recorder import Recorder
 from compensator.service.restart import resume
 from compensator.service.session import tls_files
-from compensator.signature import Signer
 from drivers.errors import DriverConfigError, DriverError
 from drivers.reading import Reading
 
@@ -127,10 +127,15 @@ async def read_once(fleet: drivers.Fleet) -> dict[str, dict[int, Reading] | Driv
 
 
 async def run_service(
-    path: str, *, clock: Clock | None = None, samples: int | None = None,
-    on_ready: Callable[[Daemon], None] | None = None, on_sample: Callable[[Outcome], None] | None = None,
-    on_poll: Callable[[], None] | None = None, on_publish: Callable[[str, bytes], None] | None = None,
-) -> Daemon:  # fmt: skip
+    path: str,
+    *,
+    clock: Clock | None = None,
+    samples: int | None = None,
+    on_ready: Callable[[Daemon], None] | None = None,
+    on_sample: Callable[[Outcome], None] | None = None,
+    on_poll: Callable[[], None] | None = None,
+    on_publish: Callable[[str, bytes], None] | None = None,
+) -> Daemon:
     """Run the service of a configuration until it is stopped.
 
     Parameters
@@ -174,16 +179,23 @@ async def run_service(
         except ConfigError as error:  # recording goes on, whether anybody can be told or not
             log.error("%s; the router will refuse the service", error)
         store = ModelStore(loaded.store(), read_model_bytes(loaded.model_name()))
-        note = EarlyNote(folder, config.machine.name)
+        note = OffsetCheckpoint(folder, config.machine.name)
         early = note.read(config.limits.offset_max_um)
         resumed = resume(loaded, model, early)
         first = first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s)
         checks: tuple[str, str, dict[str, Any]] = ("plausibility", resumed.compensation.plausibility.describe(), {})
         daemon = Daemon(
-            config=config, compensation=resumed.compensation, devices=fleet.devices, recorder=recorder,
-            publish=publish, clock=clock, first_sequence=max(first, early.seq + 1 if early is not None else 0),
-            adoption=Adoption(config, folder, store), notes=(*resumed.notes, checks), early=note,
-        )  # fmt: skip
+            config=config,
+            compensation=resumed.compensation,
+            devices=fleet.devices,
+            recorder=recorder,
+            publish=publish,
+            clock=clock,
+            first_sequence=max(first, early.seq + 1 if early is not None else 0),
+            adoption=Adoption(config, folder, store),
+            notes=(*resumed.notes, checks),
+            early=note,
+        )
         try:
             with publisher:
                 if on_ready is not None:

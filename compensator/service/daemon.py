@@ -19,9 +19,9 @@ from compensator.messages import SCHEMA, Offset, Sample, Status, encode
 from compensator.service.adoption import Adoption
 from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.early import EarlyNote
 from compensator.service.grid import Grid
 from compensator.service.journal import Entry, Journal
+from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.publisher import UNNAMED, Reply, Sender
 from compensator.service.retrace import samples_between
 from compensator.service.sampling import ChannelCollector
@@ -97,16 +97,24 @@ class Daemon:
         Prepares other models; without it the commands `adopt` and `back` are refused.
     notes : sequence of (str, str, dict)
         Events of what went before: kind, text and data.
-    early : EarlyNote, optional
+    early : OffsetCheckpoint, optional
         Where an offset is noted that is published before it is on disk.
     """
 
     def __init__(
-        self, *, config: Config, compensation: Compensation, devices: Mapping[str, Device],
-        recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, first_sequence: int,
-        adoption: Adoption | None = None, notes: Sequence[tuple[str, str, dict[str, Any]]] = (),
-        early: EarlyNote | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        *,
+        config: Config,
+        compensation: Compensation,
+        devices: Mapping[str, Device],
+        recorder: Any,
+        publish: Callable[[str, bytes], None],
+        clock: Clock,
+        first_sequence: int,
+        adoption: Adoption | None = None,
+        notes: Sequence[tuple[str, str, dict[str, Any]]] = (),
+        early: OffsetCheckpoint | None = None,
+    ) -> None:
         self._config = config
         self._compensation = compensation
         self._devices = {name: _DeviceState(device) for name, device in devices.items()}
@@ -115,10 +123,15 @@ class Daemon:
         fraction = config.sampling.min_good_fraction
         self._collectors = {channel.name: ChannelCollector(fraction) for channel in config.channel}
         self._journal = Journal(
-            machine=config.machine.name, recorder=recorder, publish=publish, clock=clock, sequence=first_sequence,
+            machine=config.machine.name,
+            recorder=recorder,
+            publish=publish,
+            clock=clock,
+            sequence=first_sequence,
             limit_s=min(DISK_PART * config.sampling.poll_interval_s, DISK_S),
-            patience_s=min(max(PATIENCE_PART * compensation.model.period_s, DISK_S), PATIENCE_S), early=early,
-        )  # fmt: skip
+            patience_s=min(max(PATIENCE_PART * compensation.model.period_s, DISK_S), PATIENCE_S),
+            early=early,
+        )
         self._takeover = Takeover(adoption, self._journal, clock, lambda: self._compensation)
         self._commands = Commands(self._journal, self._takeover, unproven=config.zenoh.takes_unproven())
         self._stop = False
@@ -137,9 +150,12 @@ class Daemon:
     # ------------------------------------------------------------------ running
 
     async def run(
-        self, *, samples: int | None = None, on_sample: Callable[[Outcome], None] | None = None,
+        self,
+        *,
+        samples: int | None = None,
+        on_sample: Callable[[Outcome], None] | None = None,
         on_poll: Callable[[], None] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Run until `stop` or for a number of samples.
 
         Parameters
@@ -276,10 +292,13 @@ class Daemon:
         self._broken_off = True
         self._commands.obey(self._compensation)
         raw = Sample(
-            schema=SCHEMA, machine=self._config.machine.name, seq=self._journal.sequence, time_utc_ns=label_ns,
+            schema=SCHEMA,
+            machine=self._config.machine.name,
+            seq=self._journal.sequence,
+            time_utc_ns=label_ns,
             period_s=self._compensation.model.period_s,
             channels={name: collector.close() for name, collector in self._collectors.items()},
-        )  # fmt: skip
+        )
         outcome = self._compensation.process(raw)
         self._broken_off = False
         if broke_off:  # once for all that broke off in a row
@@ -341,22 +360,30 @@ class Daemon:
         else:
             self._compensation.pause(missing)
             text += (
-                f"{minutes:.0f} min are bridged" if minutes <= bridged
+                f"{minutes:.0f} min are bridged"
+                if minutes <= bridged
                 else f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
-            )  # fmt: skip
+            )
         self._journal.note("restart", text, data | {"y_std_um": self._compensation.std_um})
 
     def _status(self, outcome: Outcome) -> Status:
         model = self._compensation.model
         return Status(
-            schema=SCHEMA, machine=self._config.machine.name, seq=outcome.offset.seq,
-            time_utc_ns=outcome.offset.time_utc_ns, state=outcome.offset.state, reasons=outcome.offset.reasons,
-            version=__version__, model=model.name, model_kind=model.kind, model_sha256=model.sha256,
+            schema=SCHEMA,
+            machine=self._config.machine.name,
+            seq=outcome.offset.seq,
+            time_utc_ns=outcome.offset.time_utc_ns,
+            state=outcome.offset.state,
+            reasons=outcome.offset.reasons,
+            version=__version__,
+            model=model.name,
+            model_kind=model.kind,
+            model_sha256=model.sha256,
             started_utc_ns=self._started_utc_ns,
             recording=self._journal.file,
             devices={name: state.error or "ok" for name, state in self._devices.items()},
             effects=[effect.label for effect in model.effects],
-        )  # fmt: skip
+        )
 
     # ------------------------------------------------------------------ events and commands
 

@@ -115,7 +115,7 @@ class SensorGuards:
         """
         verdicts = {name: self._guards[name].judge(sample) for name, sample in channels.items()}
         if self._t_q_below_at(channels, verdicts, heat_w):
-            # Which of the two is wrong cannot be told: neither is used.
+            # Which of the two is wrong cannot be progress: neither is used.
             verdicts["t_q_degc"] = verdicts["at_degc"] = "t_q_below_at"
         return {
             name: sample

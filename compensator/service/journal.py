@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from compensator.clock import Clock
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
 from compensator.reasons import Caution
-from compensator.service.early import EarlyNote
+from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.recording_thread import FAILED, WAITING_EVENTS, Group, RecordingThread
 
 log = logging.getLogger("compensator")
@@ -49,14 +49,22 @@ class Journal:
         So long the loop stands still for the disk, s.
     patience_s : float
         So long an offset waits for the disk while polling goes on, s; not where the disk was late before.
-    early : EarlyNote, optional
+    early : OffsetCheckpoint, optional
         Where an offset is noted that is published before it is on disk.
     """
 
     def __init__(
-        self, *, machine: str, recorder: Any, publish: Callable[[str, bytes], None], clock: Clock, sequence: int,
-        limit_s: float, patience_s: float, early: EarlyNote | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        *,
+        machine: str,
+        recorder: Any,
+        publish: Callable[[str, bytes], None],
+        clock: Clock,
+        sequence: int,
+        limit_s: float,
+        patience_s: float,
+        early: OffsetCheckpoint | None = None,
+    ) -> None:
         self._machine = machine
         self._recorder = recorder
         self._publish = publish
@@ -81,17 +89,27 @@ class Journal:
     def note(self, kind: str, text: str, data: dict[str, Any] | None = None) -> None:
         """Keep an event for the recording and publish it."""
         event = Event(
-            schema=SCHEMA, machine=self._machine, seq=self.sequence, time_utc_ns=self._clock.utc_ns(), kind=kind,
-            text=text, data=data or {},
-        )  # fmt: skip
+            schema=SCHEMA,
+            machine=self._machine,
+            seq=self.sequence,
+            time_utc_ns=self._clock.utc_ns(),
+            kind=kind,
+            text=text,
+            data=data or {},
+        )
         # Bounded, so that a loop that cannot record costs no memory.
         self._events = [*self._events[1 - WAITING_EVENTS :], event]
         self._publish("event", encode(event))
 
     def put(
-        self, time_utc_ns: int, state: bytes, *, sample: bytes = b"", estimate: bytes = b"",
+        self,
+        time_utc_ns: int,
+        state: bytes,
+        *,
+        sample: bytes = b"",
+        estimate: bytes = b"",
         offset: Offset | None = None,
-    ) -> Entry:  # fmt: skip
+    ) -> Entry:
         """Have a sample and the waiting events brought to disk.
 
         Parameters
@@ -106,9 +124,15 @@ class Journal:
             What the compensation decided.
         """
         group = Group(
-            time_utc_ns=time_utc_ns, state=state, events=self._events, sample=sample, estimate=estimate, offset=offset,
-            new_file=self._new_file, model=self._model,
-        )  # fmt: skip
+            time_utc_ns=time_utc_ns,
+            state=state,
+            events=self._events,
+            sample=sample,
+            estimate=estimate,
+            offset=offset,
+            new_file=self._new_file,
+            model=self._model,
+        )
         self._events, self._new_file, self._model = [], False, None
         attempt = asyncio.wrap_future(self._thread.put(group))
         attempt.add_done_callback(lambda done: done.cancelled() or done.exception())  # seen, also when it ends later

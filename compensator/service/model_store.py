@@ -14,8 +14,8 @@ from typing import Literal
 
 import msgspec
 
-from compensator.durable import sync_folder
 from compensator.errors import ServiceError
+from compensator.recording.live_file import sync_folder
 
 _FILE = "adopted.json"
 

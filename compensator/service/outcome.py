@@ -75,8 +75,13 @@ def estimate_message(
     """Return what the model makes of a sample."""
     y = values.y - zero.y_ref
     return EstimateMessage(
-        schema=SCHEMA, machine=sample.machine, seq=sample.seq, time_utc_ns=sample.time_utc_ns,
-        t_q_ref_degc=reference.t_q_degc, at_ref_degc=reference.at_degc, y_ref_um=zero.y_ref,
+        schema=SCHEMA,
+        machine=sample.machine,
+        seq=sample.seq,
+        time_utc_ns=sample.time_utc_ns,
+        t_q_ref_degc=reference.t_q_degc,
+        at_ref_degc=reference.at_degc,
+        y_ref_um=zero.y_ref,
         heat_w=estimate.heat_w if estimate else NAN,
         heat_std_w=estimate.heat_std_w if estimate else NAN,
         y_dtf_um=estimate.y_dtf_um if estimate else NAN,
@@ -86,8 +91,9 @@ def estimate_message(
         y_pred_um=y_pred_um,
         y_std_um=estimate.y_std_um if estimate else NAN,
         y_rate_um_per_min=estimate.y_rate_um_per_min if estimate else NAN,
-        y_um=y, residual_um=y - y_pred_um,
-    )  # fmt: skip
+        y_um=y,
+        residual_um=y - y_pred_um,
+    )
 
 
 def offset_message(
@@ -95,10 +101,15 @@ def offset_message(
 ) -> Offset:
     """Return what is published."""
     return Offset(
-        schema=SCHEMA, machine=sample.machine, seq=sample.seq, time_utc_ns=sample.time_utc_ns,
+        schema=SCHEMA,
+        machine=sample.machine,
+        seq=sample.seq,
+        time_utc_ns=sample.time_utc_ns,
         valid_for_s=VALID_SAMPLES * model.period_s,
         y_offset_um=limited.offset_um if limited else NAN,
         y_offset_rate_um_per_min=limited.rate_um_per_min if limited else NAN,
         y_offset_std_um=std_um,
-        state=state, reasons=reasons, model_sha256=model.sha256,
-    )  # fmt: skip
+        state=state,
+        reasons=reasons,
+        model_sha256=model.sha256,
+    )

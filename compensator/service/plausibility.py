@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 
 from compensator.config import Config, Plausibility
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.suspects import LOG_ODDS, Block, Fit, Suspects
+from compensator.service.fault_isolation import LOG_ODDS, Block, Fit, Suspects
 
 NAN = float("nan")
 
@@ -173,13 +173,17 @@ class PlausibilityCheck:
             else "exchanged T_Q and AT off (no plausibility.t_q_below_at_after_min)"
         )
         parts.append(
-            f"T_Q and AT at rest by {limits.rest.channel}" if limits.rest is not None else
-            "T_Q and AT at rest off (no plausibility.rest)"
-        )  # fmt: skip
+            f"T_Q and AT at rest by {limits.rest.channel}"
+            if limits.rest is not None
+            else "T_Q and AT at rest off (no plausibility.rest)"
+        )
         why = (
-            "no plausibility.false_alarm_days" if limits.false_alarm_days is None else
-            "Y is not measured" if not self._has_y else "the model states no error: plausibility.residual_std_um"
-        )  # fmt: skip
+            "no plausibility.false_alarm_days"
+            if limits.false_alarm_days is None
+            else "Y is not measured"
+            if not self._has_y
+            else "the model states no error: plausibility.residual_std_um"
+        )
         parts.append(
             f"residual of {self.residual_std_um:.2g} µm, one false alarm in {limits.false_alarm_days:g} days"
             if self._watched
@@ -190,7 +194,7 @@ class PlausibilityCheck:
     # ------------------------------------------------------------------ one sample
 
     def take(self, evidence: Evidence) -> list[tuple[str, str]]:
-        """Take one sample in; return what is to be told: kind and text."""
+        """Take one sample in; return what is to be progress: kind and text."""
         self._notes = []
         self._take_difference(evidence.below_k)
         self._take_rest(evidence)
@@ -239,9 +243,7 @@ class PlausibilityCheck:
         """Let samples pass that nobody took."""
         self.state.rest_min = 0.0
         if self._watched:
-            nothing = Evidence(
-                below_k=NAN, apart_k=NAN, rest=NAN, residual_um=NAN, std_um=NAN, predicted_um=NAN
-            )  # fmt: skip
+            nothing = Evidence(below_k=NAN, apart_k=NAN, rest=NAN, residual_um=NAN, std_um=NAN, predicted_um=NAN)
             for _ in range(min(samples, WINDOW * BLOCK_SAMPLES)):
                 self._take_residual(nothing)
 

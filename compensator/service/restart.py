@@ -16,9 +16,9 @@ from compensator.config import Config, LoadedConfig
 from compensator.errors import CompensatorError, DataError
 from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation
-from compensator.service.early import Early
+from compensator.service.offset_checkpoint import Early
 from compensator.service.retrace import opening_of, replayed, steps_of, warm_up
 from compensator.service.state import CompensationState, decode_state
 
@@ -91,8 +91,9 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: Early | None = None
         resumed.note(
             f"goes on from the offset {early.y_offset_um:.3f} µm of sample {early.seq}, "
             "which was published while the disk did not take it",
-            early_seq=early.seq, offset_um=early.y_offset_um,
-        )  # fmt: skip
+            early_seq=early.seq,
+            offset_um=early.y_offset_um,
+        )
     return resumed
 
 
@@ -163,8 +164,9 @@ def _restore(resumed: Resumed, last: _Last, config: Config) -> None:
     if differing:
         resumed.note(
             f"{differing} offset(s) of {last.path.name} come out otherwise than they were published: audit it",
-            file=last.path.name, differing=differing,
-        )  # fmt: skip
+            file=last.path.name,
+            differing=differing,
+        )
     if outcome is not None:
         # Not what is worked out for a torn last sample, whose offset nobody got.
         compensation.go_on_from(last.offset_um, model_changed=compensation.is_under_way)
@@ -172,8 +174,11 @@ def _restore(resumed: Resumed, last: _Last, config: Config) -> None:
     resumed.compensation = compensation
     resumed.note(
         f"goes on from {last.path.name}: {last.samples} sample(s) run again, the last one {seq}",
-        file=last.path.name, samples=last.samples, last_seq=seq, offset_um=compensation.offset_um,
-    )  # fmt: skip
+        file=last.path.name,
+        samples=last.samples,
+        last_seq=seq,
+        offset_um=compensation.offset_um,
+    )
 
 
 def _warm(resumed: Resumed, last: _Last, folder: Path, config: Config, model: ThermalModel, changes: list[str]) -> None:
@@ -194,5 +199,8 @@ def _warm(resumed: Resumed, last: _Last, folder: Path, config: Config, model: Th
     resumed.note(
         f"{why}; warmed up on {warm.samples} sample(s) of {warm.minutes / 60.0:.1f} h"
         + ("" if warm.known else ", which is too short to know the state"),
-        samples=warm.samples, warm_up_min=warm.minutes, known=warm.known, std_um=warm.compensation.std_um,
-    )  # fmt: skip
+        samples=warm.samples,
+        warm_up_min=warm.minutes,
+        known=warm.known,
+        std_um=warm.compensation.std_um,
+    )

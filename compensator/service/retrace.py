@@ -15,11 +15,11 @@ import msgspec
 
 from compensator.clock import NS
 from compensator.config import Config
-from compensator.container import Container
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Event, Offset, Sample, number
 from compensator.model.thermal_model import ThermalModel
-from compensator.recording import Recorded, decode, read_messages, recordings
+from compensator.recording.container import Container
+from compensator.recording.reading import Recorded, decode, read_messages, recordings
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.state import CompensationState, ZeroMode, decode_state
 
@@ -207,9 +207,11 @@ def warm_up(
         raise DataError(f"{folder}: no zero on record, and the model before took the temperatures as they are")
     else:
         compensation.begin(
-            t_q_ref_degc=number(window.last.t_q_ref_degc), at_ref_degc=number(window.last.at_ref_degc),
-            y_ref_um=number(window.last.y_ref_um), y_base_um=window.last.y_base_um,
-        )  # fmt: skip
+            t_q_ref_degc=number(window.last.t_q_ref_degc),
+            at_ref_degc=number(window.last.at_ref_degc),
+            y_ref_um=number(window.last.y_ref_um),
+            y_base_um=window.last.y_base_um,
+        )
     for path in window.files:
         run.new_file = True
         for step in steps_of(path):
@@ -224,9 +226,12 @@ def warm_up(
     if not same and model.inputs == "changes" and not absolute:
         raise DataError(f"{folder}: the recordings do not lead to the zero that stands")
     return WarmUp(
-        compensation=compensation, samples=run.samples, minutes=run.minutes, known=not compensation.is_cold,
+        compensation=compensation,
+        samples=run.samples,
+        minutes=run.minutes,
+        known=not compensation.is_cold,
         offset=run.offset,
-    )  # fmt: skip
+    )
 
 
 class _Run:
@@ -330,7 +335,9 @@ def _has_same_zero(state: CompensationState | None, last: EstimateMessage) -> bo
         return False
     reference = state.engine.reference
     pairs = (
-        (reference.t_q_degc, last.t_q_ref_degc), (reference.at_degc, last.at_ref_degc),
-        (state.zero.y_ref, last.y_ref_um), (state.zero.y_base, last.y_base_um),
-    )  # fmt: skip
+        (reference.t_q_degc, last.t_q_ref_degc),
+        (reference.at_degc, last.at_ref_degc),
+        (state.zero.y_ref, last.y_ref_um),
+        (state.zero.y_base, last.y_base_um),
+    )
     return all(a == number(b) or (math.isnan(a) and math.isnan(number(b))) for a, b in pairs)

@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.messages import ChannelSample
 from drivers.reading import Quality, Reading
 
@@ -83,7 +83,7 @@ def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
     return kept, len(readings) - len(kept)
 
 
-def _near(values: npt.NDArray[np.float64]) -> bool:
+def _near(values: Vector) -> bool:
     """Tell whether one deviating reading among equal ones is a converter step rather than wild."""
     return bool(np.ptp(values) <= 1e-3 * max(1.0, abs(float(np.median(values)))))
 

@@ -156,8 +156,12 @@ def files_of(source: Path, tls: dict[str, str], side: str) -> TlsFiles:
         if name not in tls:
             raise ConfigError(f"{source}: {_TLS}/{name}: missing, expected a PEM file")
     ca, certificate, key = names
-    return TlsFiles(Path(tls[ca]), Path(tls[certificate]), Path(tls[key]),
-                    (f"{_TLS}/{ca}", f"{_TLS}/{certificate}", f"{_TLS}/{key}"))  # fmt: skip
+    return TlsFiles(
+        Path(tls[ca]),
+        Path(tls[certificate]),
+        Path(tls[key]),
+        (f"{_TLS}/{ca}", f"{_TLS}/{certificate}", f"{_TLS}/{key}"),
+    )
 
 
 def tell_links(session: Any, endpoints: Sequence[str]) -> None:

@@ -97,11 +97,17 @@ class Takeover:
             f"model {named[0]} in the place of {named[1]}, "
             f"warm-up {prepared.minutes / 60.0:.1f} h, the offset is to move by {difference:+.2f} µm",
             {
-                "ok": True, "action": adopting.wanted.action, "old_sha256": old.model.sha256,
-                "new_sha256": new.model.sha256, "warm_up_min": prepared.minutes, "warm_up_samples": prepared.samples,
-                "state_known": prepared.known, "difference_um": difference, "y_std_um": new.std_um,
+                "ok": True,
+                "action": adopting.wanted.action,
+                "old_sha256": old.model.sha256,
+                "new_sha256": new.model.sha256,
+                "warm_up_min": prepared.minutes,
+                "warm_up_samples": prepared.samples,
+                "state_known": prepared.known,
+                "difference_um": difference,
+                "y_std_um": new.std_um,
             },
-        )  # fmt: skip
+        )
         return new
 
     async def end(self) -> None:
@@ -122,11 +128,17 @@ class Takeover:
         how = f"warmed up on {prepared.samples} sample(s) of {prepared.minutes / 60.0:.1f} h"
         if not prepared.known:
             how += f", too little to know its state: standard deviation {prepared.compensation.std_um:.1f} µm for now"
-        adopting.reply.set_result({
-            "ok": True, "text": f"model {model.name} ({model.sha256[:12]}) is taken over at the next sample, {how}",
-            "model": model.name, "model_sha256": model.sha256, "warm_up_min": prepared.minutes,
-            "warm_up_samples": prepared.samples, "state_known": prepared.known,
-        })  # fmt: skip
+        adopting.reply.set_result(
+            {
+                "ok": True,
+                "text": f"model {model.name} ({model.sha256[:12]}) is taken over at the next sample, {how}",
+                "model": model.name,
+                "model_sha256": model.sha256,
+                "warm_up_min": prepared.minutes,
+                "warm_up_samples": prepared.samples,
+                "state_known": prepared.known,
+            }
+        )
 
     def _tell_refusal(self, task: asyncio.Task[None]) -> None:
         """Answer that nothing comes of it, whatever the reason: the running model goes on."""

@@ -18,9 +18,15 @@ _STRIP = {"good": "▁", "warn": "▄", "bad": "█"}
 #: How each tone is coloured.
 STYLES = {"good": "green", "warn": "yellow", "bad": "bold red"}
 #: What is drawn of the history: name, column, unit.
-_ROWS = (("offset", "y_offset_um", "µm"), ("DTF", "y_dtf_um", "µm"), ("TDTF", "y_tdtf_um", "µm"),
-         ("effects", "effects", "µm"), ("residual", "residual_um", "µm"), ("T_Q", "t_q_degc", "°C"),
-         ("AT", "at_degc", "°C"))  # fmt: skip
+_ROWS = (
+    ("offset", "y_offset_um", "µm"),
+    ("DTF", "y_dtf_um", "µm"),
+    ("TDTF", "y_tdtf_um", "µm"),
+    ("effects", "effects", "µm"),
+    ("residual", "residual_um", "µm"),
+    ("T_Q", "t_q_degc", "°C"),
+    ("AT", "at_degc", "°C"),
+)
 _SHORT = ("offset", "residual")
 #: Room beside the bars: name before, range behind.
 _BESIDE = 38

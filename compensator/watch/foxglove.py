@@ -75,9 +75,12 @@ class FoxgloveServer:
     def __enter__(self) -> FoxgloveServer:
         try:
             self._server = self._foxglove.start_server(
-                name="thermal compensation", host=HOST, port=self._port, context=self._context,
+                name="thermal compensation",
+                host=HOST,
+                port=self._port,
+                context=self._context,
                 server_listener=_Listener(self._join),
-            )  # fmt: skip
+            )
         except (RuntimeError, OSError, OverflowError) as error:
             raise ServiceError(f"--foxglove-port {self._port}: {error}; 0 takes a free one") from error
         return self

@@ -18,7 +18,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError, UsageError
-from compensator.service.asking import alive_at, operator_of_file
+from compensator.service.command_client import alive_at, operator_of_file
 from compensator.service.session import get, in_words, put, session_config
 
 #: Seconds between two attempts where nobody is there to connect to.
@@ -250,8 +250,10 @@ def of_settings(settings: Zenoh) -> Source:
         If it is reached nowhere, or over TLS: the machine's own certificate reads nothing.
     """
     if settings.secured():
-        raise UsageError("--zenoh: missing; over TLS a receiver's or operator's certificate is needed, expected a "
-                         "Zenoh configuration such as receiver.json5")  # fmt: skip
+        raise UsageError(
+            "--zenoh: missing; over TLS a receiver's or operator's certificate is needed, expected a "
+            "Zenoh configuration such as receiver.json5"
+        )
     endpoints = endpoints_of(settings)
     if not endpoints:
         raise UsageError("zenoh: neither listen nor connect has an endpoint to reach the service at")

@@ -216,8 +216,10 @@ class Machine:
         residual_um, std_um, count = self.history.misfit(now_ns, MISFIT_MIN)
         if count < MISFIT_MIN // 2 or residual_um < max(MISFIT_STDS * std_um, MISFIT_UM):
             return None
-        figures = (f"Measured and predicted Y have been {residual_um:.1f} µm apart for half an hour (median); the "
-                   f"service states a standard deviation of {std_um:.2f} µm.")  # fmt: skip
+        figures = (
+            f"Measured and predicted Y have been {residual_um:.1f} µm apart for half an hour (median); the "
+            f"service states a standard deviation of {std_um:.2f} µm."
+        )
         return Caution("misfit", figures)
 
     def snapshot(self, now_ns: int, monotonic_s: float) -> dict[str, Any]:
@@ -238,13 +240,20 @@ class Machine:
         reasons = [in_words(code) for code in offset.reasons] if offset else []
         warnings = self.warnings(now_ns, monotonic_s)
         found: dict[str, Any] = {
-            "prefix": self.prefix, "machine": self.name, "shown": shown, "tone": _tone(shown, warnings),
-            "means": in_words(shown).means, "do": in_words(shown).do, "alive": self.alive,
+            "prefix": self.prefix,
+            "machine": self.name,
+            "shown": shown,
+            "tone": _tone(shown, warnings),
+            "means": in_words(shown).means,
+            "do": in_words(shown).do,
+            "alive": self.alive,
             "state": offset.state if offset else None,
             "reasons": [words._asdict() for words in reasons],
-            "to_do": _to_do(shown, reasons, warnings), "warnings": list(warnings),
+            "to_do": _to_do(shown, reasons, warnings),
+            "warnings": list(warnings),
             "warning_codes": [warning.code for warning in warnings],
-            "seq": offset.seq if offset else None, "time_utc_ns": offset.time_utc_ns if offset else None,
+            "seq": offset.seq if offset else None,
+            "time_utc_ns": offset.time_utc_ns if offset else None,
             "age_s": round(old_s, 3) if old_s is not None else None,
             "valid_for_s": offset.valid_for_s if offset else None,
             "y_offset_um": offset.y_offset_um if offset else None,
@@ -253,10 +262,13 @@ class Machine:
             "model_sha256": offset.model_sha256 if offset else None,
             **self._estimated(now_ns),
             **self._measured(now_ns),
-            "received": self.numbers.received, "missed": self.numbers.missed, "repeated": self.numbers.repeated,
-            "malformed": self.malformed, "last_malformed": self.last_malformed,
+            "received": self.numbers.received,
+            "missed": self.numbers.missed,
+            "repeated": self.numbers.repeated,
+            "malformed": self.malformed,
+            "last_malformed": self.last_malformed,
             "events": [self._event(event) for event in reversed(self.events)],
-        }  # fmt: skip
+        }
         names = ("version", "model", "model_kind", "started_utc_ns", "recording", "devices")
         return found | {name: getattr(status, name) if status else None for name in names}
 
@@ -297,8 +309,12 @@ class Machine:
             }
             for name, channel in sample.channels.items()
         }
-        return {"t_q_degc": usable(sample, "t_q_degc"), "at_degc": usable(sample, "at_degc"),
-                "period_s": sample.period_s, "channels": channels}  # fmt: skip
+        return {
+            "t_q_degc": usable(sample, "t_q_degc"),
+            "at_degc": usable(sample, "at_degc"),
+            "period_s": sample.period_s,
+            "channels": channels,
+        }
 
     @staticmethod
     def _event(event: Event) -> dict[str, Any]:

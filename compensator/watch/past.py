@@ -7,7 +7,7 @@ from pathlib import Path
 
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Event, Offset, Sample
-from compensator.recording import decode, read_messages, recordings
+from compensator.recording.reading import decode, read_messages, recordings
 from compensator.watch.history import SPAN_NS
 
 _TOPICS = ("sample", "estimate", "offset", "event")

@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from compensator import __version__
-from compensator.container import PAYLOAD, Container, Contents, Damaged, Torn
-from compensator.durable import sync_folder
 from compensator.errors import DataError
+from compensator.recording.container import PAYLOAD, Container, Contents, Damaged, Torn
+from compensator.recording.live_file import sync_folder
 
 
 def compact(path: Path) -> str:

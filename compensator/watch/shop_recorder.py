@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 from compensator import __version__
 from compensator.clock import NS, Clock
-from compensator.durable import LiveFile
 from compensator.messages import MESSAGES, shipped_schema
+from compensator.recording.live_file import LiveFile
 from compensator.watch.machine import KINDS, Malformed, decoded
 from compensator.watch.sequence import Sequence
 from compensator.watch.shop_file import compact
@@ -106,9 +106,11 @@ class ShopRecorder:
         """Return what was recorded and what was lost, for the end of the command."""
         missed = self.missed()
         result = {
-            "files": [str(path) for path in self.files], "messages": self.messages, "not_recorded": self.not_recorded,
+            "files": [str(path) for path in self.files],
+            "messages": self.messages,
+            "not_recorded": self.not_recorded,
             "missed": missed,
-        }  # fmt: skip
+        }
         lost = ", ".join(f"{count} of {key}" for key, count in missed.items()) or "none"
         text = f"{self.messages} messages in {len(self.files)} file(s) in {self._folder}; lost on the way: {lost}"
         if self.not_recorded:

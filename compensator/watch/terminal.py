@@ -18,9 +18,19 @@ from compensator.watch.words import SIGNS, age, here, plain, signed, zone
 
 #: Width from which on a column is shown in the table of a shop: (heading, least width of the terminal).
 _COLUMNS = (
-    ("machine", 0), ("state", 0), ("offset µm", 0), ("µm/min", 100), ("std µm", 100), ("residual µm", 84),
-    ("T_Q °C", 120), ("AT °C", 120), ("age", 0), ("alive", 72), ("last 24 h", 140), ("why", 60),
-)  # fmt: skip
+    ("machine", 0),
+    ("state", 0),
+    ("offset µm", 0),
+    ("µm/min", 100),
+    ("std µm", 100),
+    ("residual µm", 84),
+    ("T_Q °C", 120),
+    ("AT °C", 120),
+    ("age", 0),
+    ("alive", 72),
+    ("last 24 h", 140),
+    ("why", 60),
+)
 #: Events, and times in one state, shown of one machine.
 EVENTS, SPELLS = 6, 4
 #: What is to be done about a machine that says itself that it is well.
@@ -104,9 +114,13 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
     for name in names:
         left, why = name in ("machine", "state", "why", "alive", "last 24 h"), name == "why"
         table.add_column(
-            name, justify="left" if left else "right", no_wrap=name != "machine", overflow="ellipsis",
-            ratio=1 if why and width < 140 else None, max_width=max(40, width - 140) if why else None,
-        )  # fmt: skip
+            name,
+            justify="left" if left else "right",
+            no_wrap=name != "machine",
+            overflow="ellipsis",
+            ratio=1 if why and width < 140 else None,
+            max_width=max(40, width - 140) if why else None,
+        )
     shown = machines[:rows]
     for machine in shown:
         cells = _cells(machine)
@@ -126,14 +140,18 @@ def _cells(machine: dict[str, Any]) -> dict[str, Text]:
     reasons = [reason["code"] for reason in machine["reasons"]] if machine["shown"] != "silent" else []
     why = " ".join([*reasons, *machine["warning_codes"]])
     return {
-        "machine": Text(machine["prefix"]), "state": state(machine),
+        "machine": Text(machine["prefix"]),
+        "state": state(machine),
         "offset µm": Text(signed(machine["y_offset_um"]), style="dim" if machine["shown"] == "silent" else ""),
-        "µm/min": Text(signed(machine["y_offset_rate_um_per_min"])), "std µm": Text(plain(machine["y_offset_std_um"])),
-        "residual µm": Text(signed(machine["residual_um"])), "T_Q °C": Text(plain(machine["t_q_degc"])),
+        "µm/min": Text(signed(machine["y_offset_rate_um_per_min"])),
+        "std µm": Text(plain(machine["y_offset_std_um"])),
+        "residual µm": Text(signed(machine["residual_um"])),
+        "T_Q °C": Text(plain(machine["t_q_degc"])),
         "AT °C": Text(plain(machine["at_degc"])),
         "age": Text(age(machine["age_s"]) if machine["age_s"] is not None else "–"),
-        "alive": Text(_alive(machine)), "why": Text(why),
-    }  # fmt: skip
+        "alive": Text(_alive(machine)),
+        "why": Text(why),
+    }
 
 
 def _alive(machine: dict[str, Any]) -> str:
@@ -208,18 +226,23 @@ def _pairs(machine: dict[str, Any]) -> list[tuple[str, Text]]:
     return [
         ("rate, µm/min", Text(signed(machine["y_offset_rate_um_per_min"]))),
         ("std, µm", Text(plain(machine["y_offset_std_um"]))),
-        ("measured Y, µm", Text(signed(machine["y_um"]))), ("residual, µm", Text(signed(machine["residual_um"]))),
-        ("T_Q, °C", Text(plain(machine["t_q_degc"]))), ("AT, °C", Text(plain(machine["at_degc"]))),
-        ("heat, W", Text(plain(machine["heat_w"], 1))), ("predicted Y, µm", Text(signed(machine["y_pred_um"]))),
+        ("measured Y, µm", Text(signed(machine["y_um"]))),
+        ("residual, µm", Text(signed(machine["residual_um"]))),
+        ("T_Q, °C", Text(plain(machine["t_q_degc"]))),
+        ("AT, °C", Text(plain(machine["at_degc"]))),
+        ("heat, W", Text(plain(machine["heat_w"], 1))),
+        ("predicted Y, µm", Text(signed(machine["y_pred_um"]))),
         *((f"{share['name']}, µm", Text(signed(share["y_um"]))) for share in machine["shares"]),
-    ]  # fmt: skip
+    ]
 
 
 def _about(machine: dict[str, Any]) -> str:
     """Return what tells where the numbers come from, in one line."""
     model = f"{machine['model'] or '–'} {(machine['model_sha256'] or '')[:8]}".rstrip()
-    return (f"service {_alive(machine)}; {machine['received']} messages received, {machine['missed']} missed; "
-            f"model {model}; recording {machine['recording'] or '–'}")  # fmt: skip
+    return (
+        f"service {_alive(machine)}; {machine['received']} messages received, {machine['missed']} missed; "
+        f"model {model}; recording {machine['recording'] or '–'}"
+    )
 
 
 def _lists(machine: dict[str, Any], past: list[str], now: datetime) -> list[tuple[str, list[str]]]:
@@ -232,8 +255,14 @@ def _lists(machine: dict[str, Any], past: list[str], now: datetime) -> list[tupl
         for event in machine["events"][:EVENTS]
     ]
     mind = [warning.marked for warning in machine["warnings"]]
-    return [("Why", reasons), ("Mind", mind), ("Channels", channels), ("Devices", devices),
-            (PAST, past), (f"Last events, {zone(now)}", events)]  # fmt: skip
+    return [
+        ("Why", reasons),
+        ("Mind", mind),
+        ("Channels", channels),
+        ("Devices", devices),
+        (PAST, past),
+        (f"Last events, {zone(now)}", events),
+    ]
 
 
 def _channel(name: str, channel: dict[str, Any]) -> str:
@@ -264,8 +293,12 @@ def line(machine: dict[str, Any]) -> str:
     )
     old = f"{age(machine['age_s'])} old" if machine["age_s"] is not None else "no offset"
     words = [
-        when, machine["prefix"], machine["shown"], f"offset {signed(machine['y_offset_um'])} µm ({old})",
-        f"residual {signed(machine['residual_um'])} µm", *(reason["code"] for reason in machine["reasons"]),
+        when,
+        machine["prefix"],
+        machine["shown"],
+        f"offset {signed(machine['y_offset_um'])} µm ({old})",
+        f"residual {signed(machine['residual_um'])} µm",
+        *(reason["code"] for reason in machine["reasons"]),
         *machine["warnings"],
-    ]  # fmt: skip
+    ]
     return "  ".join(words)

@@ -14,9 +14,14 @@ Tone = Literal["good", "warn", "bad"]
 
 #: What a machine is shown as → how much it needs somebody.
 TONES: Mapping[str, Tone] = {
-    "ok": "good", "starting": "warn", "degraded": "warn", "hold": "bad", "fault": "bad", "silent": "bad",
+    "ok": "good",
+    "starting": "warn",
+    "degraded": "warn",
+    "hold": "bad",
+    "fault": "bad",
+    "silent": "bad",
     "unknown": "bad",
-}  # fmt: skip
+}
 #: A sign beside each, so that colour is not needed.
 SIGNS: Mapping[Tone, str] = {"good": "✓", "warn": "⚠", "bad": "✗"}
 #: Kind of an event → what to do.

@@ -55,8 +55,10 @@ def walk(table: Path, probe: str, hours: float, folder: Path) -> None:
     print(compensator("identify", fit, *roles, "--out", two))
     print("Two thermocouples do not carry the whole error of this machine. What is missing?")
     found = json.loads(compensator("diagnose", fit, *roles, "--model", two, "--out", folder / "diagnosis", "--json"))
-    print(f"verdict: {found['verdict']}; held out: {found['before']['rms_um']:.1f} µm rms before, "
-          f"{found['after']['rms_um']:.1f} after")  # fmt: skip
+    print(
+        f"verdict: {found['verdict']}; held out: {found['before']['rms_um']:.1f} µm rms before, "
+        f"{found['after']['rms_um']:.1f} after"
+    )
     for effect in found["effects"]:
         print(f"- {effect['kind']} {effect['channel'] or effect['path'] or ''}: {effect['explanation']}")
     for rival in found["rivals"]:
@@ -67,8 +69,10 @@ def walk(table: Path, probe: str, hours: float, folder: Path) -> None:
         out = folder / f"{name.replace(' ', '-')}.csv"
         compensator("simulate", table, *roles, "--model", model, "--out", out)
         nothing, left[name] = error_after(out, hours)
-    print(f"\nµm rms without compensation {nothing:.1f}, two inputs {left['two inputs']:.1f}, "
-          f"extended model {left['extended']:.1f}")  # fmt: skip
+    print(
+        f"\nµm rms without compensation {nothing:.1f}, two inputs {left['two inputs']:.1f}, "
+        f"extended model {left['extended']:.1f}"
+    )
 
 
 if __name__ == "__main__":

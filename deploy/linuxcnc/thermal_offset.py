@@ -160,15 +160,20 @@ class Axis:
         moves = hal.get_value("motion.teleop-mode") or hal.get_value("motion.coord-mode")
         # In joint mode a change is taken, and moves the axis at its own speed when the mode is left.
         ready = bool(
-            hal.get_value("motion.motion-enabled") and hal.get_value("motion.is-all-homed") and moves
-            and hal.get_value(f"{pin}.eoffset-enable") and not hal.get_value(f"{pin}.eoffset-clear")
-        )  # fmt: skip
+            hal.get_value("motion.motion-enabled")
+            and hal.get_value("motion.is-all-homed")
+            and moves
+            and hal.get_value(f"{pin}.eoffset-enable")
+            and not hal.get_value(f"{pin}.eoffset-clear")
+        )
         return AxisView(
-            counts=hal.get_value(f"{pin}.eoffset-counts"), scale_um=hal.get_value(f"{pin}.eoffset-scale") * unit,
+            counts=hal.get_value(f"{pin}.eoffset-counts"),
+            scale_um=hal.get_value(f"{pin}.eoffset-scale") * unit,
             request_um=hal.get_value(f"{pin}.eoffset-request") * unit,
-            eoffset_um=hal.get_value(f"{pin}.eoffset") * unit, ready=ready,
+            eoffset_um=hal.get_value(f"{pin}.eoffset") * unit,
+            ready=ready,
             limited=bool(hal.get_value("motion.eoffset-limited")),
-        )  # fmt: skip
+        )
 
     def found_um(self) -> float:
         """Return the offset that the axis has already; while the machine is off its pins show an old one."""

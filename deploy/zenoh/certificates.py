@@ -106,9 +106,16 @@ def authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.EllipticCur
 def key_usage(*, sign: bool) -> x509.KeyUsage:
     """Return what a key may do: sign certificates, or prove who one is."""
     return x509.KeyUsage(
-        digital_signature=not sign, content_commitment=False, key_encipherment=False, data_encipherment=False,
-        key_agreement=False, key_cert_sign=sign, crl_sign=sign, encipher_only=False, decipher_only=False,
-    )  # fmt: skip
+        digital_signature=not sign,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=sign,
+        crl_sign=sign,
+        encipher_only=False,
+        decipher_only=False,
+    )
 
 
 def alternative(host: str) -> x509.GeneralName:
@@ -120,9 +127,15 @@ def alternative(host: str) -> x509.GeneralName:
 
 
 def issue(
-    folder: Path, stem: str, name: str, hosts: list[str], ca: tuple[x509.Certificate, ec.EllipticCurvePrivateKey],
-    *, begins: datetime.datetime, ends: datetime.datetime,
-) -> None:  # fmt: skip
+    folder: Path,
+    stem: str,
+    name: str,
+    hosts: list[str],
+    ca: tuple[x509.Certificate, ec.EllipticCurvePrivateKey],
+    *,
+    begins: datetime.datetime,
+    ends: datetime.datetime,
+) -> None:
     """Make a key and a certificate. Only one with hosts may act as a server: a receiver's cannot pose as the router."""
     authority_certificate, authority_key = ca
     key = new_key(folder / f"{stem}.key")

@@ -12,8 +12,8 @@ import msgspec
 from compensator.config import parse_config
 from compensator.messages import SCHEMA, Event, Sample, encode
 from compensator.model.model_file import parse_model, read_model_bytes
+from compensator.recording.recorder import Recorder
 from compensator.service.compensation import Compensation
-from compensator.service.recorder import Recorder
 from tests.service.records import sample
 from tests.service.simulated import START_NS
 
@@ -76,8 +76,12 @@ def readings(count: int, first: int = 0) -> Iterator[dict[str, float]]:
     for i in range(first, first + count):
         load = 0.5 - 0.5 * math.cos(i / 60.0 * math.pi / 2)
         noise = math.sin(12.9898 * i) * 43758.5453 % 1.0 - 0.5
-        yield {"t_q_degc": 20.0 + 6.0 * load + 0.04 * noise, "at_degc": 20.0 + 0.6 * math.sin(i / 200.0) + 0.02 * noise,
-               "y_um": 30.0 * load + 0.4 * noise, "coolant_degc": 21.0 + 0.1 * noise}  # fmt: skip
+        yield {
+            "t_q_degc": 20.0 + 6.0 * load + 0.04 * noise,
+            "at_degc": 20.0 + 0.6 * math.sin(i / 200.0) + 0.02 * noise,
+            "y_um": 30.0 * load + 0.4 * noise,
+            "coolant_degc": 21.0 + 0.1 * noise,
+        }
 
 
 class Service:
@@ -87,9 +91,16 @@ class Service:
     """
 
     def __init__(
-        self, folder: Path, *, config: bytes = CONFIG, model: bytes = QUILL, seq: int = 0, start_ns: int = START_NS,
-        state: bytes = b"", **recorder: Any,
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        *,
+        config: bytes = CONFIG,
+        model: bytes = QUILL,
+        seq: int = 0,
+        start_ns: int = START_NS,
+        state: bytes = b"",
+        **recorder: Any,
+    ) -> None:
         self.folder = folder
         self.config = parse_config(config, source="test")
         self.recorder = Recorder(folder, MACHINE, {"config.toml": config, "model.toml": model}, **recorder)
@@ -107,8 +118,17 @@ class Service:
         return self.start_ns + self.seq * MINUTE_NS
 
     def note(self, kind: str, text: str, data: dict[str, Any] | None = None) -> None:
-        self.events.append(Event(schema=SCHEMA, machine=MACHINE, seq=self.seq, time_utc_ns=self.now_ns, kind=kind,
-                                 text=text, data=data or {}))  # fmt: skip
+        self.events.append(
+            Event(
+                schema=SCHEMA,
+                machine=MACHINE,
+                seq=self.seq,
+                time_utc_ns=self.now_ns,
+                kind=kind,
+                text=text,
+                data=data or {},
+            )
+        )
 
     def command(self, name: str, **data: Any) -> None:
         self.commands.append((name, data))
@@ -147,8 +167,11 @@ class Service:
             self.note(kind, text)
         offset = outcome.offset
         if self._failing:
-            offset = msgspec.structs.replace(offset, state="degraded" if offset.state == "ok" else offset.state,
-                                             reasons=[*offset.reasons, "recording_failed"])  # fmt: skip
+            offset = msgspec.structs.replace(
+                offset,
+                state="degraded" if offset.state == "ok" else offset.state,
+                reasons=[*offset.reasons, "recording_failed"],
+            )
         records = [
             ("sample", encode(outcome.sample)),
             ("estimate", encode(outcome.estimate)),

@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from compensator import chain
-from compensator.container import PAYLOAD, Attachment, Container, Contents, Torn
 from compensator.messages import Chain
+from compensator.recording import chain
+from compensator.recording.container import PAYLOAD, Attachment, Container, Contents, Torn
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,14 @@ def lines_of(path: Path) -> tuple[list[Line], Contents]:
 
 
 def rewrite(
-    path: Path, edit: Callable[[list[Line]], list[Line]] = list, *, contents: Callable[[Contents], None] | None = None,
-    chunked: bool = True, chunk_size: int = 2**20, late: Attachment | None = None,
-) -> None:  # fmt: skip
+    path: Path,
+    edit: Callable[[list[Line]], list[Line]] = list,
+    *,
+    contents: Callable[[Contents], None] | None = None,
+    chunked: bool = True,
+    chunk_size: int = 2**20,
+    late: Attachment | None = None,
+) -> None:
     """Write a file again with other messages, attachments or metadata; everything else fits, CRCs included."""
     lines, there = lines_of(path)
     if contents is not None:

@@ -9,8 +9,8 @@ import pytest
 from mcap.writer import Writer
 
 from compensator.cli import main
-from compensator.container import Contents
-from compensator.recording import recordings
+from compensator.recording.container import Contents
+from compensator.recording.reading import recordings
 from tests.audit.made import MACHINE, Service
 from tests.audit.tampering import find, lines_of, rewrite
 
@@ -65,8 +65,11 @@ def test_what_cannot_be_read_is_one_line_and_exit_code_2(
     random.write_bytes(bytes(range(256)) * 50)
     no_config = tmp_path / "no-config.mcap"
     no_config.write_bytes(rec.read_bytes())
-    rewrite(no_config, lambda lines: [line for line in lines if line.topic not in ("chain", "seal")],
-            contents=lambda contents: contents.attachments.pop("config.toml") and None)  # type: ignore[func-returns-value]  # fmt: skip
+    rewrite(
+        no_config,
+        lambda lines: [line for line in lines if line.topic not in ("chain", "seal")],
+        contents=lambda contents: contents.attachments.pop("config.toml") and None,
+    )  # type: ignore[func-returns-value]
     (tmp_path / "empty").mkdir()
     private = tmp_path / "key.pem"
     private.write_text("-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n")

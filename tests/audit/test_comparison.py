@@ -18,7 +18,7 @@ from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Sample, number
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import EffectTable
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from compensator.service.compensation import Compensation
 from tests.audit.made import CONFIG, MACHINE, MINUTE_NS, QUILL, Service, other_model, readings
 from tests.service.simulated import START_NS
@@ -65,10 +65,12 @@ def test_the_figures_are_those_of_a_plain_loop(tmp_path: Path) -> None:
     assert measured.sum() == 105 == found.residual_before.samples == found.residual_after.samples
     assert found.samples == 120 == found.offsets.samples
     for spread, values in (
-        (found.residual_before, before[measured]), (found.residual_after, after[measured]),
+        (found.residual_before, before[measured]),
+        (found.residual_after, after[measured]),
         (found.offsets, would - was),
-        (found.left_before, (y + was)[measured]), (found.left_after, (y + would)[measured]),
-    ):  # fmt: skip
+        (found.left_before, (y + was)[measured]),
+        (found.left_after, (y + would)[measured]),
+    ):
         assert spread.rms == pytest.approx(math.sqrt(np.mean(values**2)), rel=1e-12)
         assert spread.peak == values[np.argmax(np.abs(values))]
     assert round(found.offsets.at_s * NS) == offsets[int(np.argmax(np.abs(would - was)))].time_utc_ns
@@ -113,8 +115,10 @@ def test_a_time_without_samples_is_a_pause(tmp_path: Path) -> None:
 
 def test_a_model_that_needs_another_channel_is_refused(tmp_path: Path) -> None:
     Service(tmp_path).run(5).stop()
-    effect = EffectTable(kind="input", table={"channel": "jacket_degc", "curve": "linear", "tau_min": [10.0],
-                                              "gain": [1.0], "delay_min": 0.0})  # fmt: skip
+    effect = EffectTable(
+        kind="input",
+        table={"channel": "jacket_degc", "curve": "linear", "tau_min": [10.0], "gain": [1.0], "delay_min": 0.0},
+    )
     model = dataclasses.replace(OTHER, effects=(effect,))
     with pytest.raises(DataError, match="jacket_degc"):
         compare(recordings(tmp_path, MACHINE), model)
@@ -122,7 +126,7 @@ def test_a_model_that_needs_another_channel_is_refused(tmp_path: Path) -> None:
 
 def test_recordings_of_two_machines_are_not_mixed(tmp_path: Path) -> None:
     Service(tmp_path).run(5).stop()
-    from compensator.service.recorder import Recorder
+    from compensator.recording.recorder import Recorder
 
     other = Recorder(tmp_path, "lathe-1", {"config.toml": CONFIG, "model.toml": QUILL})
     other.write([("event", b"{}")], START_NS)

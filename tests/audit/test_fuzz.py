@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from compensator.audit.series import Audit, audit
-from compensator.container import MAGIC, Container
 from compensator.errors import CompensatorError, DataError
-from compensator.recording import end_of_chain, read_messages
-from compensator.service.finishing import compact
+from compensator.recording.container import MAGIC, Container
+from compensator.recording.finishing import compact
+from compensator.recording.reading import end_of_chain, read_messages
 from tests.audit.made import Service
 from tests.audit.tampering import rewrite
 

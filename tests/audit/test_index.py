@@ -16,8 +16,8 @@ from mcap.reader import make_reader
 
 from compensator.audit.series import audit
 from compensator.cli import main
-from compensator.container import Container
-from compensator.framing import (
+from compensator.recording.container import Container
+from compensator.recording.framing import (
     ATTACHMENT_INDEX,
     CHANNEL,
     CHUNK,
@@ -30,8 +30,8 @@ from compensator.framing import (
     STATISTICS,
     SUMMARY_OFFSET,
 )
-from compensator.index import KEPT
-from compensator.recording import recordings
+from compensator.recording.index import KEPT
+from compensator.recording.reading import recordings
 from tests.audit.made import MACHINE, Service
 from tests.audit.tampering import rewrite
 
@@ -168,9 +168,10 @@ CASES: dict[str, tuple[Callable[[list[Record]], list[Record]], str, str]] = {
     "summary offset gone": (edit(SUMMARY_OFFSET, gone, 3), "summary offset", "none leads to those at byte"),
     "no summary": (
         lambda records: [*records[: [code for code, _ in records].index(DATA_END) + 1], records[-1]],
-        "summary", "is missing",
+        "summary",
+        "is missing",
     ),
-}  # fmt: skip
+}
 
 
 def test_the_untouched_file_written_again_is_the_same(path: Path) -> None:

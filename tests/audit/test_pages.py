@@ -13,7 +13,7 @@ import pytest
 from compensator.audit.comparison import Comparison
 from compensator.audit.pages import Curves, comparison_page
 from compensator.cli import main
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
 from compensator.report.history import Spread
 from tests.audit.made import MACHINE, Service, other_model
 from tests.audit.test_command import tampered

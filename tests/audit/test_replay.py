@@ -16,10 +16,10 @@ from compensator.commands.workers import workers
 from compensator.config import LoadedConfig, parse_config
 from compensator.messages import Event, Offset
 from compensator.model.model_file import parse_model
-from compensator.recording import first_sequence, read_messages, recordings
-from compensator.service import recorder as recorder_module
+from compensator.recording import recorder as recorder_module
+from compensator.recording.reading import first_sequence, read_messages, recordings
+from compensator.recording.recorder import Recorder
 from compensator.service.daemon import Daemon
-from compensator.service.recorder import Recorder
 from compensator.service.restart import resume
 from drivers.errors import DeviceTimeout
 from drivers.reading import Quality, Reading
@@ -86,9 +86,15 @@ def wires(bench: Bench) -> None:
 
 def commands(bench: Bench) -> None:
     for at, name, payload in (
-        (60, "hold", b""), (65, "zero", b'{"mode":"warm"}'), (66, "resume", b""), (80, "zero", b'{"mode":"rest"}'),
-        (95, "zero", b""), (96, "hold", b""), (96, "resume", b""), (110, "hold", b""),
-    ):  # fmt: skip
+        (60, "hold", b""),
+        (65, "zero", b'{"mode":"warm"}'),
+        (66, "resume", b""),
+        (80, "zero", b'{"mode":"rest"}'),
+        (95, "zero", b""),
+        (96, "hold", b""),
+        (96, "resume", b""),
+        (110, "hold", b""),
+    ):
         before = bench.at_sample.get(at, lambda: None)
         bench.at_sample[at] = lambda b=before, n=name, p=payload: (b(), bench.daemon.command(n, p))  # type: ignore[misc]
 
@@ -188,11 +194,15 @@ def test_a_restart_after_a_stop_or_a_kill(tmp_path: Path, minutes: int) -> None:
     asyncio.run(bench.clock.sleep(60.0 * minutes))
     resumed = resume(loaded, parse_model(QUILL, source="test"))
     daemon = Daemon(
-        config=config, compensation=resumed.compensation, devices={"module": bench.device},
+        config=config,
+        compensation=resumed.compensation,
+        devices={"module": bench.device},
         recorder=Recorder(folder, MACHINE, {"config.toml": CONFIG, "model.toml": QUILL}),
-        publish=lambda name, data: None, clock=bench.clock, notes=resumed.notes,
+        publish=lambda name, data: None,
+        clock=bench.clock,
+        notes=resumed.notes,
         first_sequence=first_sequence(folder, MACHINE, bench.clock.utc_ns(), 60.0),
-    )  # fmt: skip
+    )
     asyncio.run(daemon.run(samples=30))
     found = look(folder)
     assert found.clean and found.samples == 110, summary(found)
@@ -333,6 +343,6 @@ def test_several_processes_find_the_same(tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
     with workers(2, None) as executor:
         assert executor is not None
-        side_by_side = audit(paths[::-1], executor=executor, told=lambda done, whole: told.append((done, whole)))
+        side_by_side = audit(paths[::-1], executor=executor, progress=lambda done, whole: told.append((done, whole)))
     assert side_by_side == audit(paths)
     assert told[-1][0] == told[-1][1] == sum(path.stat().st_size for path in paths)

@@ -15,9 +15,9 @@ from compensator.audit.series import audit, summary
 from compensator.config import load_config
 from compensator.errors import ConfigError, UsageError
 from compensator.messages import Seal, encode
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
+from compensator.recording.signature import Signer, Verifier
 from compensator.service.composition import _signer
-from compensator.signature import Signer, Verifier
 from tests.audit.made import CONFIG, MACHINE, Service
 from tests.audit.tampering import Line, find, lines_of, rewrite, with_new_values
 

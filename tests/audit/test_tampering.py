@@ -11,8 +11,8 @@ import pytest
 
 from compensator.audit.findings import Finding
 from compensator.audit.series import Audit, audit
-from compensator.container import Attachment, Contents
-from compensator.recording import recordings
+from compensator.recording.container import Attachment, Contents
+from compensator.recording.reading import recordings
 from tests.audit.made import MACHINE, MINUTE_NS, Service
 from tests.audit.tampering import Line, find, group, lines_of, rewrite, with_new_values
 from tests.service.simulated import START_NS
@@ -92,8 +92,11 @@ def test_an_edited_record_is_named(folder: Path, topic: str, chunked: bool) -> N
     rewrite(path, lambda lines: [*lines[:at], edited, *lines[at + 1 :]], chunked=chunked)
     finding = next(f for f in look(folder).findings if f.kind == "altered")
     assert (finding.file, finding.topic, finding.sequence, finding.time_utc_ns) == (
-        path.name, topic, edited.sequence, edited.time_ns,
-    )  # fmt: skip
+        path.name,
+        topic,
+        edited.sequence,
+        edited.time_ns,
+    )
     assert f"/{topic} record {edited.sequence} 2026-01-0" in finding.line()
 
 
@@ -324,8 +327,9 @@ def test_swapped_files_are_named(folder: Path) -> None:
     other.write_bytes(a)
     findings = look(folder).findings
     assert {(f.kind, f.file) for f in findings if "its name" in f.text} == {
-        ("reordered", first.name), ("reordered", other.name),
-    }  # fmt: skip
+        ("reordered", first.name),
+        ("reordered", other.name),
+    }
 
 
 def test_a_file_that_is_missing_between_others_is_named(folder: Path) -> None:
@@ -351,8 +355,9 @@ def test_another_recording_in_its_place_is_told(folder: Path, tmp_path: Path) ->
     path = second(folder)
     shutil.copy(forged / path.name, path)
     assert {(f.kind, f.file) for f in look(folder).findings} == {
-        ("broken", path.name), ("broken", recordings(folder, MACHINE)[2].name),
-    }  # fmt: skip
+        ("broken", path.name),
+        ("broken", recordings(folder, MACHINE)[2].name),
+    }
 
 
 # ------------------------------------------------------------------ the end

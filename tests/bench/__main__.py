@@ -10,10 +10,15 @@ from tests.bench import audit, diagnosis, faults, identification, machines, shop
 from tests.bench.figures import surroundings, table
 
 AREAS = {
-    "speed": speed.report, "calibration": identification.report, "diagnosis": diagnosis.report,
-    "machines": machines.report, "spindle": spindle.report, "faults": faults.report, "audit": audit.report,
+    "speed": speed.report,
+    "calibration": identification.report,
+    "diagnosis": diagnosis.report,
+    "machines": machines.report,
+    "spindle": spindle.report,
+    "faults": faults.report,
+    "audit": audit.report,
     "shop": shop.report,
-}  # fmt: skip
+}
 
 
 def main(chosen):

@@ -22,9 +22,9 @@ from mcap.reader import make_reader
 
 from compensator.audit.series import audit
 from compensator.commands.workers import workers
-from compensator.container import PAYLOAD, Container
 from compensator.messages import MESSAGES
-from compensator.recording import recordings
+from compensator.recording.container import PAYLOAD, Container
+from compensator.recording.reading import recordings
 from tests.audit.made import MACHINE, Service
 from tests.bench.figures import Figure, spread, told
 

@@ -76,10 +76,18 @@ def _summary(results):
 def report():
     """Yield the figures; the table of every kind is printed."""
     found = table(10)
-    rows("diagnosis, published machine, 10 seeds a kind",
-         ["effect", "named, nothing else", "removed %, median (tenth)", "s, median (most)"], found)  # fmt: skip
+    rows(
+        "diagnosis, published machine, 10 seeds a kind",
+        ["effect", "named, nothing else", "removed %, median (tenth)", "s, median (most)"],
+        found,
+    )
     for kind, named, removed, seconds in found:
         if kind == "all single effects" or "+" in kind:
-            yield told(Figure(what=f"diagnosis, published machine, {kind}: named and nothing beside it; removed %, "
-                                   "median (one in ten); s a search, median (most)",
-                              found=f"{named}; {removed}; {seconds}", wanted="98 %; 99 (97) %; 10 s"))  # fmt: skip
+            yield told(
+                Figure(
+                    what=f"diagnosis, published machine, {kind}: named and nothing beside it; removed %, "
+                    "median (one in ten); s a search, median (most)",
+                    found=f"{named}; {removed}; {seconds}",
+                    wanted="98 %; 99 (97) %; 10 s",
+                )
+            )

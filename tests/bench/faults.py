@@ -23,8 +23,11 @@ from tests.service.test_device_faults import run_all
 CHANNELS = [*TABLE["channel"][:3], {"name": "heat_w", "device": "module", "input": 4}]
 #: Hours after the start of the day at which a drift begins.
 BEGINS_H = (4, 7, 10, 13)
-LIMITS = {"offset_max_um": 300.0, "offset_rate_max_um_per_min": 8.0,
-          "validity": {"t_q_degc": [0.0, 90.0], "at_degc": [0.0, 60.0]}}  # fmt: skip
+LIMITS = {
+    "offset_max_um": 300.0,
+    "offset_rate_max_um_per_min": 8.0,
+    "validity": {"t_q_degc": [0.0, 90.0], "at_degc": [0.0, 60.0]},
+}
 
 
 def recorded(plant, seed, days):
@@ -33,8 +36,11 @@ def recorded(plant, seed, days):
 
 
 def settings(**more):
-    table = {"t_q_below_at_after_min": 15.0, "false_alarm_days": 365.0,
-             "rest": {"channel": "heat_w", "at_most": 1.0, "after_min": 100.0, "t_q_at_max_k": 3.0}}  # fmt: skip
+    table = {
+        "t_q_below_at_after_min": 15.0,
+        "false_alarm_days": 365.0,
+        "rest": {"channel": "heat_w", "at_most": 1.0, "after_min": 100.0, "t_q_at_max_k": 3.0},
+    }
     return config(channel=CHANNELS, limits=LIMITS, plausibility={**table, **more})
 
 
@@ -83,12 +89,14 @@ def drifts(name, plant, model, **more):
                             alone_right += named == [f"implausible:{channel}"]
             n = len(delays)
             unit = "µm" if channel == "y_um" else "K"
-            yield told(Figure(
-                what=f"plausibility, {name}: {channel} drifts by {rate} {unit} an hour; raised after (most), error by "
-                "then; suspected, alone after 2 h",
-                found=f"{np.median(delays):.0f} ({max(delays)}) min, {np.median(errors):.1f} µm; {right} of {n}, "
-                f"alone {alone_right}; raised {n} of {2 * len(BEGINS_H)}",
-            ))  # fmt: skip
+            yield told(
+                Figure(
+                    what=f"plausibility, {name}: {channel} drifts by {rate} {unit} an hour; raised after (most), "
+                    "error by then; suspected, alone after 2 h",
+                    found=f"{np.median(delays):.0f} ({max(delays)}) min, {np.median(errors):.1f} µm; {right} of {n}, "
+                    f"alone {alone_right}; raised {n} of {2 * len(BEGINS_H)}",
+                )
+            )
 
 
 def episodes(title, courses):
@@ -96,12 +104,14 @@ def episodes(title, courses):
         found = asyncio.run(run_all(Path(folder), courses))
     far = [seen.distance_um for seen in found]
     held = sum("hold" in seen.states for seen in found)
-    yield told(Figure(
-        what=f"{title}: distance to a run without the fault afterwards",
-        found=f"median {np.median(far):.2f}, 95 % {np.quantile(far, 0.95):.2f}, most {max(far):.2f} µm "
-        f"({len(found)} episodes, {held} held)",
-        beside=f"largest stated standard deviation in the fault {max(seen.std_most_um for seen in found):.0f} µm",
-    ))  # fmt: skip
+    yield told(
+        Figure(
+            what=f"{title}: distance to a run without the fault afterwards",
+            found=f"median {np.median(far):.2f}, 95 % {np.quantile(far, 0.95):.2f}, most {max(far):.2f} µm "
+            f"({len(found)} episodes, {held} held)",
+            beside=f"largest stated standard deviation in the fault {max(seen.std_most_um for seen in found):.0f} µm",
+        )
+    )
 
 
 def report():

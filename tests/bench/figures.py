@@ -58,16 +58,24 @@ def told(figure):
 def rows(title, head, body):
     """Print the details of some figures as a table."""
     widths = [max(len(row[i]) for row in (head, *body)) for i in range(len(head))]
-    lines = ["  " + "  ".join(f"{cell:{'<' if i < 2 else '>'}{widths[i]}}" for i, cell in enumerate(row))
-             for row in (head, *body)]  # fmt: skip
+    lines = [
+        "  " + "  ".join(f"{cell:{'<' if i < 2 else '>'}{widths[i]}}" for i, cell in enumerate(row))
+        for row in (head, *body)
+    ]
     sys.stdout.write("\n".join(["", title, *lines, ""]))
     sys.stdout.flush()
 
 
 def surroundings():
     """Return machine and versions in one line each."""
-    cpu = next((line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
-                if line.startswith("model name")), "unknown processor")  # fmt: skip
+    cpu = next(
+        (
+            line.split(":")[1].strip()
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if line.startswith("model name")
+        ),
+        "unknown processor",
+    )
     load = os.getloadavg()[0]
     packages = []
     for name in PACKAGES:

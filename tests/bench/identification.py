@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
+from compensator.data.runs import runs_of
+from compensator.data.tables import load_data
 from compensator.identify.arx import fit_arx
 from compensator.identify.calibration import calibrate
 from compensator.identify.choice import fit
 from compensator.identify.output_error import Segment, Structure
-from compensator.identify.runs import runs_of
 from compensator.identify.settings import Settings
-from compensator.tables import load_data
 from sim_hardware.physics import Duty, QuillMachine
 from tests.bench.figures import Figure, rows, told
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W, fit_pct, published, simulated
@@ -128,19 +128,33 @@ def score(tool, pick, true):
 def table():
     """Rows of: what, fit (worst), below the true model, ms, ratio of time to ours."""
     cases = {
-        "TTF": (lambda p: (p[0], p[2]), lambda p: p[4], {
-            "this project, known to start at rest": ours_ttf, "this project, initial state fitted": ours_ttf_free,
-            "ARX": arx(TTF), "nfoursid, 60 rows": nfoursid(2),
-            "SIPPY output error": sippy_output_error(TTF),
-            "SIPPY N4SID, 60 rows": sippy_states("N4SID", 2), "SIPPY PARSIM-K, 60 rows": sippy_states("PARSIM-K", 2),
-        }),
-        "DTF+TDTF": (lambda p: (np.stack((p[0], p[1])), p[3]), lambda p: p[5], {
-            "this project, known to start at rest": ours_rest, "this project, initial state fitted": ours_free,
-            "ARX": arx(BOTH), "nfoursid, 60 rows": nfoursid(3),
-            "SIPPY output error": sippy_output_error(BOTH),
-            "SIPPY N4SID, 60 rows": sippy_states("N4SID", 3), "SIPPY PARSIM-K, 60 rows": sippy_states("PARSIM-K", 3),
-        }),
-    }  # fmt: skip
+        "TTF": (
+            lambda p: (p[0], p[2]),
+            lambda p: p[4],
+            {
+                "this project, known to start at rest": ours_ttf,
+                "this project, initial state fitted": ours_ttf_free,
+                "ARX": arx(TTF),
+                "nfoursid, 60 rows": nfoursid(2),
+                "SIPPY output error": sippy_output_error(TTF),
+                "SIPPY N4SID, 60 rows": sippy_states("N4SID", 2),
+                "SIPPY PARSIM-K, 60 rows": sippy_states("PARSIM-K", 2),
+            },
+        ),
+        "DTF+TDTF": (
+            lambda p: (np.stack((p[0], p[1])), p[3]),
+            lambda p: p[5],
+            {
+                "this project, known to start at rest": ours_rest,
+                "this project, initial state fitted": ours_free,
+                "ARX": arx(BOTH),
+                "nfoursid, 60 rows": nfoursid(3),
+                "SIPPY output error": sippy_output_error(BOTH),
+                "SIPPY N4SID, 60 rows": sippy_states("N4SID", 3),
+                "SIPPY PARSIM-K, 60 rows": sippy_states("PARSIM-K", 3),
+            },
+        ),
+    }
     rows = []
     for case, (pick, true, tools) in cases.items():
         ours = None
@@ -171,11 +185,18 @@ def physics():
     }
     rows = []
     for kind in ("heat", "direct"):
-        result = calibrate(calibration, Settings(kind=kind), period_s=60.0, name=kind,
-                           validation=[run for runs in others.values() for run in runs])  # fmt: skip
+        result = calibrate(
+            calibration,
+            Settings(kind=kind),
+            period_s=60.0,
+            name=kind,
+            validation=[run for runs in others.values() for run in runs],
+        )
         held_out = [part for part in result.parts if part.role == "held out"]
-        rows += [[kind, name, f"{part.model.fit_pct:.2f}", f"{part.model.rms_um:.2f}"]
-                 for name, part in zip(others, held_out, strict=True)]  # fmt: skip
+        rows += [
+            [kind, name, f"{part.model.fit_pct:.2f}", f"{part.model.rms_um:.2f}"]
+            for name, part in zip(others, held_out, strict=True)
+        ]
     return rows
 
 
@@ -195,8 +216,11 @@ def spindle():
 def report():
     """Yield the figures; the tables behind them are printed."""
     found = table()
-    rows("calibration, published case: fit %, median (worst) of 20 seeds",
-         ["path", "by", "fit %", "below the true model", "ms a fit", "of ours"], found)  # fmt: skip
+    rows(
+        "calibration, published case: fit %, median (worst) of 20 seeds",
+        ["path", "by", "fit %", "below the true model", "ms a fit", "of ours"],
+        found,
+    )
     for case, wanted in (("TTF", "0.02 points"), ("DTF+TDTF", "0.2 points")):
         own = [row for row in found if row[0] == case and row[1].startswith("this project")]
         others = [row for row in found if row[0] == case and row[3] and not row[1].startswith("this project")]
@@ -204,12 +228,17 @@ def report():
         beside = f"{best[1]}: {best[3]} points, {best[4]} ms" if best else "no other tool is installed"
         for row in own:
             what = f"calibration, published {case}, {row[1].partition(', ')[2]}: below the true model"
-            yield told(Figure(what=what, found=f"{row[3]} points; {row[4]} ms a fit", wanted=f"{wanted}, 50 ms",
-                              beside=beside))  # fmt: skip
+            yield told(
+                Figure(what=what, found=f"{row[3]} points; {row[4]} ms a fit", wanted=f"{wanted}, 50 ms", beside=beside)
+            )
     for kind, name, share, rms in physics():
         what = f"calibration of simulated conduction physics ({kind}), free run on {name}"
         yield told(Figure(what=what, found=f"{share} %, {rms} µm rms", wanted="99 %"))
     for part, model, nothing, persistence in (row for row in spindle() if row[1]):
-        yield told(Figure(what=f"measured spindle ch3, two inputs, first 20 of 32 h fitted: {part}",
-                          found=f"{model} µm rms",
-                          beside=f"no compensation {nothing}, persistence {persistence}"))  # fmt: skip
+        yield told(
+            Figure(
+                what=f"measured spindle ch3, two inputs, first 20 of 32 h fitted: {part}",
+                found=f"{model} µm rms",
+                beside=f"no compensation {nothing}, persistence {persistence}",
+            )
+        )

@@ -76,16 +76,24 @@ def report(first=1000, count=26):
         took = f"{np.median(seconds):.1f} ({max(seconds):.1f}) s a search"
         if not size:
             none = sum(not r[1] for r in results)
-            yield told(Figure(what="diagnosis, conduction machine, no effect", wanted="nothing",
-                              found=f"nothing found in {none} of {count}; {took}"))  # fmt: skip
+            yield told(
+                Figure(
+                    what="diagnosis, conduction machine, no effect",
+                    wanted="nothing",
+                    found=f"nothing found in {none} of {count}; {took}",
+                )
+            )
             continue
         named, alone = sum(r[0] in r[1] for r in results), sum(r[1] == [r[0]] for r in results)
         left = [100.0 * r[2] for r in results if np.isfinite(r[2])]
-        yield told(Figure(
-            what=f"diagnosis, conduction machine, effects about {size} µm: named (alone); excess left, median (90 %)",
-            found=f"{named} ({alone}) of {count}; {np.median(left):.0f} ({np.quantile(left, 0.9):.0f}) %; {took}",
-            wanted="90 %; 10 (30) %",
-        ))  # fmt: skip
+        yield told(
+            Figure(
+                what=f"diagnosis, conduction machine, effects about {size} µm: named (alone); "
+                "excess left, median (90 %)",
+                found=f"{named} ({alone}) of {count}; {np.median(left):.0f} ({np.quantile(left, 0.9):.0f}) %; {took}",
+                wanted="90 %; 10 (30) %",
+            )
+        )
 
 
 if __name__ == "__main__":

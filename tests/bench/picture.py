@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from compensator.recording import read_messages
+from compensator.recording.reading import read_messages
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line
 
@@ -49,24 +49,30 @@ def figures(demo):
     hours, y, offset, extended = day(demo / "second-day-extended" / "recordings")
     hours_first, _, _, first = day(demo / "second-day-first" / "recordings")
     judged = hours > 1.5
-    rms = {name: float(np.sqrt(np.nanmean(v[m] ** 2))) for name, v, m in (
-        ("first", first, hours_first > 1.5), ("extended", extended, judged), ("none", y, judged))}  # fmt: skip
+    rms = {
+        name: float(np.sqrt(np.nanmean(v[m] ** 2)))
+        for name, v, m in (("first", first, hours_first > 1.5), ("extended", extended, judged), ("none", y, judged))
+    }
     common = {"x_label": "time, h", "x_limits": (0.0, 24.0)}
     return (
         Figure(
-            title="A working day of the simulated conduction machine", y_label="Y, µm",
+            title="A working day of the simulated conduction machine",
+            y_label="Y, µm",
             lines=(Line("deformation in Y, measured", hours, y), Line("offset of Y, published", hours, offset)),
-            height=2.9, **common,
+            height=2.9,
+            **common,
         ),
         Figure(
-            title="What is left", y_label="left, µm", height=2.9,
+            title="What is left",
+            y_label="left, µm",
+            height=2.9,
             lines=(
                 Line(f"model of the calibration ({rms['first']:.1f} µm rms)", hours_first, first),
                 Line(f"extended by diagnose, adopted after 1 h ({rms['extended']:.1f} µm rms)", hours, extended),
             ),
             **common,
         ),
-    ), rms  # fmt: skip
+    ), rms
 
 
 def stacked(pictures):
@@ -93,8 +99,10 @@ def stacked(pictures):
 def main(demo="demo-out", out=TOP / "compensator/report/loop.svg"):
     pictures, rms = figures(Path(demo) / "conduction")
     Path(out).write_text(stacked(pictures), encoding="utf-8")
-    print(f"{out}: {Path(out).stat().st_size / 1024:.0f} KB; µm rms after 1.5 h: without {rms['none']:.2f}, "
-          f"first model {rms['first']:.2f}, extended {rms['extended']:.2f}")  # fmt: skip
+    print(
+        f"{out}: {Path(out).stat().st_size / 1024:.0f} KB; µm rms after 1.5 h: without {rms['none']:.2f}, "
+        f"first model {rms['first']:.2f}, extended {rms['extended']:.2f}"
+    )
 
 
 if __name__ == "__main__":

@@ -73,22 +73,73 @@ class Measured:
 def messages(machine: str, seq: int) -> Iterator[tuple[str, bytes]]:
     """Yield what a service publishes of one sample, with the time of each call as its time."""
     head = {"schema": 1, "machine": machine, "seq": seq}
-    channel = ChannelSample(mean=31.41592653589793, min=31.29, max=31.52, spread=0.05123456789, count=60, polls=60,
-                            quality="good", device_quality="good")  # fmt: skip
-    yield "offset", encode(Offset(
-        **head, time_utc_ns=time.time_ns(), valid_for_s=150.0, y_offset_um=-12.345678901234567,
-        y_offset_rate_um_per_min=-0.8123456789, y_offset_std_um=0.4212345678, state="ok", reasons=[],
-        model_sha256="0" * 64))  # fmt: skip
-    yield "sample", encode(Sample(
-        **head, time_utc_ns=time.time_ns(), period_s=60.0, channels=dict.fromkeys(CHANNELS, channel)))  # fmt: skip
-    values = dict.fromkeys(("t_q_ref_degc", "at_ref_degc", "y_ref_um", "heat_w", "heat_std_w", "y_dtf_um", "y_tdtf_um",
-                            "y_base_um", "y_pred_um", "y_std_um", "y_rate_um_per_min", "y_um", "residual_um"),
-                           12.345678901234567)  # fmt: skip
+    channel = ChannelSample(
+        mean=31.41592653589793,
+        min=31.29,
+        max=31.52,
+        spread=0.05123456789,
+        count=60,
+        polls=60,
+        quality="good",
+        device_quality="good",
+    )
+    yield (
+        "offset",
+        encode(
+            Offset(
+                **head,
+                time_utc_ns=time.time_ns(),
+                valid_for_s=150.0,
+                y_offset_um=-12.345678901234567,
+                y_offset_rate_um_per_min=-0.8123456789,
+                y_offset_std_um=0.4212345678,
+                state="ok",
+                reasons=[],
+                model_sha256="0" * 64,
+            )
+        ),
+    )
+    yield (
+        "sample",
+        encode(Sample(**head, time_utc_ns=time.time_ns(), period_s=60.0, channels=dict.fromkeys(CHANNELS, channel))),
+    )
+    values = dict.fromkeys(
+        (
+            "t_q_ref_degc",
+            "at_ref_degc",
+            "y_ref_um",
+            "heat_w",
+            "heat_std_w",
+            "y_dtf_um",
+            "y_tdtf_um",
+            "y_base_um",
+            "y_pred_um",
+            "y_std_um",
+            "y_rate_um_per_min",
+            "y_um",
+            "residual_um",
+        ),
+        12.345678901234567,
+    )
     yield "estimate", encode(EstimateMessage(**head, time_utc_ns=time.time_ns(), y_effects_um=[1.2345678], **values))
-    yield "status", encode(Status(
-        **head, time_utc_ns=time.time_ns(), state="ok", reasons=[], version="0.1.0", model="vmc", model_kind="heat",
-        model_sha256="0" * 64, started_utc_ns=1, recording=f"{machine}_20260105T060000Z.mcap",
-        devices=dict.fromkeys(("spindle-couples", "cabinet-couples", "control", "probe"), "ok")))  # fmt: skip
+    yield (
+        "status",
+        encode(
+            Status(
+                **head,
+                time_utc_ns=time.time_ns(),
+                state="ok",
+                reasons=[],
+                version="0.1.0",
+                model="vmc",
+                model_kind="heat",
+                model_sha256="0" * 64,
+                started_utc_ns=1,
+                recording=f"{machine}_20260105T060000Z.mcap",
+                devices=dict.fromkeys(("spindle-couples", "cabinet-couples", "control", "probe"), "ok"),
+            )
+        ),
+    )
 
 
 # ---------------------------------------------------------------------------- the processes
@@ -111,10 +162,12 @@ def publish(port: int, first: int, count: int, period_s: float, samples: int) ->
     lines = obeyed()
     names = [f"vmc-{i:03d}" for i in range(first, first + count)]
     publishers = [
-        Publisher(Zenoh(prefix=f"shop/{name}", mode="peer", connect=[f"tcp/127.0.0.1:{port}"]),
-                  lambda name, payload, sender: {"ok": False, "text": "not here"})
+        Publisher(
+            Zenoh(prefix=f"shop/{name}", mode="peer", connect=[f"tcp/127.0.0.1:{port}"]),
+            lambda name, payload, sender: {"ok": False, "text": "not here"},
+        )
         for name in names
-    ]  # fmt: skip
+    ]
     with ExitStack() as stack, ThreadPoolExecutor(count) as pool:
         for opened in [pool.submit(stack.enter_context, publisher) for publisher in publishers]:
             opened.result()
@@ -174,8 +227,15 @@ def hear(port: int, folder: Path) -> None:
         for _ in sys.stdin:
             say(len(late.late_ns))
     tokens = recorder.messages - len(late.late_ns)
-    say({"late_ns": late.late_ns, "recorded": recorder.messages - tokens, "missed": sum(recorder.missed().values()),
-         "machines": len(shop.overview()), "tokens": tokens})  # fmt: skip
+    say(
+        {
+            "late_ns": late.late_ns,
+            "recorded": recorder.messages - tokens,
+            "missed": sum(recorder.missed().values()),
+            "machines": len(shop.overview()),
+            "tokens": tokens,
+        }
+    )
 
 
 def say(what: Any) -> None:
@@ -195,8 +255,14 @@ def started(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]
     """Run this module as a process of its own; yield it when it is ready."""
     command = [sys.executable, "-m", "tests.bench.shop", *map(str, arguments)]
     # A group of its own: Ctrl-C reaches this process alone, which ends machines and watch before their router.
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
-                          cwd=Path(__file__).parents[2]) as process:  # fmt: skip
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        cwd=Path(__file__).parents[2],
+    ) as process:
         try:
             assert process.stdin is not None and process.stdout is not None
             yield process, process.stdin, process.stdout
@@ -234,8 +300,9 @@ def measure(
         answer(out)
         watch, asks, answers = stack.enter_context(started("hear", port, folder))
         answer(answers)
-        shops = [stack.enter_context(started("publish", port, i * each, each, period_s, samples))
-                 for i in range(processes)]  # fmt: skip
+        shops = [
+            stack.enter_context(started("publish", port, i * each, each, period_s, samples)) for i in range(processes)
+        ]
         for _, _, out in shops:
             answer(out)
         start = np.ceil(time.time() + 0.5)
@@ -260,9 +327,16 @@ def measure(
         found = answer(answers)
     late_ms = np.array(found["late_ns"]) / 1e6
     size = sum(len(data) for _, data in messages("vmc-000", 1))
-    return Measured(sent=sent, heard=late_ms.size, recorded=found["recorded"], missed=found["missed"], late_ms=late_ms,
-                    router_pct=100.0 * router_s / seconds, watch_pct=100.0 * watch_s / seconds,
-                    bytes_per_sample=float(size))  # fmt: skip
+    return Measured(
+        sent=sent,
+        heard=late_ms.size,
+        recorded=found["recorded"],
+        missed=found["missed"],
+        late_ms=late_ms,
+        router_pct=100.0 * router_s / seconds,
+        watch_pct=100.0 * watch_s / seconds,
+        bytes_per_sample=float(size),
+    )
 
 
 def report(runs: tuple[tuple[float, int], ...] = ((1.0, 60), (60.0, 3))) -> Iterator[Figure]:
@@ -272,18 +346,26 @@ def report(runs: tuple[tuple[float, int], ...] = ((1.0, 60), (60.0, 3))) -> Iter
             got = measure(Path(folder), period_s, samples)
         middle, high, most = np.percentile(got.late_ms, [50, 99, 100])
         pace = f"{MACHINES} machines at one instant every {period_s:g} s through one router, {samples} samples"
-        yield told(Figure(
-            what=f"{pace}: lost of {got.sent} messages ({got.bytes_per_sample:.0f} bytes a sample)",
-            found=f"{got.sent - got.heard} on the way, {got.sent - got.recorded} not recorded", wanted="none",
-        ))  # fmt: skip
-        yield told(Figure(
-            what=f"{pace}: from the call of one to the call of the other",
-            found=f"{middle:.1f} ms median, {high:.1f} 99th percentile, {most:.0f} most",
-        ))  # fmt: skip
-        yield told(Figure(
-            what=f"{pace}: processor", found=f"{got.router_pct:.1f} % of a core for the router",
-            beside=f"{got.watch_pct:.1f} % for watch with its recorder",
-        ))  # fmt: skip
+        yield told(
+            Figure(
+                what=f"{pace}: lost of {got.sent} messages ({got.bytes_per_sample:.0f} bytes a sample)",
+                found=f"{got.sent - got.heard} on the way, {got.sent - got.recorded} not recorded",
+                wanted="none",
+            )
+        )
+        yield told(
+            Figure(
+                what=f"{pace}: from the call of one to the call of the other",
+                found=f"{middle:.1f} ms median, {high:.1f} 99th percentile, {most:.0f} most",
+            )
+        )
+        yield told(
+            Figure(
+                what=f"{pace}: processor",
+                found=f"{got.router_pct:.1f} % of a core for the router",
+                beside=f"{got.watch_pct:.1f} % for watch with its recorder",
+            )
+        )
 
 
 def main() -> None:

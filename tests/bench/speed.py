@@ -58,8 +58,13 @@ def engine_steps() -> Iterator[Figure]:
         engine.run(t_q, at)
         runs = [(timed(lambda engine=engine: engine.run(t_q, at)), timed(compiled)) for _ in range(7)]
         ratio = statistics.median(a / b for a, b in runs)
-        yield spread(f"one step of the engine, {NAMES[method]}, settled", [a / n * 1e6 for a, _ in runs], "µs",
-                     wanted="under 20 µs", beside=f"{ratio:.0f} × scipy.signal.lfilter over whole arrays")  # fmt: skip
+        yield spread(
+            f"one step of the engine, {NAMES[method]}, settled",
+            [a / n * 1e6 for a, _ in runs],
+            "µs",
+            wanted="under 20 µs",
+            beside=f"{ratio:.0f} × scipy.signal.lfilter over whole arrays",
+        )
 
 
 @contextmanager

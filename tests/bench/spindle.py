@@ -124,8 +124,11 @@ def report():
                 beside = ", ".join(f"{name} {errors[name][0]:.1f}" for name in names[:-1])
                 what = f"measured spindle ch{probe}, fitted on 20 h, run on the 12 after them: {found}"
                 figures.append(Figure(what=what, found=f"{errors['extended'][0]:.1f} µm rms", beside=beside))
-    rows("measured spindle, free run on hours that nothing saw, µm rms (mean absolute)",
-         ["probe", "fit, h", "judged, h", *names, "found"], body)  # fmt: skip
+    rows(
+        "measured spindle, free run on hours that nothing saw, µm rms (mean absolute)",
+        ["probe", "fit, h", "judged, h", *names, "found"],
+        body,
+    )
     yield from map(told, figures)
 
 

@@ -187,7 +187,7 @@ async def _near(plc: Plc, um: float) -> bool:
         ("[opcua]", "[other]\nx = 1\n[opcua]", "other: unknown table"),
         ("offset_max_um", "offset_maximum_um", "receiver.offset_maximum_um: unknown key"),
     ],
-)  # fmt: skip
+)
 def test_it_does_not_start_like_this(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, expected: str
 ) -> None:

@@ -17,7 +17,7 @@ import zenoh
 
 from compensator.cli import main
 from compensator.demo.machine import configuration, hardware
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from compensator.service.model_store import sha256_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.cli.test_commands import load_fast_model
@@ -105,10 +105,15 @@ def test_an_adopted_model_that_was_damaged_is_said_and_the_configured_one_stands
     [
         (lambda text: "nonsense", "not a TOML file"),
         (lambda text: text.replace("sample_period_s = 60.0", "sample_period_s = 55.0"), "whole multiple"),
-        (lambda text: text + '\n[[effect]]\nkind = "input"\nchannel = "oil_degc"\ncurve = "linear"\n'
-         "tau_min = [5.0]\ngain = [1.0]\ndelay_min = 0.0\n", "oil_degc"),
+        (
+            lambda text: (
+                text + '\n[[effect]]\nkind = "input"\nchannel = "oil_degc"\ncurve = "linear"\n'
+                "tau_min = [5.0]\ngain = [1.0]\ndelay_min = 0.0\n"
+            ),
+            "oil_degc",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_model_that_the_service_cannot_run_is_never_kept(
     idle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Any, expected: str
 ) -> None:
@@ -206,9 +211,15 @@ def test_killed_restarted_and_given_another_model(tmp_path: Path, capsys: pytest
     assert all(o["y_offset_um"] is not None for o in offsets[first:])  # also right after a start
     for (t0, a), (t1, b) in itertools.pairwise(values):
         assert abs(b - a) <= 8.0 / 60.0 * max((t1 - t0) / 1e9, 1.0) + 1e-9
-    logged = {json.loads(r.data)["seq"] for path in recordings(tmp_path / "recordings", "vmc-07")
-              for r in read_messages(path, ("offset",))}  # fmt: skip
+    logged = {
+        json.loads(r.data)["seq"]
+        for path in recordings(tmp_path / "recordings", "vmc-07")
+        for r in read_messages(path, ("offset",))
+    }
     assert set(seqs) <= logged
-    references = {json.loads(r.data)["t_q_ref_degc"] for path in recordings(tmp_path / "recordings", "vmc-07")
-                  for r in read_messages(path, ("estimate",))}  # fmt: skip
+    references = {
+        json.loads(r.data)["t_q_ref_degc"]
+        for path in recordings(tmp_path / "recordings", "vmc-07")
+        for r in read_messages(path, ("estimate",))
+    }
     assert len(references - {None}) == 1  # one zero, across kill, stop and models

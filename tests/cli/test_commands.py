@@ -19,7 +19,7 @@ from compensator.cli import COMMANDS, load, main
 from compensator.demo.day import START_NS, run_day
 from compensator.demo.machine import configuration, hardware
 from compensator.model.model_file import load_model
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 
 
@@ -198,8 +198,19 @@ def test_simulate_takes_roles_and_reports_gaps_and_disorder(
     lines[50], lines[51] = lines[51], lines[50]
     del lines[100:110]
     (tmp_path / "rough.csv").write_text("\n".join(lines))
-    command = ["simulate", str(tmp_path / "rough.csv"), "--model", "quill", "--out", str(tmp_path / "o.csv"), "--json",
-               "--column", "t_q_degc=spindle", "--column", "at_degc=room"]  # fmt: skip
+    command = [
+        "simulate",
+        str(tmp_path / "rough.csv"),
+        "--model",
+        "quill",
+        "--out",
+        str(tmp_path / "o.csv"),
+        "--json",
+        "--column",
+        "t_q_degc=spindle",
+        "--column",
+        "at_degc=room",
+    ]
     assert main(command) == 0
     captured = capsys.readouterr()
     assert "out of order" in captured.err and "gap of 10 sample(s) from t_s = 5940; bridged" in captured.err

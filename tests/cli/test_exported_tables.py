@@ -7,8 +7,8 @@ import pytest
 from mcap.writer import Writer
 
 from compensator.cli import main
-from compensator.recording import read_messages
-from compensator.tables import EXPORTED, load_data
+from compensator.data.tables import EXPORTED, load_data
+from compensator.recording.reading import read_messages
 from tests.audit.made import MACHINE, Service, other_model
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from compensator.atomic_write import whole_file
 from compensator.cli import main
-from compensator.whole import whole_file
 
 HEADER = "t_s,t_q_degc,at_degc,y_um,heat_w\n"
 
@@ -33,13 +33,19 @@ def refused(capsys: pytest.CaptureFixture[str], words: list[str], *expected: str
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
-        (b"PK\x03\x04rest", "workbook"), (b"\xd0\xcf\x11\xe0rest", "XLS"), (b"\x89MCAP0\r\n", "name it FILE.mcap"),
-        (HEADER.encode("utf-16"), "UTF-16"), (b"\x1f\x8brest", "gzip"), (b"\x7fELF\xff", "expected a table"),
-        (b"", "empty"), (b"t_s;t_q_degc;at_degc\n0;20,1;20,1\n", "semicolons"), (b"t_s\tt_q_degc\n0\t20\n", "tabs"),
+        (b"PK\x03\x04rest", "workbook"),
+        (b"\xd0\xcf\x11\xe0rest", "XLS"),
+        (b"\x89MCAP0\r\n", "name it FILE.mcap"),
+        (HEADER.encode("utf-16"), "UTF-16"),
+        (b"\x1f\x8brest", "gzip"),
+        (b"\x7fELF\xff", "expected a table"),
+        (b"", "empty"),
+        (b"t_s;t_q_degc;at_degc\n0;20,1;20,1\n", "semicolons"),
+        (b"t_s\tt_q_degc\n0\t20\n", "tabs"),
         (b"t_s,at_degc,at_degc\n0,1,2\n", "'at_degc' twice"),
         (b"t_s,t_q_degc,at_degc\n0,20,20\n60000,21,20\n120000,21,20\n", "in seconds?"),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_is_no_table_says_what_it_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes, expected: str
 ) -> None:

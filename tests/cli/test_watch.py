@@ -55,8 +55,11 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, in
 
 def test_one_look_as_json(running: tuple[Path, int], capsys: pytest.CaptureFixture[str]) -> None:
     config, port = running
-    for arguments in (["--config", str(config)], ["--connect", f"tcp/127.0.0.1:{port}", "--wait", "2.5"],
-                      ["--connect", f"tcp/127.0.0.1:{port}", "--prefix", "shop"]):  # fmt: skip
+    for arguments in (
+        ["--config", str(config)],
+        ["--connect", f"tcp/127.0.0.1:{port}", "--wait", "2.5"],
+        ["--connect", f"tcp/127.0.0.1:{port}", "--prefix", "shop"],
+    ):
         assert main(["watch", *arguments, "--json"]) == 0
         found: dict[str, Any] = json.loads(capsys.readouterr().out)
         (machine,) = found["machines"]
@@ -77,8 +80,12 @@ def test_one_look_for_people(running: tuple[Path, int], capsys: pytest.CaptureFi
 
 
 def watch(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen([sys.executable, "-m", "compensator", "watch", *arguments],
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
+    return subprocess.Popen(
+        [sys.executable, "-m", "compensator", "watch", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -113,8 +120,11 @@ def test_a_recording_of_the_shop_ends_whole(running: tuple[Path, int], tmp_path:
     (path,) = tmp_path.iterdir()
     assert result["files"] == [str(path)] and result["missed"] == {} and result["not_recorded"] == 0
     with path.open("rb") as file:
-        recorded = {message.data for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
-                    if channel.topic == "/shop/sim/thermal/y/offset"}  # fmt: skip
+        recorded = {
+            message.data
+            for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
+            if channel.topic == "/shop/sim/thermal/y/offset"
+        }
     assert len(recorded) >= 2
     received = {offset["seq"]: offset for offset in receiver.offsets}
     both = [json.loads(data) for data in recorded if json.loads(data)["seq"] in received]

@@ -104,7 +104,7 @@ def test_a_cluster_that_is_not_there_is_said_in_one_line(
     words: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("compensator.commands.workers.SCHEDULER_S", 1.0)
     Service(tmp_path).run(3).stop()

@@ -23,7 +23,7 @@ from compensator.clock import NS
 from compensator.demo.live import obey
 from compensator.demo.machine import CapaNcdt, configuration, hardware
 from compensator.messages import Offset
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from compensator.service.composition import load, read_once
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire import Faults
@@ -70,9 +70,11 @@ def test_typing_breaks_a_sensor_and_mends_it(tmp_path: Path) -> None:
         sound = readings(config)
         assert sound == ["good", "good", "good"]
         for line, number, expected in (
-            ("break t_q", 0, "open_circuit"), ("unplug at", 1, "device_timeout"), ("break y", 2, "over_range"),
+            ("break t_q", 0, "open_circuit"),
+            ("unplug at", 1, "device_timeout"),
+            ("break y", 2, "over_range"),
             ("unplug y", 2, "device_disconnected"),
-        ):  # fmt: skip
+        ):
             assert obey(line + "\n", faults).startswith(f"{line}: done")
             assert readings(config) == [*sound[:number], expected, *sound[number + 1 :]]
             assert obey("mend\n", faults) == "all is well again"
@@ -103,9 +105,12 @@ def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest
     folder = tmp_path / "live/recordings"
     began_ns = time.time_ns()
     process = subprocess.Popen(
-        [sys.executable, "-m", "compensator", *command, "--json"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [sys.executable, "-m", "compensator", *command, "--json"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         assert process.stdin is not None and process.stderr is not None
         assert any("Ctrl-C ends it" in line for line in process.stderr)
@@ -124,8 +129,9 @@ def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest
             pipe.close()
     offsets = [
         msgspec.json.decode(record.data, type=Offset)
-        for path in recordings(folder, "vmc-07") for record in read_messages(path, ("offset",))
-    ]  # fmt: skip
+        for path in recordings(folder, "vmc-07")
+        for record in read_messages(path, ("offset",))
+    ]
     assert 59 <= len(offsets) <= 62
     assert abs(offsets[-1].time_utc_ns - began_ns) < 300 * NS and offsets[-1].state in ("ok", "degraded")
     steps = {b.time_utc_ns - a.time_utc_ns for a, b in itertools.pairwise(offsets)}

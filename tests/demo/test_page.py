@@ -21,15 +21,22 @@ def words(loop: dict[str, Any]) -> str:
     return html_of(page_of([day], [["a"], ["b"]], loop, lines, {"comparison": []}))
 
 
-@pytest.mark.parametrize(("adopted", "there", "not_there"), [
-    (True, "took the extended model over; judged from 1.0 h on", "left as it was"),
-    (False, "The model was left as it was", "took the extended model over"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("adopted", "there", "not_there"),
+    [
+        (True, "took the extended model over; judged from 1.0 h on", "left as it was"),
+        (False, "The model was left as it was", "took the extended model over"),
+    ],
+)
 def test_the_page_says_whether_a_model_was_taken_over(adopted: bool, there: str, not_there: str) -> None:
     loop = {
-        "second_day_rms_um": {"without": 38.3, "first": 6.3, "extended": 1.2 if adopted else 6.3}, "found": ["drift"],
-        "verdict": "partly_explained", "drawn": "drift", "adopted": adopted, "adopted_after_h": float(adopted),
-    }  # fmt: skip
+        "second_day_rms_um": {"without": 38.3, "first": 6.3, "extended": 1.2 if adopted else 6.3},
+        "found": ["drift"],
+        "verdict": "partly_explained",
+        "drawn": "drift",
+        "adopted": adopted,
+        "adopted_after_h": float(adopted),
+    }
     page = words(loop)
     assert there in page and not_there not in page and "partly explained" in page
     assert ("drift) cannot run in the service" in page) is not adopted

@@ -104,9 +104,12 @@ class Box:
         log = self._folder / "boot.log"
         with log.open("wb") as file:
             self._process = subprocess.Popen(
-                ["sh", "-c", enter + "--kill-child sh -c \"$BOOT\""], env=environment | {"BOOT": _BOOT},
-                stdin=subprocess.DEVNULL, stdout=file, stderr=file,
-            )  # fmt: skip
+                ["sh", "-c", enter + '--kill-child sh -c "$BOOT"'],
+                env=environment | {"BOOT": _BOOT},
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+            )
         children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children")
 
         def booted() -> bool:
@@ -136,9 +139,15 @@ class Box:
     def run(self, *command: str, check: bool = True, environment: Mapping[str, str] | None = None) -> str:
         """Run a command in the box and return what it printed on both streams."""
         enter = ["nsenter", "--target", str(self.pid), "--all"]
-        done = subprocess.run([*enter, *command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                              env={"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", **(environment or {})}, check=False,
-                              timeout=300)  # fmt: skip
+        done = subprocess.run(
+            [*enter, *command],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", **(environment or {})},
+            check=False,
+            timeout=300,
+        )
         if check and done.returncode != 0:
             raise AssertionError(f"{' '.join(command)}: exit {done.returncode}\n{done.stdout}")
         return done.stdout

@@ -64,8 +64,15 @@ def test_states_and_reasons_are_those_of_the_service() -> None:
 def test_keys_of_the_limits_are_keys_of_the_configuration() -> None:
     from compensator.config import Channel, Config, Guards, Limits, Loss, Recording, Sampling, Validity
 
-    tables = {"limits": Limits, "limits.validity": Validity, "loss": Loss, "guards": Guards, "channel": Channel,
-              "sampling": Sampling, "recording": Recording}  # fmt: skip
+    tables = {
+        "limits": Limits,
+        "limits.validity": Validity,
+        "loss": Loss,
+        "guards": Guards,
+        "channel": Channel,
+        "sampling": Sampling,
+        "recording": Recording,
+    }
     section = TEXT.split("## 7. Limits")[1].split("## 8.")[0]
     named = re.findall(r"^\| `([a-z_.]+)\.([a-z_*]+)`", section, re.MULTILINE)
     assert len(named) >= 9
@@ -81,7 +88,10 @@ def test_keys_of_the_limits_are_keys_of_the_configuration() -> None:
 def test_links_lead_somewhere() -> None:
     for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", TEXT):
         assert (GUIDE.parent / link).exists(), link
-    headings = {re.sub(r"[^\w -]", "", line.lstrip("# ").lower()).replace(" ", "-")
-                for line in TEXT.splitlines() if line.startswith("#")}  # fmt: skip
+    headings = {
+        re.sub(r"[^\w -]", "", line.lstrip("# ").lower()).replace(" ", "-")
+        for line in TEXT.splitlines()
+        if line.startswith("#")
+    }
     for anchor in re.findall(r"\]\(#([^)]+)\)", TEXT):
         assert anchor in headings, anchor

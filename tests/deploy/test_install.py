@@ -243,8 +243,9 @@ def test_a_configuration_is_never_overwritten(pc: Pc) -> None:
     assert b"# second" in config.with_name("machine.toml.new").read_bytes()
 
 
-@pytest.mark.parametrize("folder", ["recordings", "/data", "/var/lib/compensator/other/recordings",
-                                    "/var/lib/compensator/vmc-07/../other"])  # fmt: skip
+@pytest.mark.parametrize(
+    "folder", ["recordings", "/data", "/var/lib/compensator/other/recordings", "/var/lib/compensator/vmc-07/../other"]
+)
 def test_a_recording_that_the_service_could_not_write_is_refused(pc: Pc, folder: str) -> None:
     pc.activate(pc.version("1.0-aaaa"))
     with pytest.raises(install.InstallError, match="expected a folder below /var/lib/compensator/vmc-07/"):
@@ -260,8 +261,11 @@ def test_removal_keeps_configuration_and_recordings_unless_told(pc: Pc) -> None:
     recording.touch()
     pc.uninstall(purge=False)
     left = {path.relative_to(pc.folder).as_posix() for path in pc.folder.rglob("*") if path.is_file()}
-    assert left == {"given.toml", "etc/compensator/vmc-07/machine.toml",
-                    "var/lib/compensator/vmc-07/recordings/day.mcap"}  # fmt: skip
+    assert left == {
+        "given.toml",
+        "etc/compensator/vmc-07/machine.toml",
+        "var/lib/compensator/vmc-07/recordings/day.mcap",
+    }
     pc.uninstall(purge=False)
     assert config.exists()
     pc.uninstall(purge=True)

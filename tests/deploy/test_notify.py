@@ -25,7 +25,7 @@ from compensator.clock import NS
 from compensator.commands.run import Voice, level, status
 from compensator.demo.machine import configuration
 from compensator.messages import Event, Offset
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
 from compensator.service import journald
 from compensator.service.compensation import Outcome
 from compensator.service.notify import ServiceManager
@@ -76,9 +76,18 @@ def listener(tmp_path: Path) -> Iterator[Listener]:
 
 def offset(**changes: Any) -> Offset:
     values: dict[str, Any] = {
-        "schema": 1, "machine": "vmc-07", "seq": 7, "time_utc_ns": 1, "valid_for_s": 150.0, "y_offset_um": -12.341,
-        "y_offset_rate_um_per_min": -0.81, "y_offset_std_um": 0.4, "state": "ok", "reasons": [], "model_sha256": "",
-    }  # fmt: skip
+        "schema": 1,
+        "machine": "vmc-07",
+        "seq": 7,
+        "time_utc_ns": 1,
+        "valid_for_s": 150.0,
+        "y_offset_um": -12.341,
+        "y_offset_rate_um_per_min": -0.81,
+        "y_offset_std_um": 0.4,
+        "state": "ok",
+        "reasons": [],
+        "model_sha256": "",
+    }
     return Offset(**values | changes)
 
 
@@ -98,8 +107,13 @@ def test_the_manager_is_told_in_its_own_protocol(listener: Listener) -> None:
         manager.watch(5.0)
         manager.watch(60.0)
         manager.stopping()
-    assert listener.drain() == ["STATUS=one line only", "READY=1", "WATCHDOG=1", "WATCHDOG_USEC=180000000",
-                                "STOPPING=1"]  # fmt: skip
+    assert listener.drain() == [
+        "STATUS=one line only",
+        "READY=1",
+        "WATCHDOG=1",
+        "WATCHDOG_USEC=180000000",
+        "STOPPING=1",
+    ]
 
 
 def test_an_abstract_address_is_understood() -> None:
@@ -272,9 +286,17 @@ def test_events_reach_the_journal_with_their_fields(tmp_path: Path, listener: Li
         log.removeHandler(handler)
         log.setLevel(logging.NOTSET)
         handler.close()
-    assert first == {"MESSAGE": "state: hold t_q_missing", "PRIORITY": "4", "SYSLOG_IDENTIFIER": "compensator",
-                     "LOGGER": "compensator", "MACHINE": "vmc-07", "SEQ": "3", "KIND": "state", "STATE": "hold",
-                     "REASONS": "t_q_missing"}  # fmt: skip
+    assert first == {
+        "MESSAGE": "state: hold t_q_missing",
+        "PRIORITY": "4",
+        "SYSLOG_IDENTIFIER": "compensator",
+        "LOGGER": "compensator",
+        "MACHINE": "vmc-07",
+        "SEQ": "3",
+        "KIND": "state",
+        "STATE": "hold",
+        "REASONS": "t_q_missing",
+    }
     assert second["MESSAGE"] == "device: two\nlines" and second["STATE"] == "hold" and second["PRIORITY"] == "6"
 
 
@@ -305,12 +327,18 @@ def test_the_process_under_a_manager(tmp_path: Path, listener: Listener) -> None
     text = configuration("vmc-07", LINES, free_port()).replace('"quill"', f'"{load_fast_model(tmp_path).name}"')
     config.write_text(text.replace("poll_interval_s = 10.0", "poll_interval_s = 0.25"), encoding="utf-8")
     with (tmp_path / "stderr").open("w") as stderr:
-        process = subprocess.Popen([sys.executable, "-m", "compensator", "run", "--config", str(config)],
-                                   stderr=stderr, env=os.environ | listener.environment(0.1))  # fmt: skip
+        process = subprocess.Popen(
+            [sys.executable, "-m", "compensator", "run", "--config", str(config)],
+            stderr=stderr,
+            env=os.environ | listener.environment(0.1),
+        )
         try:
             lines = listener.until(lambda lines: lines.count("WATCHDOG=1") >= 6)
-            assert lines[:3] == ["STATUS=starting: reads the last recording", "WATCHDOG_USEC=750000",
-                                 "STATUS=starting: waits for the first poll"]  # fmt: skip
+            assert lines[:3] == [
+                "STATUS=starting: reads the last recording",
+                "WATCHDOG_USEC=750000",
+                "STATUS=starting: waits for the first poll",
+            ]
             assert lines.count("READY=1") == 1 and lines.index("READY=1") < lines.index("WATCHDOG=1")
             listener.until(lambda lines: any("no offset yet; sample" in line for line in lines))
             process.send_signal(signal.SIGTERM)

@@ -14,7 +14,7 @@ import pytest
 
 from compensator.cli import main
 from compensator.demo.machine import configuration
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire.icpdas import IcpDas
 from sim_hardware.wire.modbus_servers import ModbusRtuLine

@@ -10,9 +10,24 @@ from sim_hardware.physics.published import DEFORMATION_POLES, DTF, TDTF, TTF, TT
 
 NAMES = ("coolant_degc", "coolant_flow_lpm", "spindle_rpm", "fan_rpm", "cabinet_degc", "hydraulic_bar")
 KINDS = (
-    "none", "input", "input square", "input delay", "gain DTF", "gain TDTF", "missing mode", "mistimed", "late path",
-    "late sensor", "nonlinear", "scheduled", "play", "drift", "step", "periodic", "unobserved",
-)  # fmt: skip
+    "none",
+    "input",
+    "input square",
+    "input delay",
+    "gain DTF",
+    "gain TDTF",
+    "missing mode",
+    "mistimed",
+    "late path",
+    "late sensor",
+    "nonlinear",
+    "scheduled",
+    "play",
+    "drift",
+    "step",
+    "periodic",
+    "unobserved",
+)
 
 
 @dataclass
@@ -91,7 +106,10 @@ def draw(kind, seed, size_um=None):
     table = {
         "none": ((), lambda s: np.zeros(s[0])),
         "input": (("input", "", channel), lambda s: fixed("a", lag(s[1][channel], tau))),
-        "input square": (("input", "", "spindle_rpm"), lambda s: fixed("a", lag((s[1]["spindle_rpm"] / 8e3)**2, tau))),
+        "input square": (
+            ("input", "", "spindle_rpm"),
+            lambda s: fixed("a", lag((s[1]["spindle_rpm"] / 8e3) ** 2, tau)),
+        ),
         "input delay": (("input", "", channel), lambda s: fixed("a", late(lag(s[1][channel], tau), delay))),
         "gain DTF": (("gain", "DTF", ""), lambda s: fixed("a", s[4])),
         "gain TDTF": (("gain", "TDTF", ""), lambda s: fixed("a", s[5])),
@@ -106,7 +124,7 @@ def draw(kind, seed, size_um=None):
         "step": (("step", "", ""), lambda s: sign * 2 * size * (np.arange(s[0]) >= t_step * s[0])),
         "periodic": (("periodic", "", ""), lambda s: cycles(s[0])),
         "unobserved": (("unobserved", "", ""), lambda s: fixed("a", hidden(s[0]))),
-    }  # fmt: skip
+    }
     place, act = table[kind]
     sensor = (lambda d: late(d, max(1, delay // 4))) if kind == "late sensor" else None
     return Scenario(place=place, act=act, sensor=sensor)
@@ -124,8 +142,9 @@ def record(scenarios, seed, hours=36.0, *, noise_k=0.02, noise_um=0.3):
     true = y_dtf + y_tdtf + effect
     at = columns["ambient_degc"]
     measured = {
-        "t_q_degc": at + difference + rng.normal(0, noise_k, n), "at_degc": at + rng.normal(0, noise_k, n),
+        "t_q_degc": at + difference + rng.normal(0, noise_k, n),
+        "at_degc": at + rng.normal(0, noise_k, n),
         "y_um": true + rng.normal(0, noise_um, n),
         **{name: columns[name] + rng.normal(0, 0.02 if "degc" in name else 0.0, n) for name in NAMES},
-    }  # fmt: skip
+    }
     return measured, true, effect

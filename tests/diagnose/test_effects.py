@@ -88,7 +88,7 @@ def test_a_restart_in_between_changes_no_bit(day, evidence):
         ("hysteresis", {"path": "DTF", "form": "play", "half_width_um": float("nan")}, "half_width_um"),
         ("delay", {"path": "DTF", "delay_min": "soon", "lag_min": 0.0}, "delay_min"),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_table_names_kind_key_and_value(kind, table, words):
     with pytest.raises(ModelError, match=f"effect {kind}: .*{words}"):
         Engine(dataclasses.replace(QUILL, effects=(EffectTable(kind=kind, table=table),)))

@@ -33,10 +33,12 @@ def machine(seed, speeds, *, logged=True):
     y = 1.4 * lag(motor, 90.0) - 2.0 * lag(room - room[0], 200.0)
     y = y - 2.4e-6 * lag(rpm**2, 70.0)
     columns = {
-        "t_q_degc": room + motor + rng.normal(0, 0.02, n), "at_degc": room + rng.normal(0, 0.02, n),
-        "y_um": y + rng.normal(0, 0.2, n), "shop_degc": 19.0 + lag(rng.normal(0.0, 1.0, n), 60.0) * 8.0,
+        "t_q_degc": room + motor + rng.normal(0, 0.02, n),
+        "at_degc": room + rng.normal(0, 0.02, n),
+        "y_um": y + rng.normal(0, 0.2, n),
+        "shop_degc": 19.0 + lag(rng.normal(0.0, 1.0, n), 60.0) * 8.0,
         "second_um": 0.8 * y + rng.normal(0, 0.2, n),
-    }  # fmt: skip
+    }
     if logged:
         columns["spindle_rpm"] = rpm
     return runs_from(columns)
@@ -119,10 +121,14 @@ def test_held_out_samples_do_not_take_part(runs):
     block = next(evidence.blocks(3))
     seen = evidence.hidden(block)
     before = refit(seen)
-    disturbed = runs_from({
-        "t_q_degc": runs[0].t_q_degc, "at_degc": runs[0].at_degc, "y_um": np.where(block, 77.0, runs[0].y_um),
-        **runs[0].channels,
-    })  # fmt: skip
+    disturbed = runs_from(
+        {
+            "t_q_degc": runs[0].t_q_degc,
+            "at_degc": runs[0].at_degc,
+            "y_um": np.where(block, 77.0, runs[0].y_um),
+            **runs[0].channels,
+        }
+    )
     again = refit(evidence_of(calibrated(runs), disturbed).hidden(block))
     assert again.rms_um == pytest.approx(before.rms_um, rel=1e-6)
     assert not seen.deformation_um[block].any()

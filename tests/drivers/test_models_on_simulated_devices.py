@@ -45,25 +45,54 @@ INPUTS = {"inputs": [{"input": 0}, {"input": 3}]}
 #: model, settings, simulated module, protocol, values, tolerance (half a step of the converter and a little)
 CASES = [
     ("icpdas-m7018r", COUPLES | {"format": "hex"}, lambda: icp("m-7018r"), "modbus-rtu", TEMPERATURES, 0.05),
-    ("icpdas-m7018r", COUPLES | {"format": "engineering"}, lambda: icp("m-7018r", data_format="engineering"),
-     "modbus-rtu-over-tcp", TEMPERATURES, 0.11),
+    (
+        "icpdas-m7018r",
+        COUPLES | {"format": "engineering"},
+        lambda: icp("m-7018r", data_format="engineering"),
+        "modbus-rtu-over-tcp",
+        TEMPERATURES,
+        0.11,
+    ),
     ("icpdas-m7019r", COUPLES | {"format": "hex"}, lambda: icp("m-7019r"), "modbus-rtu", TEMPERATURES, 0.05),
     ("icpdas-et7018z", COUPLES | {"format": "hex"}, lambda: icp("et-7018z"), "modbus-tcp", TEMPERATURES, 0.05),
-    ("icpdas-et7018z", COUPLES | {"format": "engineering"}, lambda: icp("et-7018z", data_format="engineering"),
-     "modbus-tcp", TEMPERATURES, 0.11),
+    (
+        "icpdas-et7018z",
+        COUPLES | {"format": "engineering"},
+        lambda: icp("et-7018z", data_format="engineering"),
+        "modbus-tcp",
+        TEMPERATURES,
+        0.11,
+    ),
     ("adam-4018p", COUPLES, lambda: adam("adam-4018+"), "modbus-rtu", TEMPERATURES, 0.03),
     ("adam-4118", COUPLES, lambda: adam("adam-4118"), "modbus-rtu-over-tcp", TEMPERATURES, 0.03),
     ("adam-6018", COUPLES, lambda: adam("adam-6018"), "modbus-tcp", TEMPERATURES, 0.03),
-    ("moxa-e1262", COUPLES | {"word_order": "little"},
-     lambda: MoxaE1262(sources=sources(TEMPERATURES), word_order="little"), "modbus-tcp", TEMPERATURES, 0.01),
-    ("icpdas-m7017", INPUTS | {"format": "hex"},
-     lambda: IcpDas("m-7017", sources=sources(VOLTS), ranges="10V"), "modbus-rtu", VOLTS, 0.001),
-    ("icpdas-et7017", INPUTS | {"format": "engineering"},
-     lambda: IcpDas("et-7017", sources=sources(VOLTS), ranges="10V", data_format="engineering"),
-     "modbus-tcp", VOLTS, 0.002),
+    (
+        "moxa-e1262",
+        COUPLES | {"word_order": "little"},
+        lambda: MoxaE1262(sources=sources(TEMPERATURES), word_order="little"),
+        "modbus-tcp",
+        TEMPERATURES,
+        0.01,
+    ),
+    (
+        "icpdas-m7017",
+        INPUTS | {"format": "hex"},
+        lambda: IcpDas("m-7017", sources=sources(VOLTS), ranges="10V"),
+        "modbus-rtu",
+        VOLTS,
+        0.001,
+    ),
+    (
+        "icpdas-et7017",
+        INPUTS | {"format": "engineering"},
+        lambda: IcpDas("et-7017", sources=sources(VOLTS), ranges="10V", data_format="engineering"),
+        "modbus-tcp",
+        VOLTS,
+        0.002,
+    ),
     ("adam-4117", INPUTS, lambda: Adam("adam-4117", sources=sources(VOLTS), ranges="10V"), "modbus-rtu", VOLTS, 0.001),
     ("adam-6017", INPUTS, lambda: Adam("adam-6017", sources=sources(VOLTS), ranges="10V"), "modbus-tcp", VOLTS, 0.001),
-]  # fmt: skip
+]
 
 
 def serve(rack: Rack, protocol: str, module: Any) -> tuple[Any, dict[str, Any]]:
@@ -104,8 +133,13 @@ async def test_probe_behind_an_analogue_amplifier_gives_um() -> None:
         module = Adam("adam-6017", sources=sources({2: 4.0}), ranges="10V")
         _, line = serve(rack, "modbus-tcp", module)
         probe = {"um_per_v": 5.0, "polarity": -1, "standoff_um": 50.0, "volt_min": -9.9, "volt_max": 9.9}
-        device = {"name": "d", "line": "line", "model": "adam-6017", "address": 1,
-                  "inputs": [{"input": 2, "probe": probe}]}  # fmt: skip
+        device = {
+            "name": "d",
+            "line": "line",
+            "model": "adam-6017",
+            "address": 1,
+            "inputs": [{"input": 2, "probe": probe}],
+        }
         fleet = drivers.build([line], [device], source="test")
         try:
             assert fleet.devices["d"].units == {2: "um"}
@@ -119,10 +153,12 @@ async def test_probe_behind_an_analogue_amplifier_gives_um() -> None:
 
 async def test_register_map() -> None:
     with Rack() as rack:
-        module = RegisterMap({
-            10: Register(source=lambda: 4321.0, kind="uint16"),
-            20: Register(source=lambda: -12.34, kind="float32", word_order="little"),
-        })  # fmt: skip
+        module = RegisterMap(
+            {
+                10: Register(source=lambda: 4321.0, kind="uint16"),
+                20: Register(source=lambda: -12.34, kind="float32", word_order="little"),
+            }
+        )
         _, line = serve(rack, "modbus-tcp", module)
         inputs = [
             {"input": 0, "unit": "rpm", "function": 4, "address": 10, "type": "uint16"},
@@ -145,8 +181,15 @@ async def test_dcon_modules(checksum: bool, vendor: str) -> None:
         module = icp("m-7018r") if vendor == "icpdas" else adam("adam-4018+")
         line = rack.add(DconLine({7: module}, settings={7: DconSettings(checksum=checksum)}))
         table = {"name": "line", "protocol": "dcon", "port": str(line.port)}
-        device = {"name": "d", "line": "line", "model": "dcon", "address": 7, "checksum": checksum,
-                  "vendor": vendor, **COUPLES}  # fmt: skip
+        device = {
+            "name": "d",
+            "line": "line",
+            "model": "dcon",
+            "address": 7,
+            "checksum": checksum,
+            "vendor": vendor,
+            **COUPLES,
+        }
         fleet = drivers.build([table], [device], source="test")
         try:
             readings = await fleet.devices["d"].read()
@@ -161,8 +204,13 @@ async def test_dcon_modules(checksum: bool, vendor: str) -> None:
 async def test_capancdt_takes_the_range_from_the_controller() -> None:
     with Rack() as rack:
         capa = rack.add(CapaNcdt({1: lambda: 123.4, 2: lambda: 50.0}, {1: 2000.0, 2: 100.0}))
-        line = {"name": "line", "protocol": "capancdt", "host": capa.host, "data_port": capa.data_port,
-                "command_port": capa.command_port}  # fmt: skip
+        line = {
+            "name": "line",
+            "protocol": "capancdt",
+            "host": capa.host,
+            "data_port": capa.data_port,
+            "command_port": capa.command_port,
+        }
         device = {"name": "d", "line": "line", "model": "capancdt-6200", "inputs": [{"input": 0}, {"input": 1}]}
         fleet = drivers.build([line], [device], source="test")
         try:

@@ -20,7 +20,7 @@ import zenoh
 from compensator.config import Zenoh
 from compensator.demo.day import run_day
 from compensator.messages import SCHEMA, Offset, encode
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from compensator.service.publisher import session_config
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "deploy/examples"
@@ -57,13 +57,26 @@ def figures(day: Path) -> tuple[int, float, float]:
 def test_a_subscriber_prints_what_is_published_and_says_when_to_hold(tmp_path: Path) -> None:
     messages = [
         Offset(
-            schema=SCHEMA, machine="vmc-07", seq=48213 + i, time_utc_ns=1, valid_for_s=150.0, y_offset_um=value,
-            y_offset_rate_um_per_min=rate, y_offset_std_um=0.4, state=state, reasons=reasons, model_sha256="",
+            schema=SCHEMA,
+            machine="vmc-07",
+            seq=48213 + i,
+            time_utc_ns=1,
+            valid_for_s=150.0,
+            y_offset_um=value,
+            y_offset_rate_um_per_min=rate,
+            y_offset_std_um=0.4,
+            state=state,
+            reasons=reasons,
+            model_sha256="",
         )
-        for i, (value, rate, state, reasons) in enumerate((
-            (-12.34, -0.81, "ok", []), (-13.0, 0.0, "degraded", ["predicting"]), (None, None, "starting", ["no_zero"]),
-        ))
-    ]  # fmt: skip
+        for i, (value, rate, state, reasons) in enumerate(
+            (
+                (-12.34, -0.81, "ok", []),
+                (-13.0, 0.0, "degraded", ["predicting"]),
+                (None, None, "starting", ["no_zero"]),
+            )
+        )
+    ]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
@@ -73,8 +86,11 @@ def test_a_subscriber_prints_what_is_published_and_says_when_to_hold(tmp_path: P
         listener = publisher.declare_matching_listener(lambda status: matched.set() if status.matching else None)
         with subprocess.Popen(
             [sys.executable, EXAMPLES / "subscriber.py", endpoint, PREFIX, "3"],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        ) as process:  # fmt: skip
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process:
             try:
                 assert matched.wait(60.0)
                 for message in messages:
@@ -119,8 +135,15 @@ def install(folder: Path) -> None:
         pytest.skip("no node or npm on this machine: the example in JavaScript was not run")
     for name in ("package.json", "recording.mjs"):
         shutil.copy(EXAMPLES / name, folder)
-    words = ["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", "--fetch-retries=0",
-             "--fetch-timeout=15000"]  # fmt: skip
+    words = [
+        "npm",
+        "install",
+        "--no-audit",
+        "--no-fund",
+        "--ignore-scripts",
+        "--fetch-retries=0",
+        "--fetch-timeout=15000",
+    ]
     try:
         done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=60.0, env=dict(os.environ))
     except subprocess.TimeoutExpired:

@@ -7,11 +7,44 @@ from collections.abc import Callable
 
 #: What people, editors, disks and attackers put into files.
 PIECES = (
-    b"\x00", b"\xef\xbb\xbf", b"\xff\xfe", "µ°é".encode("latin-1"), "µ°é∞".encode(), b"\r", b"\n\n", b"\t", b'"', b"'",
-    b"nan", b"NaN", b"inf", b"-inf", b"1e308", b"-1e308", b"1e999", b"9" * 400, b"0x10", b"-0.0", b"1_0", b"1,5",
-    b"5e-324", b"99999999999999999999", b"9223372036854775808", b"true", b"null", b"[]", b"{}", b"[" * 300,
-    b"{" * 300, b'{"a":' * 300, b"../../../etc/passwd", b"%s%n", b"\\u0000", b"\xed\xa0\x80", b"x" * 5000,
-)  # fmt: skip
+    b"\x00",
+    b"\xef\xbb\xbf",
+    b"\xff\xfe",
+    "µ°é".encode("latin-1"),
+    "µ°é∞".encode(),
+    b"\r",
+    b"\n\n",
+    b"\t",
+    b'"',
+    b"'",
+    b"nan",
+    b"NaN",
+    b"inf",
+    b"-inf",
+    b"1e308",
+    b"-1e308",
+    b"1e999",
+    b"9" * 400,
+    b"0x10",
+    b"-0.0",
+    b"1_0",
+    b"1,5",
+    b"5e-324",
+    b"99999999999999999999",
+    b"9223372036854775808",
+    b"true",
+    b"null",
+    b"[]",
+    b"{}",
+    b"[" * 300,
+    b"{" * 300,
+    b'{"a":' * 300,
+    b"../../../etc/passwd",
+    b"%s%n",
+    b"\\u0000",
+    b"\xed\xa0\x80",
+    b"x" * 5000,
+)
 
 
 def _flip(rng: random.Random, data: bytearray) -> None:
@@ -62,8 +95,16 @@ def _exchange(rng: random.Random, data: bytearray) -> None:
 
 
 _WAYS: tuple[Callable[[random.Random, bytearray], None], ...] = (
-    _flip, _cut, _drop, _double, _insert, _number, _number, _noise, _exchange,
-)  # fmt: skip
+    _flip,
+    _cut,
+    _drop,
+    _double,
+    _insert,
+    _number,
+    _number,
+    _noise,
+    _exchange,
+)
 
 
 def mutated(seed: int, data: bytes) -> bytes:

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from compensator.cli import main
 from compensator.config import parse_config
+from compensator.data.tables import load_data
 from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model, read_model_bytes
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation
 from compensator.service.model_store import ModelStore
-from compensator.tables import load_data
 from tests.audit.made import CONFIG, Service
 from tests.fuzz.mutation import mutated
 from tests.service.records import QUILL, day

@@ -125,8 +125,14 @@ async def test_the_service_on_mangled_wires_never_fails_and_never_jumps(tmp_path
 def payloads(seed: int, count: int) -> Iterator[tuple[str, bytes]]:
     """Commands of every name with what may come with them."""
     rng = random.Random(seed)
-    good = (b"", b'{"mode": "rest"}', b'{"model": "[model]", "force": false}', b'{"sha256": "00ff", "force": true}',
-            b'{"mode": {"mode": ["warm", 1e999, null]}}', b'{"model": 7, "sha256": [], "force": "yes"}')  # fmt: skip
+    good = (
+        b"",
+        b'{"mode": "rest"}',
+        b'{"model": "[model]", "force": false}',
+        b'{"sha256": "00ff", "force": true}',
+        b'{"mode": {"mode": ["warm", 1e999, null]}}',
+        b'{"model": 7, "sha256": [], "force": "yes"}',
+    )
     for _ in range(count):
         data = rng.choice(good)
         yield rng.choice(COMMANDS), mutated(rng.randrange(2**32), data) if data and rng.random() < 0.8 else data

@@ -5,9 +5,9 @@ import functools
 import numpy as np
 from scipy.signal import lfilter
 
-from compensator.identify.runs import runs_of
+from compensator.data.record import Record
+from compensator.data.runs import runs_of
 from compensator.model.model_file import load_model
-from compensator.tables import Record
 from sim_hardware.physics import World, usual_sensors
 
 QUILL = load_model("quill")

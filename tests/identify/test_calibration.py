@@ -97,8 +97,9 @@ def test_several_records_make_one_model(paper):
 
 
 def test_what_comes_after_fit_until_is_held_out(conduction):
-    result = calibrate(conduction, Settings(kind="direct", order=(3, 3, 3)), period_s=60.0, name="x",
-                       fit_until_s=24 * 3600.0)  # fmt: skip
+    result = calibrate(
+        conduction, Settings(kind="direct", order=(3, 3, 3)), period_s=60.0, name="x", fit_until_s=24 * 3600.0
+    )
     fitted, held_out = result.parts
     assert (fitted.role, held_out.role) == ("fitted", "held out")
     assert fitted.y_um.size == 24 * 60

@@ -43,8 +43,13 @@ def machine(n=2400, *, swing_k=3.0, seed=0, extra_um=0.0, follows=False):
 
 def made(columns, **changes):
     validation = changes.pop("validation", ())
-    return calibrate(runs_from(columns), Settings(kind="direct", order=ORDER, folds=3, **changes), period_s=60.0,
-                     name="machine", validation=validation)  # fmt: skip
+    return calibrate(
+        runs_from(columns),
+        Settings(kind="direct", order=ORDER, folds=3, **changes),
+        period_s=60.0,
+        name="machine",
+        validation=validation,
+    )
 
 
 def said(calibration, words):
@@ -58,9 +63,20 @@ def good():
 
 @pytest.mark.parametrize(
     "words",
-    ["ambient moved", "hardly determined", "longest record", "outside the unit circle", "not white", "worse than none",
-     "moved together", "slower than the record", "coincide", "turns round", "noise in the heat"],
-)  # fmt: skip
+    [
+        "ambient moved",
+        "hardly determined",
+        "longest record",
+        "outside the unit circle",
+        "not white",
+        "worse than none",
+        "moved together",
+        "slower than the record",
+        "coincide",
+        "turns round",
+        "noise in the heat",
+    ],
+)
 def test_a_good_calibration_is_not_blamed(good, words):
     assert not said(good, words), criticise(good).warnings
 

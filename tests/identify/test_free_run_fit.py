@@ -68,9 +68,7 @@ def test_what_is_left_of_the_initial_state_dies_out():
 def test_a_delay_is_a_delay():
     u = inputs(800, 3)[:1]
     y = np.concatenate((np.zeros(4), lfilter([0.1], [1.0, -0.9], u[0])[:-4]))
-    right, wrong = (
-        fit([Segment.of(u, y)], Structure(order=1, terms=(1,), delays=(nk,)), 60.0) for nk in (4, 0)
-    )  # fmt: skip
+    right, wrong = (fit([Segment.of(u, y)], Structure(order=1, terms=(1,), delays=(nk,)), 60.0) for nk in (4, 0))
     assert right.sigma < 1e-6
     assert wrong.sigma > 0.1
     assert right.function().b == pytest.approx((0.0, 0.0, 0.0, 0.0, 0.1), abs=1e-7)
@@ -173,8 +171,16 @@ def test_too_few_samples_counts_the_nuisances():
     assert fit_output_error([resting], TRUE, period_s=60.0, starts=[TAUS]).residuals[0].size == 13
 
 
-@pytest.mark.parametrize("wrong", [{"terms": ()}, {"terms": (0,)}, {"terms": (1,), "delays": (-1,)},
-                                   {"terms": (1, 1), "delays": (0,)}, {"terms": (1,), "order": -1}])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"terms": ()},
+        {"terms": (0,)},
+        {"terms": (1,), "delays": (-1,)},
+        {"terms": (1, 1), "delays": (0,)},
+        {"terms": (1,), "order": -1},
+    ],
+)
 def test_structures_that_make_no_sense(wrong):
     with pytest.raises(DataError, match="structure"):
         Structure(**({"order": 1} | wrong))

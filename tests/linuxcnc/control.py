@@ -168,11 +168,15 @@ def linuxcnc(folder: Path, settings: str, **ini: str) -> Iterator[tuple[Control,
     text = (SHIPPED / "machine.ini").read_text(encoding="utf-8")
     panel = folder / "panel.py"
     shutil.copy(Path(__file__).with_name("operator_panel.py"), panel)
-    text = changed(text, {
-        "DISPLAY = dummy": "DISPLAY = ./panel.py",
-        "/opt/thermal/venv/bin/python": "./python",
-        "HALFILE = thermal.hal": "HALFILE = thermal.hal\nHALFILE = sampler.hal", **ini,
-    })  # fmt: skip
+    text = changed(
+        text,
+        {
+            "DISPLAY = dummy": "DISPLAY = ./panel.py",
+            "/opt/thermal/venv/bin/python": "./python",
+            "HALFILE = thermal.hal": "HALFILE = thermal.hal\nHALFILE = sampler.hal",
+            **ini,
+        },
+    )
     (folder / "machine.ini").write_text(text, encoding="utf-8")
     (folder / "thermal.toml").write_text(settings, encoding="utf-8")
     (folder / "sampler.hal").write_text(SAMPLER, encoding="utf-8")
@@ -183,15 +187,25 @@ def linuxcnc(folder: Path, settings: str, **ini: str) -> Iterator[tuple[Control,
     for program in (python, panel):
         program.chmod(program.stat().st_mode | stat.S_IXUSR | stat.S_IXGRP | stat.S_IXOTH)
     path = str(folder / "panel.sock")
-    environment = {**os.environ, "HOME": str(folder), "RTAPI_UID": "65534", "PANEL_SOCKET": path,
-                   "RTAPI_FIFO_PATH": str(folder / "rtapi_fifo"), "TMPDIR": str(folder)}  # fmt: skip
+    environment = {
+        **os.environ,
+        "HOME": str(folder),
+        "RTAPI_UID": "65534",
+        "PANEL_SOCKET": path,
+        "RTAPI_FIFO_PATH": str(folder / "rtapi_fifo"),
+        "TMPDIR": str(folder),
+    }
     environment.pop("PYTHONPATH", None)
     log = folder / "linuxcnc.log"
     with log.open("wb") as out:
         process = subprocess.Popen(
-            ["linuxcnc", "-r", "machine.ini"], cwd=folder, env=environment, stdin=subprocess.DEVNULL,
-            stdout=out, stderr=subprocess.STDOUT,
-        )  # fmt: skip
+            ["linuxcnc", "-r", "machine.ini"],
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=subprocess.STDOUT,
+        )
         control = Control(folder, path)
         try:
             control.connect(lambda: process.poll() is None)

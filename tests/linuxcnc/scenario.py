@@ -37,10 +37,15 @@ PROGRAM = "G21 G90 G17 G64\nG0 X0 Y0\nG1 X10 Y8 F900\nG4 P0.3\nG1 X0 Y2\nG4 P0.3
 def settings(prefix: str = "shop/vmc-07") -> str:
     """The shipped settings, ten µm a second instead of eight a minute."""
     text = (SHIPPED / "thermal.toml").read_text(encoding="utf-8")
-    return changed(text, {
-        "max_um_per_min = 8.0 ": "max_um_per_min = 600.0 ", "slew_um_per_s = 10.0": "slew_um_per_s = 20.0",
-        "fade_um_per_min = 20.0": "fade_um_per_min = 300.0", '"shop/vmc-07"': f'"{prefix}"',
-    })  # fmt: skip
+    return changed(
+        text,
+        {
+            "max_um_per_min = 8.0 ": "max_um_per_min = 600.0 ",
+            "slew_um_per_s = 10.0": "slew_um_per_s = 20.0",
+            "fade_um_per_min = 20.0": "fade_um_per_min = 300.0",
+            '"shop/vmc-07"': f'"{prefix}"',
+        },
+    )
 
 
 def still(periods: list[Period], most_um: float = STEP_UM) -> None:
@@ -291,10 +296,14 @@ def machine(folder: Path) -> Iterator[Path]:
         fast = changed(quill, {"sample_period_s = 60.0": "sample_period_s = 1.0", "[-20.0, 120.0]": "[-9e3, 9e3]"})
         (folder / "fast.toml").write_text(fast, encoding="utf-8")
         text = configuration("vmc-07", lines, PORT, model="fast.toml")
-        text = changed(text, {
-            "poll_interval_s = 10.0": "poll_interval_s = 0.25", "max_um_per_min = 8.0": "max_um_per_min = 300.0",
-            f'listen = ["tcp/127.0.0.1:{PORT}"]': f'connect = ["tcp/127.0.0.1:{PORT}"]',
-        })  # fmt: skip
+        text = changed(
+            text,
+            {
+                "poll_interval_s = 10.0": "poll_interval_s = 0.25",
+                "max_um_per_min = 8.0": "max_um_per_min = 300.0",
+                f'listen = ["tcp/127.0.0.1:{PORT}"]': f'connect = ["tcp/127.0.0.1:{PORT}"]',
+            },
+        )
         text = re.sub(r"(?m)^rate_max_per_min = .*$", "rate_max_per_min = 10000.0", text)
         path = folder / "machine.toml"
         path.write_text(text, encoding="utf-8")
@@ -375,10 +384,12 @@ def service(folder: Path) -> None:
 
 def refused(folder: Path) -> None:
     """An axis that would never move, and settings that cannot be right, stop LinuxCNC's start with one line."""
-    for number, (ini, toml, expected) in enumerate((
-        ({"OFFSET_AV_RATIO = 0.01": ""}, ("", ""), "OFFSET_AV_RATIO = 0: expected above 0"),
-        ({}, ("unit_um = 1000.0 ", "unit_um = 25400.0 "), "is another unit"),
-    )):  # fmt: skip
+    for number, (ini, toml, expected) in enumerate(
+        (
+            ({"OFFSET_AV_RATIO = 0.01": ""}, ("", ""), "OFFSET_AV_RATIO = 0: expected above 0"),
+            ({}, ("unit_um = 1000.0 ", "unit_um = 25400.0 "), "is another unit"),
+        )
+    ):
         one = folder.parent / f"refused-{number}"
         try:
             with linuxcnc(one, settings().replace(*toml), **ini):

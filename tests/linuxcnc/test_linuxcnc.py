@@ -30,6 +30,10 @@ def place() -> Iterator[Path]:
 def test_at_the_control(name: str, place: Path) -> None:
     done = subprocess.run(
         [*NAMESPACES, sys.executable, "-m", "tests.linuxcnc.scenario", name, str(place)],
-        cwd=ROOT, capture_output=True, text=True, timeout=280, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
     assert done.returncode == 0 and done.stdout.endswith("done\n"), done.stdout + done.stderr

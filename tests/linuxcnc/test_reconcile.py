@@ -45,9 +45,13 @@ class Axis:
 
     def view(self) -> AxisView:
         return AxisView(
-            counts=self.pin, scale_um=SCALE_UM, request_um=self.request_um, eoffset_um=self.eoffset_um,
-            ready=self.ready, limited=False,
-        )  # fmt: skip
+            counts=self.pin,
+            scale_um=SCALE_UM,
+            request_um=self.request_um,
+            eoffset_um=self.eoffset_um,
+            ready=self.ready,
+            limited=False,
+        )
 
 
 class Loop:

@@ -86,9 +86,10 @@ def test_the_table_of_the_published_model_is_the_models() -> None:
 
 ROOMS = ("compensator", "drivers", "sim_hardware", "tests", "deploy")
 PAGES = sorted(
-    page for page in [TOP / "README.md", *(p for room in ROOMS for p in (TOP / room).rglob("*.md"))]
+    page
+    for page in [TOP / "README.md", *(p for room in ROOMS for p in (TOP / room).rglob("*.md"))]
     if not {".venv", "node_modules"} & set(page.parts)
-)  # fmt: skip
+)
 CODE = re.compile(r"```.*?```", flags=re.DOTALL)
 #: A cell that names files: nothing but names in backticks.
 NAMES = re.compile(r"^(?:`[\w./@-]+`(?:, )?)+$")
@@ -121,9 +122,10 @@ def named_files(text: str) -> list[str]:
 def test_files_in_tables_and_links_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     gone = [
-        name for name in named_files(text)
+        name
+        for name in named_files(text)
         if not name.startswith("/") and not any((page.parent / way).exists() for way in (name, f"{name}.py"))
-    ]  # fmt: skip
+    ]
     for target in re.findall(r"\]\(([^)\s]+)\)", CODE.sub("", text)):
         where, _, part = target.partition("#")
         if "://" in target:

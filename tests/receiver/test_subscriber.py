@@ -22,9 +22,12 @@ ROOT = Path(__file__).parents[2]
 
 def settings(port: int, **changes: Any) -> Settings:
     usual: dict[str, Any] = {
-        "machine": MACHINE, "prefix": PREFIX, "connect": (f"tcp/127.0.0.1:{port}",), "offset_max_um": 100.0,
+        "machine": MACHINE,
+        "prefix": PREFIX,
+        "connect": (f"tcp/127.0.0.1:{port}",),
+        "offset_max_um": 100.0,
         "offset_rate_max_um_per_min": 60_000.0,
-    }  # fmt: skip
+    }
     return Settings(**{**usual, **changes})
 
 
@@ -174,11 +177,23 @@ offset_rate_max_um_per_min = 60000.0
                 finally:
                     process.send_signal(signal.SIGINT)
                     process.stdout.read()
-    done = subprocess.run([sys.executable, "-m", "compensator.receiver", "--config", str(tmp_path / "none.toml")],
-                          cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "compensator.receiver", "--config", str(tmp_path / "none.toml")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "none.toml" in done.stderr
-    done = subprocess.run([sys.executable, str(ROOT / "deploy/receiver/follow.py"), str(tmp_path / "none.toml")],
-                          cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "deploy/receiver/follow.py"), str(tmp_path / "none.toml")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and "none.toml" in done.stderr
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from compensator.cli import main
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
 from compensator.report.demonstration import MachineDay, page_of
 from compensator.report.page import write_page
 from tests.audit.made import MACHINE, Service, other_model, readings
@@ -26,10 +26,42 @@ def make(folder: Path) -> dict[str, Path]:
     run = folder / "run with a rather long name, of a spindle on a day in the winter.csv"
     _run(run)
     model = pages["identify"].with_name("model.toml")
-    assert main(["identify", str(run), "--out", str(model), "--order", "2", "2", "1", "--kind", "direct",
-                 "--fit-until", "9", "--reference", "quill"]) == 0  # fmt: skip
-    assert main(["diagnose", str(run), "--model", str(model), "--out", str(pages["diagnose"].parent),
-                 "--page", str(pages["diagnose"].with_name("page.pdf"))]) == 0  # fmt: skip
+    assert (
+        main(
+            [
+                "identify",
+                str(run),
+                "--out",
+                str(model),
+                "--order",
+                "2",
+                "2",
+                "1",
+                "--kind",
+                "direct",
+                "--fit-until",
+                "9",
+                "--reference",
+                "quill",
+            ]
+        )
+        == 0
+    )
+    assert (
+        main(
+            [
+                "diagnose",
+                str(run),
+                "--model",
+                str(model),
+                "--out",
+                str(pages["diagnose"].parent),
+                "--page",
+                str(pages["diagnose"].with_name("page.pdf")),
+            ]
+        )
+        == 0
+    )
     assert main(["report", str(rec), "--out", str(pages["report"])]) == 0
     assert main(["replay", str(rec), "--page", str(pages["replay"])]) == 0
     assert main(["replay", str(rec), "--model", "quill", "--page", str(pages["replay-model"])]) == 0
@@ -68,8 +100,14 @@ def _demo(path: Path) -> None:
     days = [
         MachineDay(name=name, figures=figures, errors=errors, heat=(t, t, t, t)) for name in ("conduction", "published")
     ]
-    loop = {"second_day_rms_um": {"without": 38.3, "first": 6.3, "extended": 1.2}, "found": ["hysteresis DTF"],
-            "verdict": "explained", "drawn": "hysteresis DTF", "adopted": True, "adopted_after_h": 1.0}  # fmt: skip
+    loop = {
+        "second_day_rms_um": {"without": 38.3, "first": 6.3, "extended": 1.2},
+        "found": ["hysteresis DTF"],
+        "verdict": "explained",
+        "drawn": "hysteresis DTF",
+        "adopted": True,
+        "adopted_after_h": 1.0,
+    }
     paper = {
         "comparison": [{"path": "TTF", "figure": "gain at rest, K/W", "found": 0.25, "std": 0.01, "reference": 0.25}]
     }

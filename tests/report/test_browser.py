@@ -40,16 +40,30 @@ def seen(pages: dict[str, Path], folder: Path, *options: str) -> list[dict]:
     frames = "".join(
         f'<iframe title="{name}" width="{width}" height="900" style="border:0" '
         f'srcdoc="{html.escape(path.read_text(encoding="utf-8"))}"></iframe>'
-        for name, path in pages.items() for width in WIDTHS
-    )  # fmt: skip
+        for name, path in pages.items()
+        for width in WIDTHS
+    )
     harness = folder / "harness.html"
     harness.write_text(HARNESS % frames, encoding="utf-8")
     done = subprocess.run(
-        [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", "--dump-dom",
-         "--virtual-time-budget=20000", "--enable-logging=stderr", "--window-size=1500,1000", *options,
-         harness.as_uri()],
-        capture_output=True, text=True, timeout=110, check=True,
-    )  # fmt: skip
+        [
+            browser,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={folder / 'profile'}",
+            "--dump-dom",
+            "--virtual-time-budget=20000",
+            "--enable-logging=stderr",
+            "--window-size=1500,1000",
+            *options,
+            harness.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=True,
+    )
     assert not [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     found = re.search(r'<pre id="seen">(.*?)</pre>', done.stdout, re.S)
     assert found and found[1]

@@ -150,9 +150,9 @@ def test_a_page_is_written_as_pdf_beside_the_html(pages: dict[str, Path]) -> Non
 
 
 @pytest.mark.parametrize(
-    "command", [["demo"], ["identify", "none.csv", "--out", "m.toml"],
-                ["diagnose", "none.csv", "--model", "quill", "--out", "d"]],
-)  # fmt: skip
+    "command",
+    [["demo"], ["identify", "none.csv", "--out", "m.toml"], ["diagnose", "none.csv", "--model", "quill", "--out", "d"]],
+)
 def test_a_page_of_another_format_is_refused_before_the_work(
     command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,8 +10,8 @@ import pytest
 from compensator.identify.calibration import calibrate
 from compensator.identify.criticism import criticise
 from compensator.identify.settings import Settings
+from compensator.model.simulation import Scores
 from compensator.report.identification import _joined, _tone, write_report
-from compensator.simulation import Scores
 from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
 
 
@@ -23,9 +23,16 @@ def run(name, seed):
 @pytest.fixture(scope="module")
 def calibration():
     settings = Settings(kind="direct", order=(2, 2, 1), folds=2)
-    return calibrate(run("day <1>.csv", 1), settings, period_s=60.0, name="a & b", validation=run("other.csv", 2),
-                     fit_until_s=9 * 3600.0, remarks=["day <1>.csv: gap of 3 sample(s)"],
-                     provenance={"data": [{"role": "fit", "file": "day <1>.csv", "sha256": "ab" * 32}]})  # fmt: skip
+    return calibrate(
+        run("day <1>.csv", 1),
+        settings,
+        period_s=60.0,
+        name="a & b",
+        validation=run("other.csv", 2),
+        fit_until_s=9 * 3600.0,
+        remarks=["day <1>.csv: gap of 3 sample(s)"],
+        provenance={"data": [{"role": "fit", "file": "day <1>.csv", "sha256": "ab" * 32}]},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -57,11 +64,19 @@ def test_identifiers_are_unique_over_all_pictures(page):
 
 def test_every_part_is_a_row_with_its_own_errors(page, calibration):
     assert [part.role for part in calibration.parts] == ["fitted", "held out", "held out"]
-    rows = [[html.unescape(cell) for cell in re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row)]
-            for row in re.findall(r"<tr>(.*?)</tr>", page)]  # fmt: skip
+    rows = [
+        [html.unescape(cell) for cell in re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row)]
+        for row in re.findall(r"<tr>(.*?)</tr>", page)
+    ]
     for part in calibration.parts:
-        figures = (part.y_um.size / 60, part.model.fit_pct, part.model.rms_um, part.model.peak_to_peak_um,
-                   part.nothing.rms_um, part.persistence.rms_um)  # fmt: skip
+        figures = (
+            part.y_um.size / 60,
+            part.model.fit_pct,
+            part.model.rms_um,
+            part.model.peak_to_peak_um,
+            part.nothing.rms_um,
+            part.persistence.rms_um,
+        )
         shown = [f"{value:.{1 if i == 0 else 2}f}" for i, value in enumerate(figures)]
         assert [part.name, part.role, *shown] in rows
 
@@ -100,7 +115,5 @@ def test_the_tone_is_that_of_the_worst_held_out_part(calibration, rms, tone):
 
 @pytest.mark.parametrize(("rms", "tone"), [(0.09, "good"), (0.5, "warn"), (1.0, "bad")])
 def test_without_held_out_data_the_folds_set_the_tone(calibration, rms, tone):
-    fitted = dataclasses.replace(
-        calibration.parts[0], nothing=Scores(fit_pct=0.0, rms_um=2.0, peak_to_peak_um=0.0)
-    )  # fmt: skip
+    fitted = dataclasses.replace(calibration.parts[0], nothing=Scores(fit_pct=0.0, rms_um=2.0, peak_to_peak_um=0.0))
     assert _tone(dataclasses.replace(calibration, parts=(fitted,), folds_rms_um=2.0 * rms)) == tone

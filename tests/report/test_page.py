@@ -23,7 +23,7 @@ from compensator.report.page import (
     Table,
     Words,
     write_page,
-)  # fmt: skip
+)
 
 X = np.arange(5000.0)
 VOID = {"meta"}
@@ -35,10 +35,16 @@ def figure(title="a picture"):
     y = np.sin(X / 300.0)
     y[2000:2300] = np.nan
     return Figure(
-        title=title, x_label="time, h", y_label="Y, µm", lines=(Line("one", X, y, band=(y - 0.1, y + 0.1)),),
-        marks=(Marks("poles", np.array([0.9]), np.array([0.0])),), spans=(Span("held out", 10.0, 90.0),),
-        stems=(Stems("bars", X[:5], X[:5]),), limits=(0.5,), note="a <note>",
-    )  # fmt: skip
+        title=title,
+        x_label="time, h",
+        y_label="Y, µm",
+        lines=(Line("one", X, y, band=(y - 0.1, y + 0.1)),),
+        marks=(Marks("poles", np.array([0.9]), np.array([0.0])),),
+        spans=(Span("held out", 10.0, 90.0),),
+        stems=(Stems("bars", X[:5], X[:5]),),
+        limits=(0.5,),
+        note="a <note>",
+    )
 
 
 def written(folder, *blocks, **page):
@@ -61,15 +67,20 @@ def one_curve(y, x=X, **options):
 def page(tmp_path):
     return written(
         tmp_path,
-        figure(), Row(figures=(figure(), figure("another <b>"))),
+        figure(),
+        Row(figures=(figure(), figure("another <b>"))),
         Table(title="errors", head=["data", "rms µm", "part"], rows=[["a & b", "1.0", "held out"], ["", "<i>", "x"]]),
         Words(title="Warnings", lines=["mind <this>"], kind="warning"),
-        Section(title="more", blocks=[
-            Details(title="to open", blocks=[figure(), Table(head=["", ""], rows=[["a", "b"]])]),
-        ]),
+        Section(
+            title="more",
+            blocks=[
+                Details(title="to open", blocks=[figure(), Table(head=["", ""], rows=[["a", "b"]])]),
+            ],
+        ),
         Details(title="at the end", blocks=[Words(title="in words", lines=["plain"])]),
-        title='<script>alert("1")</script>', verdict="it is & works",
-    )  # fmt: skip
+        title='<script>alert("1")</script>',
+        verdict="it is & works",
+    )
 
 
 class Tree(HTMLParser):
@@ -208,8 +219,12 @@ def test_a_warning_bears_a_sign_and_plain_words_none(tmp_path):
 
 
 def test_numbers_stand_right_and_words_left(tmp_path):
-    rows = [["a", "1.018 ± 0.0021", "held out", "12.3", "0a3f"], ["b", "−3e-5", "fitted", "unstable", "77bc"],
-            ["c", "169 (not determined)", "", "", "12"], ["d", "", "", "0.4", ""]]  # fmt: skip
+    rows = [
+        ["a", "1.018 ± 0.0021", "held out", "12.3", "0a3f"],
+        ["b", "−3e-5", "fitted", "unstable", "77bc"],
+        ["c", "169 (not determined)", "", "", "12"],
+        ["d", "", "", "0.4", ""],
+    ]
     text = written(tmp_path, Table(head=["name", "value", "part", "rms", "hash"], rows=rows))
     assert '<table class="text-1 text-3 text-5">' in text
     for column in (1, 3, 5):
@@ -308,9 +323,15 @@ def test_spans_of_one_name_share_an_entry():
 
 def test_the_unit_circle_is_round():
     text = svg(
-        Figure(title="t", x_label="x", y_label="y", unit_circle=True,
-               marks=(Marks("poles", np.array([3.0]), np.array([0.1])), Marks("zeros", X[:1], X[:1], marker="o"))), "p"
-    )  # fmt: skip
+        Figure(
+            title="t",
+            x_label="x",
+            y_label="y",
+            unit_circle=True,
+            marks=(Marks("poles", np.array([3.0]), np.array([0.1])), Marks("zeros", X[:1], X[:1], marker="o")),
+        ),
+        "p",
+    )
     circle = max(re.findall(r'<path d="([^"]+)"', text), key=len)
     points = np.array([[float(v) for v in pair] for pair in re.findall(r"[ML] ([\d.-]+) ([\d.-]+)", circle)])
     assert np.ptp(points[:, 0]) == pytest.approx(np.ptp(points[:, 1]), rel=0.01)

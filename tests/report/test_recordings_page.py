@@ -14,7 +14,7 @@ import pytest
 
 from compensator.cli import main
 from compensator.reasons import explain
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
 from compensator.report.envelope import COLUMNS, Envelope, Stretches
 from compensator.report.gathering import read_history
 from compensator.report.history import NO_RECORDING, History, Period
@@ -104,10 +104,16 @@ def test_the_verdict_says_how_long_the_machine_was_followed(history: History) ->
 
 @pytest.mark.parametrize(
     ("seconds", "measured", "left", "tone"),
-    [({"ok": 1e5}, 9.0, 1.0, "good"), ({"ok": 1e5, "hold": 60.0}, 9.0, 1.0, "warn"), ({"ok": 1.0}, 1.0, 2.0, "bad"),
-     ({"ok": 8e4, "degraded": 2e4}, 9.0, 1.0, "warn"), ({"ok": 8e4, "starting": 2e4}, 9.0, 1.0, "bad"),
-     ({"ok": 9e4, "fault": 60.0}, 9.0, 1.0, "bad"), ({"ok": 9e4, NO_RECORDING: 60.0}, 9.0, 1.0, "warn")],
-)  # fmt: skip
+    [
+        ({"ok": 1e5}, 9.0, 1.0, "good"),
+        ({"ok": 1e5, "hold": 60.0}, 9.0, 1.0, "warn"),
+        ({"ok": 1.0}, 1.0, 2.0, "bad"),
+        ({"ok": 8e4, "degraded": 2e4}, 9.0, 1.0, "warn"),
+        ({"ok": 8e4, "starting": 2e4}, 9.0, 1.0, "bad"),
+        ({"ok": 9e4, "fault": 60.0}, 9.0, 1.0, "bad"),
+        ({"ok": 9e4, NO_RECORDING: 60.0}, 9.0, 1.0, "warn"),
+    ],
+)
 def test_the_tone(seconds: dict[str, float], measured: float, left: float, tone: str) -> None:
     whole = Period(samples=1)
     whole.seconds.update(seconds)
@@ -163,8 +169,10 @@ def test_a_torn_and_a_damaged_file_are_shown_up_to_there(tmp_path: Path) -> None
     service = Service(tmp_path / "rec").run(90)
     service.kill()
     data = recordings(tmp_path / "rec", MACHINE)[0].read_bytes()
-    for name, changed, end in (("torn", data[: len(data) // 2], "no end"),
-                               ("damaged", data[: len(data) // 2] + b"\xff" * 4000, "damaged from byte")):  # fmt: skip
+    for name, changed, end in (
+        ("torn", data[: len(data) // 2], "no end"),
+        ("damaged", data[: len(data) // 2] + b"\xff" * 4000, "damaged from byte"),
+    ):
         broken = tmp_path / f"{name}.mcap"
         broken.write_bytes(changed)
         history = read_history([broken])

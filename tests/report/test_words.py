@@ -47,8 +47,11 @@ def written() -> set[str]:
         for path in (PACKAGE.parent / root).rglob("*.py"):
             if path != PACKAGE / "reasons.py":
                 tree = ast.parse(path.read_text(encoding="utf-8"))
-                found |= {node.value.partition(":")[0] for node in ast.walk(tree) if isinstance(node, ast.Constant)
-                          and isinstance(node.value, str)}  # fmt: skip
+                found |= {
+                    node.value.partition(":")[0]
+                    for node in ast.walk(tree)
+                    if isinstance(node, ast.Constant) and isinstance(node.value, str)
+                }
     return found
 
 

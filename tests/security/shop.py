@@ -81,8 +81,24 @@ def script(name: str, *arguments: str, code: int = 0) -> str:
 
 def make_keys(folder: Path) -> Path:
     keys = folder / "keys"
-    script("certificates.py", str(keys), "--router", "127.0.0.1", "--machine", "vmc-07", "--machine", "vmc-08",
-           "--receiver", "cnc-07", "--receiver", "watch", "--operator", "anna", "--operator", "bert")  # fmt: skip
+    script(
+        "certificates.py",
+        str(keys),
+        "--router",
+        "127.0.0.1",
+        "--machine",
+        "vmc-07",
+        "--machine",
+        "vmc-08",
+        "--receiver",
+        "cnc-07",
+        "--receiver",
+        "watch",
+        "--operator",
+        "anna",
+        "--operator",
+        "bert",
+    )
     script("certificates.py", str(keys), "--operator", "old", "--days", "-2")
     script("certificates.py", str(folder / "other"), "--operator", "anna", "--receiver", "cnc-07")
     return keys
@@ -119,8 +135,12 @@ class Shop:
         """The shipped client configuration, with this shop's addresses and keys in the place of the example's."""
         role, *_ = stem.partition("-")
         text = (DEPLOY / ("receiver.json5" if role == "receiver" else "operator.json5")).read_text(encoding="utf-8")
-        for old, new in (("router.shop:7447", f"127.0.0.1:{self.port}"), ("/etc/compensator/zenoh", str(self.keys)),
-                         ("receiver-cnc-07", stem), ("operator-anna", stem)):  # fmt: skip
+        for old, new in (
+            ("router.shop:7447", f"127.0.0.1:{self.port}"),
+            ("/etc/compensator/zenoh", str(self.keys)),
+            ("receiver-cnc-07", stem),
+            ("operator-anna", stem),
+        ):
             assert old in text or old in ("receiver-cnc-07", "operator-anna")
             text = text.replace(old, new)
         path = self.folder / f"{stem}.json5"
@@ -137,8 +157,13 @@ class Shop:
 
     def settings(self, machine: str = "vmc-07") -> Zenoh:
         stem = self.keys / f"machine-{machine}"
-        return Zenoh(prefix=f"shop/{machine}", connect=[self.endpoint], tls_ca=str(self.keys / "ca.pem"),
-                     tls_certificate=f"{stem}.pem", tls_key=f"{stem}.key")  # fmt: skip
+        return Zenoh(
+            prefix=f"shop/{machine}",
+            connect=[self.endpoint],
+            tls_ca=str(self.keys / "ca.pem"),
+            tls_certificate=f"{stem}.pem",
+            tls_key=f"{stem}.key",
+        )
 
 
 class Plant:
@@ -153,10 +178,17 @@ class Plant:
         self.service = Publisher(shop.settings(), self._command)
         self.other_commands: list[tuple[str, Sender]] = []
         self.other = Publisher(shop.settings("vmc-08"), self._other_command)
-        self.receiver = Receiver(Settings(
-            machine="vmc-07", prefix=PREFIX, offset_max_um=200.0, offset_rate_max_um_per_min=1e6, valid_max_s=600.0,
-            zenoh_config=str(shop.client_file("receiver-cnc-07")),
-        ), step_max_s=60.0)  # fmt: skip
+        self.receiver = Receiver(
+            Settings(
+                machine="vmc-07",
+                prefix=PREFIX,
+                offset_max_um=200.0,
+                offset_rate_max_um_per_min=1e6,
+                valid_max_s=600.0,
+                zenoh_config=str(shop.client_file("receiver-cnc-07")),
+            ),
+            step_max_s=60.0,
+        )
 
     def _command(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
         self.commands.append((name, payload, sender))
@@ -168,9 +200,16 @@ class Plant:
 
     def __enter__(self) -> Plant:
         self.screen = zenoh.open(self.shop.config("receiver-watch"))
-        self.screen.declare_subscriber("**", lambda s: self.seen.append(
-            (str(s.key_expr), s.kind.name if hasattr(s.kind, "name") else str(s.kind).rpartition(".")[2],
-             s.payload.to_bytes())))  # fmt: skip
+        self.screen.declare_subscriber(
+            "**",
+            lambda s: self.seen.append(
+                (
+                    str(s.key_expr),
+                    s.kind.name if hasattr(s.kind, "name") else str(s.kind).rpartition(".")[2],
+                    s.payload.to_bytes(),
+                )
+            ),
+        )
         self.screen.liveliness().declare_subscriber(
             "**", lambda s: self.alive.append((str(s.key_expr), str(s.kind).rpartition(".")[2])), history=True
         )

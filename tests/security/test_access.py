@@ -44,9 +44,14 @@ def tamper(session: Any, operator: str) -> list[Any]:
 
 @pytest.mark.parametrize(
     ("stem", "mode"),
-    [("receiver-cnc-07", "client"), ("receiver-cnc-07", "router"), ("machine-vmc-08", "client"),
-     ("machine-vmc-08", "peer"), ("operator-bert", "client")],
-)  # fmt: skip
+    [
+        ("receiver-cnc-07", "client"),
+        ("receiver-cnc-07", "router"),
+        ("machine-vmc-08", "client"),
+        ("machine-vmc-08", "peer"),
+        ("operator-bert", "client"),
+    ],
+)
 def test_what_others_try_reaches_nobody(plant: Plant, shop: Shop, stem: str, mode: str) -> None:
     plant.forget()
     with zenoh.open(shop.config(stem, mode)) as session:

@@ -105,12 +105,19 @@ def test_what_would_not_be_secure_is_refused(
 
 
 def test_open_doors_and_numbered_ports_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = written(tmp_path, 'listen = ["tcp/0.0.0.0:7447"]\nconnect = ["tcp/router.shop:7447"]\n'
-                               "unproven_commands = true\n", rtu="/dev/ttyUSB0")  # fmt: skip
+    config = written(
+        tmp_path,
+        'listen = ["tcp/0.0.0.0:7447"]\nconnect = ["tcp/router.shop:7447"]\nunproven_commands = true\n',
+        rtu="/dev/ttyUSB0",
+    )
     assert main(["check", "--config", str(config)]) == 0
     said = capsys.readouterr().err
-    for words in ("zenoh.listen tcp/0.0.0.0:7447", "zenoh.connect tcp/router.shop:7447", "zenoh.unproven_commands",
-                  "port /dev/ttyUSB0 goes by the order of plugging in"):  # fmt: skip
+    for words in (
+        "zenoh.listen tcp/0.0.0.0:7447",
+        "zenoh.connect tcp/router.shop:7447",
+        "zenoh.unproven_commands",
+        "port /dev/ttyUSB0 goes by the order of plugging in",
+    ):
         assert words in said, words
     assert said.count("\n") == 4 and "may be another adapter's after a restart" in said
     codes = ["numbered_port", "open_listen", "unsecured_connect", "unproven_commands"]

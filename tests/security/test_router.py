@@ -18,7 +18,7 @@ from compensator.certificates import check_files
 from compensator.cli import main
 from compensator.commands.router import checked
 from compensator.config import Zenoh
-from compensator.service.asking import operator_of_file
+from compensator.service.command_client import operator_of_file
 from compensator.service.session import read_config_file, tls_files
 from tests.security.shop import DEPLOY, Shop, script
 
@@ -27,8 +27,10 @@ def test_the_router_serves_says_who_comes_and_ends_on_sigterm(shop: Shop, tmp_pa
     own = Shop(tmp_path, shop.keys)
     process = subprocess.Popen(
         [sys.executable, "-m", "compensator", "router", "--config", str(own.router_file)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         assert process.stderr is not None and process.stdout is not None
         assert own.endpoint in process.stderr.readline()
@@ -134,8 +136,15 @@ def test_the_trial_on_one_computer_works_as_written(tmp_path: Path) -> None:
     assert text.count("\ncompensator ") == 1
     shell = text.replace("/path/to/deploy/zenoh", str(DEPLOY)).replace("python ", f"{sys.executable} ")
     shell = shell.replace("\ncompensator ", f"\n{sys.executable} -m compensator ")
-    done = subprocess.run(["sh", "-euc", shell], cwd=tmp_path, capture_output=True, text=True, timeout=110, check=False,
-                          env={**os.environ, "PYTHONPATH": str(DEPLOY.parents[1])})  # fmt: skip
+    done = subprocess.run(
+        ["sh", "-euc", shell],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(DEPLOY.parents[1])},
+    )
     assert done.returncode == 0, done.stderr
     assert "Listens on tls/127.0.0.1:7448, access list on." in done.stdout
     for name in ("receiver", "operator"):

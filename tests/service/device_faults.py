@@ -36,7 +36,7 @@ CARRIERS = {
     "one line": ("modbus-rtu", "modbus-rtu", "capancdt"),
     "dcon": ("dcon", "dcon", "capancdt"),
     "map": ("map float32", "map int16", "capancdt"),
-}  # fmt: skip
+}
 SUPPORTED = {
     "modbus-rtu": RTU_FAULTS | INPUT_FAULTS,
     "modbus-tcp": TCP_FAULTS | INPUT_FAULTS,
@@ -52,15 +52,30 @@ _ALTERNATING = {*_GARBLED, "good"}
 HARMLESS: frozenset[str] = frozenset()
 OLD = frozenset({"the last value until the guard `stuck`"})
 _LINE = {
-    "silence": _SILENT, "late": _GARBLED, "join": _ALTERNATING, "garbage": _GARBLED, "truncate": _GARBLED,
-    "wrong_length": _GARBLED, "bad_crc": _GARBLED, "disconnect": _GONE, "exception": {"device_refused"},
-    "split": HARMLESS, "frozen": OLD, "wild": {"out_of_range"},
-}  # fmt: skip
+    "silence": _SILENT,
+    "late": _GARBLED,
+    "join": _ALTERNATING,
+    "garbage": _GARBLED,
+    "truncate": _GARBLED,
+    "wrong_length": _GARBLED,
+    "bad_crc": _GARBLED,
+    "disconnect": _GONE,
+    "exception": {"device_refused"},
+    "split": HARMLESS,
+    "frozen": OLD,
+    "wild": {"out_of_range"},
+}
 _COUPLE = {"open": {"open_circuit"}, "over": {"open_circuit", "over_range"}, "under": {"under_range"}}
 _CONTROLLER = {
-    "late": _ALTERNATING, "exception": HARMLESS, "gap": HARMLESS, "stale_counter": _GARBLED | OLD,
-    "open": {"over_range"}, "over": {"over_range"}, "under": {"under_range"}, "wild": {"out_of_range", "over_range"},
-}  # fmt: skip
+    "late": _ALTERNATING,
+    "exception": HARMLESS,
+    "gap": HARMLESS,
+    "stale_counter": _GARBLED | OLD,
+    "open": {"over_range"},
+    "over": {"over_range"},
+    "under": {"under_range"},
+    "wild": {"out_of_range", "over_range"},
+}
 #: carrier → kind → codes of which one stands in every sample while the fault lasts.
 EXPECTED: dict[str, dict[str, frozenset[str]]] = {
     carrier: {kind: frozenset(codes) for kind, codes in rows.items() if kind in SUPPORTED[carrier]}
@@ -70,7 +85,7 @@ EXPECTED: dict[str, dict[str, frozenset[str]]] = {
         "dcon": {**_LINE, **_COUPLE},
         "capancdt": {**_LINE, **_CONTROLLER},
     }.items()
-}  # fmt: skip
+}
 #: What only a configured register map can say.
 EXPECTED["map float32"] = {"open": frozenset({"invalid"})}
 EXPECTED["map int16"] = {"open": frozenset({"stale"})}
@@ -222,9 +237,13 @@ def _check_stream(name: str, course: Course, offsets: Sequence[Offset], samples:
 
 
 def _check(
-    course: Course, begin: int, episode: Episode, samples: Sequence[Sample], offsets: Sequence[Offset],
+    course: Course,
+    begin: int,
+    episode: Episode,
+    samples: Sequence[Sample],
+    offsets: Sequence[Offset],
     truth: Sequence[dict[str, float]],
-) -> Seen:  # fmt: skip
+) -> Seen:
     end = begin + episode.samples
     seen = Seen(course.layout, episode, {role: set() for role in ROLES})
     seen.std_before_um = number(offsets[begin - 1].y_offset_std_um)
@@ -275,9 +294,16 @@ def _true(
 
 
 def _check_channel(
-    message: Sample, role: str, kinds: dict[str, str], carriers: dict[str, str], course: Course, true: float,
-    held: float, seen: Seen, context: tuple[object, ...],
-) -> None:  # fmt: skip
+    message: Sample,
+    role: str,
+    kinds: dict[str, str],
+    carriers: dict[str, str],
+    course: Course,
+    true: float,
+    held: float,
+    seen: Seen,
+    context: tuple[object, ...],
+) -> None:
     channel = message.channels[role]
     seen.codes[role].add(channel.quality)
     frozen = kinds.get(role) == "frozen"
@@ -310,9 +336,14 @@ def _check_channel(
 
 
 def _check_recovery(
-    course: Course, episode: Episode, end: int, samples: Sequence[Sample], offsets: Sequence[Offset],
-    truth: Sequence[dict[str, float]], seen: Seen,
-) -> None:  # fmt: skip
+    course: Course,
+    episode: Episode,
+    end: int,
+    samples: Sequence[Sample],
+    offsets: Sequence[Offset],
+    truth: Sequence[dict[str, float]],
+    seen: Seen,
+) -> None:
     after = range(end, end + REST[episode.samples])
     last = max((i for i in after if offsets[i].state == "ok"), default=-1)
     context = (course.layout, episode, [(offsets[i].state, offsets[i].reasons) for i in after])
@@ -331,8 +362,14 @@ def _check_recovery(
 
 def alone(samples: int, *, every_carrier: bool = True) -> list[Course]:
     """Every kind of every carrier, alone; or every kind once, on carriers that take turns."""
-    places = [("apart", "t_q_degc"), ("apart", "at_degc"), ("apart", "y_um"), ("dcon", "t_q_degc"),
-              ("map", "t_q_degc"), ("map", "at_degc")]  # fmt: skip
+    places = [
+        ("apart", "t_q_degc"),
+        ("apart", "at_degc"),
+        ("apart", "y_um"),
+        ("dcon", "t_q_degc"),
+        ("map", "t_q_degc"),
+        ("map", "at_degc"),
+    ]
     rows = [
         (layout, role, kind)
         for layout, role in places

@@ -18,13 +18,13 @@ from compensator.clock import VirtualClock
 from compensator.config import Config, LoadedConfig
 from compensator.messages import Event, encode, number
 from compensator.model.model_file import parse_model, read_model_bytes
-from compensator.recording import first_sequence, recordings
+from compensator.recording.reading import first_sequence, recordings
+from compensator.recording.recorder import Recorder
 from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
-from compensator.service.early import EarlyNote
 from compensator.service.model_store import ModelStore
-from compensator.service.recorder import Recorder
+from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.restart import resume
 from compensator.service.retrace import opening_of, replayed, steps_of
 from sim_hardware.physics import Duty, PublishedQuill, World
@@ -87,17 +87,22 @@ class Machine:
         loaded = LoadedConfig(
             config=self.config, path=self.folder / "machine.toml", data=self.config_bytes, sha256="unused"
         )
-        note = EarlyNote(self.recordings, MACHINE, self.folder)
+        note = OffsetCheckpoint(self.recordings, MACHINE, self.folder)
         early = note.read(self.config.limits.offset_max_um)
         resumed = resume(loaded, check_model(self.config, data, source="test"), early)
         recorder = Recorder(self.recordings, MACHINE, {"config.toml": self.config_bytes, "model.toml": data})
         daemon = self.daemon = Daemon(
-            config=self.config, compensation=resumed.compensation, devices={"module": self.device},
-            recorder=recorder, publish=lambda name, sent: self.published.append((name, sent)), clock=self.clock,
+            config=self.config,
+            compensation=resumed.compensation,
+            devices={"module": self.device},
+            recorder=recorder,
+            publish=lambda name, sent: self.published.append((name, sent)),
+            clock=self.clock,
             first_sequence=first_sequence(self.recordings, MACHINE, self.clock.utc_ns(), 60.0),
-            adoption=Adoption(self.config, self.recordings, self.store), notes=resumed.notes,
+            adoption=Adoption(self.config, self.recordings, self.store),
+            notes=resumed.notes,
             early=note,
-        )  # fmt: skip
+        )
 
         def step(outcome: Outcome) -> None:
             self.outcomes.append(outcome)

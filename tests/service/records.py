@@ -18,22 +18,47 @@ from tests.service.simulated import START_NS
 QUILL = load_model("quill")
 
 EFFECTS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("input", {"channel": "coolant_degc", "curve": "square", "tau_min": [7.0, 90.0], "gain": [0.02, -0.01],
-               "delay_min": 4.5}),
+    (
+        "input",
+        {"channel": "coolant_degc", "curve": "square", "tau_min": [7.0, 90.0], "gain": [0.02, -0.01], "delay_min": 4.5},
+    ),
     ("gain", {"path": "TDTF", "change": 0.2}),
     ("dynamics", {"form": "missing", "path": "DTF", "tau_min": 40.0, "gain": 0.05}),
     ("dynamics", {"form": "mistimed", "path": "DTF", "tau_min": 25.0, "instead_of_min": 20.9}),
     ("delay", {"path": "DTF", "delay_min": 3.5, "lag_min": 2.0}),
     ("nonlinear", {"form": "odd square", "path": "DTF", "change": 0.1}),
     ("nonlinear", {"form": "drive", "path": "DTF", "change": 0.1, "b": [0.0, 0.1], "a": [1.0, -0.9]}),
-    ("scheduled", {"form": "share", "origin": "start", "path": "DTF", "channel": "coolant_degc", "change": 0.1,
-                   "span": 2.0}),
-    ("scheduled", {"form": "drive", "origin": "zero", "path": "DTF", "channel": "spindle_rpm", "change": 0.1,
-                   "span": 2000.0, "b": [0.0, 0.1], "a": [1.0, -0.9]}),
-    ("scheduled", {"form": "speed", "origin": "zero", "path": "TDTF", "channel": "spindle_rpm", "change": 0.1,
-                   "span": 2000.0, "tau_min": 12.0}),
+    (
+        "scheduled",
+        {"form": "share", "origin": "start", "path": "DTF", "channel": "coolant_degc", "change": 0.1, "span": 2.0},
+    ),
+    (
+        "scheduled",
+        {
+            "form": "drive",
+            "origin": "zero",
+            "path": "DTF",
+            "channel": "spindle_rpm",
+            "change": 0.1,
+            "span": 2000.0,
+            "b": [0.0, 0.1],
+            "a": [1.0, -0.9],
+        },
+    ),
+    (
+        "scheduled",
+        {
+            "form": "speed",
+            "origin": "zero",
+            "path": "TDTF",
+            "channel": "spindle_rpm",
+            "change": 0.1,
+            "span": 2000.0,
+            "tau_min": 12.0,
+        },
+    ),
     ("hysteresis", {"form": "stick", "path": "all", "half_width_um": 1.5}),
-)  # fmt: skip
+)
 
 
 def with_method(method: str) -> ThermalModel:
@@ -53,22 +78,40 @@ def direct(method: str) -> ThermalModel:
     function = TransferFunction(numerator=(4.0, 20.0), denominator=(1.0, 120.0), unit="um/K")
     base = with_method(method)
     return dataclasses.replace(
-        base, kind="direct", ttf=None, dtf=Path.from_continuous(function, 60.0), sha256="d" * 64,
+        base,
+        kind="direct",
+        ttf=None,
+        dtf=Path.from_continuous(function, 60.0),
+        sha256="d" * 64,
         estimator=dataclasses.replace(base.estimator, drive_walk_std=0.5),
-    )  # fmt: skip
+    )
 
 
 def channel(value: float, quality: str = "good") -> ChannelSample:
     good = quality == "good" and not math.isnan(value)
     value = value if good else math.nan
     quality = quality if good or quality != "good" else "device_timeout"
-    return ChannelSample(mean=value, min=value - 0.01, max=value + 0.01, spread=0.01, count=6 if good else 0, polls=6,
-                         quality=quality, device_quality=quality)  # fmt: skip
+    return ChannelSample(
+        mean=value,
+        min=value - 0.01,
+        max=value + 0.01,
+        spread=0.01,
+        count=6 if good else 0,
+        polls=6,
+        quality=quality,
+        device_quality=quality,
+    )
 
 
 def sample(seq: int, values: dict[str, float]) -> Sample:
-    return Sample(schema=1, machine="vmc-07", seq=seq, time_utc_ns=START_NS + seq * 60_000_000_000, period_s=60.0,
-                  channels={name: channel(value) for name, value in values.items()})  # fmt: skip
+    return Sample(
+        schema=1,
+        machine="vmc-07",
+        seq=seq,
+        time_utc_ns=START_NS + seq * 60_000_000_000,
+        period_s=60.0,
+        channels={name: channel(value) for name, value in values.items()},
+    )
 
 
 def day(samples: int, seed: int = 1, lost: dict[str, list[range]] | None = None) -> Iterator[Sample]:
@@ -81,8 +124,13 @@ def day(samples: int, seed: int = 1, lost: dict[str, list[range]] | None = None)
     y = QUILL.dtf.sampled.response(heat) + 0.2 * rng.normal(size=samples)
     coolant = 22.0 + np.cumsum(0.05 * rng.normal(size=samples))
     for i in range(samples):
-        values = {"t_q_degc": t_q[i], "at_degc": at[i], "y_um": y[i], "coolant_degc": coolant[i],
-                  "spindle_rpm": 50.0 * heat[i]}  # fmt: skip
+        values = {
+            "t_q_degc": t_q[i],
+            "at_degc": at[i],
+            "y_um": y[i],
+            "coolant_degc": coolant[i],
+            "spindle_rpm": 50.0 * heat[i],
+        }
         for name, ranges in (lost or {}).items():
             if any(i in r for r in ranges):
                 values[name] = math.nan

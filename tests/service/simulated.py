@@ -10,9 +10,9 @@ import msgspec
 from compensator.clock import NS, VirtualClock
 from compensator.config import Config
 from compensator.model.model_file import load_model
+from compensator.recording.recorder import Recorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
-from compensator.service.recorder import Recorder
 from drivers.errors import DriverError
 from drivers.reading import Reading
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
@@ -37,15 +37,33 @@ TABLE: dict[str, Any] = {
     "line": [],
     "device": [{"name": "module"}],
     "channel": [
-        {"name": "t_q_degc", "device": "module", "input": 0, "range": [0.0, 80.0], "rate_max_per_min": 5.0,
-         "stuck_after_min": 60.0},
-        {"name": "at_degc", "device": "module", "input": 1, "range": [0.0, 50.0], "rate_max_per_min": 2.0,
-         "stuck_after_min": 60.0},
-        {"name": "y_um", "device": "module", "input": 2, "range": [-200.0, 200.0], "rate_max_per_min": 30.0,
-         "stuck_after_min": 60.0},
+        {
+            "name": "t_q_degc",
+            "device": "module",
+            "input": 0,
+            "range": [0.0, 80.0],
+            "rate_max_per_min": 5.0,
+            "stuck_after_min": 60.0,
+        },
+        {
+            "name": "at_degc",
+            "device": "module",
+            "input": 1,
+            "range": [0.0, 50.0],
+            "rate_max_per_min": 2.0,
+            "stuck_after_min": 60.0,
+        },
+        {
+            "name": "y_um",
+            "device": "module",
+            "input": 2,
+            "range": [-200.0, 200.0],
+            "rate_max_per_min": 30.0,
+            "stuck_after_min": 60.0,
+        },
         {"name": "coolant_degc", "device": "module", "input": 3},
     ],
-}  # fmt: skip
+}
 
 
 def config(**changes: Any) -> Config:

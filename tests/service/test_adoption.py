@@ -14,7 +14,7 @@ import pytest
 
 from compensator.errors import ServiceError
 from compensator.messages import number
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
 from compensator.service.adoption import Adoption
 from compensator.service.compensation import Outcome
 from compensator.service.model_store import ModelStore, sha256_of
@@ -23,9 +23,12 @@ from tests.service.living import MACHINE, Machine, check_files, largest_step, se
 from tests.service.test_restart import QUILL, STRONGER
 
 SLOW = settings(
-    limits={"offset_max_um": 200.0, "offset_rate_max_um_per_min": 2.0,
-            "validity": {"t_q_degc": [10.0, 60.0], "at_degc": [10.0, 35.0]}},
-)  # fmt: skip
+    limits={
+        "offset_max_um": 200.0,
+        "offset_rate_max_um_per_min": 2.0,
+        "validity": {"t_q_degc": [10.0, 60.0], "at_degc": [10.0, 35.0]},
+    },
+)
 WITH_INPUT = QUILL.replace(b'name = "quill"', b'name = "coolant"') + (
     b'\n[[effect]]\nkind = "input"\nchannel = "coolant_degc"\ncurve = "linear"\ntau_min = [60.0]\n'
     b"gain = [3.0]\ndelay_min = 5.0\n"
@@ -215,8 +218,11 @@ async def test_too_little_on_record_is_refused_and_taken_only_by_force(tmp_path:
 async def test_back_and_further_back_to_the_configured_one(tmp_path: Path) -> None:
     machine = Machine(tmp_path)
     for name, model, expected in (
-        ("adopt", STRONGER, STRONGER), ("adopt", WITH_INPUT, WITH_INPUT), ("back", b"", STRONGER), ("back", b"", QUILL),
-    ):  # fmt: skip
+        ("adopt", STRONGER, STRONGER),
+        ("adopt", WITH_INPUT, WITH_INPUT),
+        ("back", b"", STRONGER),
+        ("back", b"", QUILL),
+    ):
         asked = machine.at_sample[len(machine.outcomes) + 30] = Asked(
             machine, name, payload(model) if name == "adopt" else b""
         )
@@ -271,9 +277,21 @@ async def test_models_that_cannot_be_run_are_refused_and_nothing_changes(tmp_pat
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"{}", b"[]", b"{", b"[" * 100_000, b'{"model": 3}', b'{"sha256": "0"}', b'{"force": "yes"}',
-     b'{"model": "x", "sha256": "y"}', b'{"surprise": 1}', b"x" * 1_000_001, b'{"sha256": "../../etc/passwd"}'],
-)  # fmt: skip
+    [
+        b"",
+        b"{}",
+        b"[]",
+        b"{",
+        b"[" * 100_000,
+        b'{"model": 3}',
+        b'{"sha256": "0"}',
+        b'{"force": "yes"}',
+        b'{"model": "x", "sha256": "y"}',
+        b'{"surprise": 1}',
+        b"x" * 1_000_001,
+        b'{"sha256": "../../etc/passwd"}',
+    ],
+)
 async def test_payloads_that_are_no_model_are_refused_in_words(tmp_path: Path, data: bytes) -> None:
     machine = Machine(tmp_path)
     asked = machine.at_sample[2] = Asked(machine, "adopt", data)

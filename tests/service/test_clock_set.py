@@ -13,11 +13,11 @@ from compensator.config import Zenoh, parse_config
 from compensator.messages import number
 from compensator.model.model_file import parse_model
 from compensator.receiver import Receiver, Settings
-from compensator.recording import recordings
+from compensator.recording.reading import recordings
+from compensator.recording.recorder import Recorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.publisher import Publisher
-from compensator.service.recorder import Recorder
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.audit.made import CONFIG, MACHINE, QUILL
 from tests.receiver.wire import until
@@ -51,16 +51,25 @@ class Shop:
             Zenoh(prefix="shop/vmc-07", mode="client", connect=[endpoint]), lambda *asked: self.daemon.command(*asked)
         )
         self.daemon = Daemon(
-            config=config, compensation=Compensation(config, parse_model(QUILL, source="test")),
+            config=config,
+            compensation=Compensation(config, parse_model(QUILL, source="test")),
             devices={"module": FakeDevice([self.world.source(name) for name in CHANNELS])},
             recorder=Recorder(folder, MACHINE, {"config.toml": CONFIG, "model.toml": QUILL}),
-            publish=self.publisher.publish, clock=self.clock, first_sequence=0,
-        )  # fmt: skip
+            publish=self.publisher.publish,
+            clock=self.clock,
+            first_sequence=0,
+        )
         elsewhere, here = (
-            Settings(machine=MACHINE, prefix="shop/vmc-07", connect=(endpoint,), offset_max_um=200.0,
-                     offset_rate_max_um_per_min=2.0 * RATE_UM_PER_MIN, check_clock=check)
+            Settings(
+                machine=MACHINE,
+                prefix="shop/vmc-07",
+                connect=(endpoint,),
+                offset_max_um=200.0,
+                offset_rate_max_um_per_min=2.0 * RATE_UM_PER_MIN,
+                check_clock=check,
+            )
             for check in (False, True)
-        )  # fmt: skip
+        )
         self.later_s = 0.0
         seconds = {"step_max_s": 90.0, "clock": lambda: self.clock.monotonic_ns() / NS + self.later_s}
         self.controls = [

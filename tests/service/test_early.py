@@ -10,9 +10,9 @@ import pytest
 
 from compensator.audit.series import audit
 from compensator.messages import Offset
-from compensator.recording import recordings
-from compensator.service import recorder as recorder_module
-from compensator.service.early import Early, EarlyNote
+from compensator.recording import recorder as recorder_module
+from compensator.recording.reading import recordings
+from compensator.service.offset_checkpoint import Early, OffsetCheckpoint
 from tests.service.living import MACHINE, Machine, largest_step, settings
 from tests.service.simulated import TABLE
 
@@ -55,13 +55,23 @@ async def test_while_the_disk_takes_everything_nothing_is_noted(tmp_path: Path) 
 
 
 def offset(value: float, seq: int = 7) -> Offset:
-    return Offset(schema=1, machine=MACHINE, seq=seq, time_utc_ns=5, valid_for_s=150.0, y_offset_um=value,
-                  y_offset_rate_um_per_min=0.0, y_offset_std_um=0.1, state="degraded", reasons=["recording_failed"],
-                  model_sha256="")  # fmt: skip
+    return Offset(
+        schema=1,
+        machine=MACHINE,
+        seq=seq,
+        time_utc_ns=5,
+        valid_for_s=150.0,
+        y_offset_um=value,
+        y_offset_rate_um_per_min=0.0,
+        y_offset_std_um=0.1,
+        state="degraded",
+        reasons=["recording_failed"],
+        model_sha256="",
+    )
 
 
 def test_the_note_is_of_one_machine_and_its_newest(tmp_path: Path) -> None:
-    note, other = (EarlyNote(tmp_path / folder, MACHINE, tmp_path) for folder in ("a", "b"))
+    note, other = (OffsetCheckpoint(tmp_path / folder, MACHINE, tmp_path) for folder in ("a", "b"))
     assert note.read(100.0) is None
     note.keep(offset(1.5))
     note.keep(offset(float("nan"), 8))  # nothing was published that a control could apply
@@ -76,7 +86,7 @@ def test_the_note_is_of_one_machine_and_its_newest(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("what", ["not JSON", "torn", "not a number", "a link", "a pipe", "others may write it"])
 def test_what_no_service_wrote_does_not_count(tmp_path: Path, what: str) -> None:
-    note = EarlyNote(tmp_path / "rec", MACHINE, tmp_path)
+    note = OffsetCheckpoint(tmp_path / "rec", MACHINE, tmp_path)
     note.keep(offset(3.0))
     whole = note.path.read_bytes()
     if what == "not JSON":
@@ -97,7 +107,7 @@ def test_what_no_service_wrote_does_not_count(tmp_path: Path, what: str) -> None
 
 
 def test_a_computer_that_does_not_take_the_note_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    note = EarlyNote(tmp_path / "rec", MACHINE, tmp_path / "missing")
+    note = OffsetCheckpoint(tmp_path / "rec", MACHINE, tmp_path / "missing")
     note.keep(offset(3.0))
     note.keep(offset(4.0))
     assert caplog.text.count("a kill now would lose the offset") == 1 and note.read(100.0) is None

@@ -14,9 +14,9 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from compensator.audit.series import audit
 from compensator.errors import DataError
-from compensator.recording import end_of_chain, read_messages, recordings
-from compensator.service import finishing
-from compensator.service.finishing import Finisher, Retention, compact
+from compensator.recording import finishing
+from compensator.recording.finishing import Finisher, Retention, compact
+from compensator.recording.reading import end_of_chain, read_messages, recordings
 from tests.audit.made import MACHINE, MINUTE_NS, Service
 from tests.audit.tampering import lines_of, rewrite
 from tests.service.simulated import START_NS
@@ -42,8 +42,13 @@ def test_a_finished_file_has_chunks_an_index_and_crcs(tmp_path: Path) -> None:
         assert len(summary.chunk_indexes) == summary.statistics.chunk_count == 1
         assert summary.chunk_indexes[0].compression == "zstd"
         assert {channel.topic for channel in summary.channels.values()} == {
-            "/sample", "/estimate", "/offset", "/event", "/seal", "/chain",
-        }  # fmt: skip
+            "/sample",
+            "/estimate",
+            "/offset",
+            "/event",
+            "/seal",
+            "/chain",
+        }
         assert len(summary.schemas) == 6 and len(summary.metadata_indexes) == 1
         assert [a.name for a in reader.iter_attachments()] == ["config.toml", "model.toml", "state.json"]
         sought = [(channel.topic, message.data) for _, channel, message in reader.iter_messages()]

@@ -14,9 +14,9 @@ import drivers
 from compensator.clock import VirtualClock
 from compensator.messages import number
 from compensator.model.model_file import load_model
+from compensator.recording.recorder import Recorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
-from compensator.service.recorder import Recorder
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire import CapaNcdt, IcpDas, ModbusRtuLine, ModbusTcpServer, Rack
 from tests.service.simulated import START_NS, TABLE, config
@@ -66,16 +66,33 @@ class Wired:
         lines = [
             {"name": "a", "protocol": "modbus-rtu", "port": str(self.rtu.port), "timeout_s": 0.15},
             {"name": "b", "protocol": "modbus-tcp", "tcp_port": self.tcp.port, **host},
-            {"name": "c", "protocol": "capancdt", "data_port": self.capa.data_port,
-             "command_port": self.capa.command_port, **host},
-        ]  # fmt: skip
+            {
+                "name": "c",
+                "protocol": "capancdt",
+                "data_port": self.capa.data_port,
+                "command_port": self.capa.command_port,
+                **host,
+            },
+        ]
         devices = [
-            {"name": "couples", "line": "a", "model": "icpdas-m7018r", "address": 1, "format": "hex",
-             "inputs": [{"input": 0, "couple": "K"}]},
-            {"name": "cabinet", "line": "b", "model": "icpdas-et7018z", "address": 1, "format": "hex",
-             "inputs": [{"input": 0, "couple": "T"}]},
+            {
+                "name": "couples",
+                "line": "a",
+                "model": "icpdas-m7018r",
+                "address": 1,
+                "format": "hex",
+                "inputs": [{"input": 0, "couple": "K"}],
+            },
+            {
+                "name": "cabinet",
+                "line": "b",
+                "model": "icpdas-et7018z",
+                "address": 1,
+                "format": "hex",
+                "inputs": [{"input": 0, "couple": "T"}],
+            },
             {"name": "probe", "line": "c", "model": "capancdt-6200", "inputs": [{"input": 0}]},
-        ]  # fmt: skip
+        ]
         return lines, devices
 
     async def run(self, most: int, done: Callable[[Wired], bool]) -> None:

@@ -40,8 +40,13 @@ def day() -> dict[str, np.ndarray]:
     return World(PublishedQuill(), duty, sensors, 1).record(60.0)
 
 
-def outcomes_of(day: dict[str, np.ndarray], samples: int, change: Change = lambda i, v: None, conf: Any = None,
-                act: Callable[[int, Compensation], None] = lambda i, c: None) -> list[Outcome]:  # fmt: skip
+def outcomes_of(
+    day: dict[str, np.ndarray],
+    samples: int,
+    change: Change = lambda i, v: None,
+    conf: Any = None,
+    act: Callable[[int, Compensation], None] = lambda i, c: None,
+) -> list[Outcome]:
     compensation = Compensation(conf or checked(), QUILL)
     outcomes = []
     for i in range(samples):
@@ -72,10 +77,15 @@ BEGIN = 400
 @pytest.mark.parametrize(
     ("channel", "per_h", "within_min"),
     [
-        ("t_q_degc", 0.5, 70), ("t_q_degc", -1.0, 60), ("t_q_degc", 2.0, 50), ("at_degc", 0.5, 70),
-        ("at_degc", 2.0, 60), ("y_um", 5.0, 60), ("y_um", -2.0, 90),
+        ("t_q_degc", 0.5, 70),
+        ("t_q_degc", -1.0, 60),
+        ("t_q_degc", 2.0, 50),
+        ("at_degc", 0.5, 70),
+        ("at_degc", 2.0, 60),
+        ("y_um", 5.0, 60),
+        ("y_um", -2.0, 90),
     ],
-)  # fmt: skip
+)
 def test_a_drift_is_raised_and_the_right_sensor_is_among_the_suspects(
     day: dict[str, np.ndarray], channel: str, per_h: float, within_min: int
 ) -> None:
@@ -264,11 +274,13 @@ def test_the_state_goes_on_to_the_bit_and_old_states_are_taken(day: dict[str, np
         ("[plausibility]\nfalse_alarm_days = 0.0", "plausibility.false_alarm_days = 0.0"),
         ("[plausibility]\nresidual_correlation_min = 5.0", "plausibility.residual_correlation_min = 5.0"),
         ("[plausibility]\nsurprise = 1", "surprise"),
-        ('[plausibility.rest]\nchannel = "heat_w"\nat_most = 1.0\nafter_min = 60.0\nt_q_at_max_k = 1.0',
-         "plausibility.rest.channel = 'heat_w': no such channel"),
+        (
+            '[plausibility.rest]\nchannel = "heat_w"\nat_most = 1.0\nafter_min = 60.0\nt_q_at_max_k = 1.0',
+            "plausibility.rest.channel = 'heat_w': no such channel",
+        ),
         ('[plausibility.rest]\nchannel = "at_degc"', "at_most"),
     ],
-)  # fmt: skip
+)
 def test_bad_limits_get_one_line(table: str, expected: str) -> None:
     base = """
     guards = {t_q_below_at_max_k = 2.0}

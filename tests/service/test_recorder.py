@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from compensator.recording import recordings
-from compensator.service.recorder import Recorder
+from compensator.recording.reading import recordings
+from compensator.recording.recorder import Recorder
 from tests.service.simulated import START_NS
 
 

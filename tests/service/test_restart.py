@@ -13,8 +13,8 @@ import pytest
 from compensator.config import LoadedConfig
 from compensator.messages import number
 from compensator.model.model_file import load_model, read_model_bytes
-from compensator.recording import decode, read_messages, recordings
-from compensator.service.recorder import Recorder
+from compensator.recording.reading import decode, read_messages, recordings
+from compensator.recording.recorder import Recorder
 from compensator.service.restart import resume
 from drivers.reading import Quality, Reading
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings

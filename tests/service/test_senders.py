@@ -10,7 +10,7 @@ from typing import Any
 import zenoh
 
 from compensator.config import Zenoh
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from compensator.service.publisher import Publisher, Sender
 from compensator.service.session import session_config
 from tests.audit.made import MACHINE

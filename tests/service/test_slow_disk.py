@@ -14,7 +14,7 @@ import pytest
 
 from compensator.audit.series import Audit, audit, summary
 from compensator.messages import Event, Offset
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from compensator.service import recording_thread
 from tests.audit.made import CONFIG, MACHINE, QUILL
 from tests.service.simulated import Bench
@@ -80,8 +80,11 @@ def sent(bench: Bench) -> list[Offset]:
 
 
 def logged(folder: Path) -> list[Offset]:
-    return [msgspec.json.decode(record.data, type=Offset) for path in recordings(folder, MACHINE)
-            for record in read_messages(path, ("offset",))]  # fmt: skip
+    return [
+        msgspec.json.decode(record.data, type=Offset)
+        for path in recordings(folder, MACHINE)
+        for record in read_messages(path, ("offset",))
+    ]
 
 
 def events(bench: Bench, kind: str = "recording") -> list[Event]:
@@ -102,8 +105,15 @@ async def test_polling_goes_on_nothing_is_lost_and_the_receiver_is_told(
 ) -> None:
     bench = replayable(tmp_path)
     disk = Disk(bench, monkeypatch)
-    at(bench, {10: disk.stop, 20: lambda: bench.daemon.command("hold", b""), 30: disk.go_on,
-               35: lambda: bench.daemon.command("resume", b"")})  # fmt: skip
+    at(
+        bench,
+        {
+            10: disk.stop,
+            20: lambda: bench.daemon.command("hold", b""),
+            30: disk.go_on,
+            35: lambda: bench.daemon.command("resume", b""),
+        },
+    )
     await bench.run(50)
     offsets = sent(bench)
     assert [o.seq for o in offsets] == list(range(50))
@@ -184,8 +194,11 @@ async def test_what_waits_is_bounded_and_what_is_given_up_is_said(
     assert events(bench)[-1].data == {"lost": 11}
     found = look(tmp_path / "rec")
     assert found.clean and found.samples == 29, summary(found)
-    kept = [msgspec.json.decode(record.data, type=Event) for path in recordings(tmp_path / "rec", MACHINE)
-            for record in read_messages(path, ("event",))]  # fmt: skip
+    kept = [
+        msgspec.json.decode(record.data, type=Event)
+        for path in recordings(tmp_path / "rec", MACHINE)
+        for record in read_messages(path, ("event",))
+    ]
     assert [(e.seq, e.text) for e in kept if e.kind == "command"] == [(12, "zero")]
 
 

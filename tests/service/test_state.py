@@ -23,9 +23,12 @@ from tests.service.simulated import TABLE, config
 CHANNELS = [*TABLE["channel"], {"name": "spindle_rpm", "device": "module", "input": 4}]
 CONFIG = config(
     channel=CHANNELS,
-    limits={"offset_max_um": 60.0, "offset_rate_max_um_per_min": 1.5,
-            "validity": {"t_q_degc": [10.0, 34.0], "at_degc": [10.0, 35.0]}},
-)  # fmt: skip
+    limits={
+        "offset_max_um": 60.0,
+        "offset_rate_max_um_per_min": 1.5,
+        "validity": {"t_q_degc": [10.0, 34.0], "at_degc": [10.0, 35.0]},
+    },
+)
 MODELS = {
     "kalman": QUILL,
     "inverse": with_method("inverse"),
@@ -165,7 +168,7 @@ def changed(state: dict[str, Any], value: Any, *keys: Any) -> dict[str, Any]:
         (changed(at_work(with_effects()), {}, "engine", "gap", "samples", 0, "channels"), "channels"),
         (changed(at_work(with_effects()), [1.0], "memory", "estimate", "y_effects_um"), "effects"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_state_gets_one_line_and_changes_nothing(state: Any, expected: str) -> None:
     data = state if isinstance(state, bytes) else json.dumps(state).encode()
     of_effects = not isinstance(state, bytes) and state.get("model_sha256") == "e" * 64

@@ -12,7 +12,7 @@ import pytest
 from compensator.audit.series import audit, summary
 from compensator.config import parse_config
 from compensator.messages import Offset
-from compensator.recording import decode, read_messages, recordings
+from compensator.recording.reading import decode, read_messages, recordings
 from drivers.reading import Reading
 from tests.audit.made import CONFIG, QUILL
 from tests.service.simulated import Bench

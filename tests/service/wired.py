@@ -24,10 +24,10 @@ from compensator.config import Config, Zenoh
 from compensator.messages import Event, Offset, Sample
 from compensator.model.model_file import load_model
 from compensator.model.thermal_model import ThermalModel
+from compensator.recording.recorder import Recorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.publisher import Publisher, session_config
-from compensator.service.recorder import Recorder
 from drivers.errors import DriverError
 from sim_hardware.physics import World
 from sim_hardware.wire import (
@@ -91,10 +91,18 @@ class WiredMachine:
     """
 
     def __init__(
-        self, rack: Rack, folder: Path, world: World, *, name: str = "vmc-07", layout: str = "apart",
-        model: ThermalModel | None = None, receiver: Receiver | None = None,
-        sources: Mapping[str, Callable[[], float]] | None = None, **changes: Any,
-    ) -> None:  # fmt: skip
+        self,
+        rack: Rack,
+        folder: Path,
+        world: World,
+        *,
+        name: str = "vmc-07",
+        layout: str = "apart",
+        model: ThermalModel | None = None,
+        receiver: Receiver | None = None,
+        sources: Mapping[str, Callable[[], float]] | None = None,
+        **changes: Any,
+    ) -> None:
         self.world, self.name, self.layout = world, name, layout
         self.sources: dict[str, Callable[[], float]] = {
             channel: sources[channel] if sources and channel in sources else world.source(channel)
@@ -121,10 +129,14 @@ class WiredMachine:
             self.publisher = Publisher(settings, lambda *asked: self.daemon.command(*asked))
         publish = self.publisher.publish if self.publisher else lambda what, data: None
         self.daemon = Daemon(
-            config=self.config, compensation=Compensation(self.config, model or load_model("quill")),
-            devices=self.fleet.devices, recorder=Recorder(folder, name, {}), publish=publish,
-            clock=VirtualClock(START_NS, self._advance), first_sequence=0,
-        )  # fmt: skip
+            config=self.config,
+            compensation=Compensation(self.config, model or load_model("quill")),
+            devices=self.fleet.devices,
+            recorder=Recorder(folder, name, {}),
+            publish=publish,
+            clock=VirtualClock(START_NS, self._advance),
+            first_sequence=0,
+        )
 
     def read(self, channel: str) -> Callable[[], float]:
         """Read a source by its name at each call, so that a test may exchange it."""
@@ -137,13 +149,21 @@ class WiredMachine:
         if self.layout == "apart":
             at = IcpDas("et-7018z", couples="T", sources={0: self.read("at_degc")})
             rtu, tcp = rack.add(ModbusRtuLine({1: t_q})), rack.add(ModbusTcpServer({1: at}))
-            self.lines += [{"name": "a", "protocol": "modbus-rtu", "port": str(rtu.port), "timeout_s": TIMEOUT_S},
-                           {"name": "b", "protocol": "modbus-tcp", "tcp_port": tcp.port, **host}]  # fmt: skip
+            self.lines += [
+                {"name": "a", "protocol": "modbus-rtu", "port": str(rtu.port), "timeout_s": TIMEOUT_S},
+                {"name": "b", "protocol": "modbus-tcp", "tcp_port": tcp.port, **host},
+            ]
             self.devices += [
                 {"name": "couples", "line": "a", "model": "icpdas-m7018r", "address": 1, "format": "hex", **couple},
-                {"name": "cabinet", "line": "b", "model": "icpdas-et7018z", "address": 1, "format": "hex",
-                 "inputs": [{"input": 0, "couple": "T"}]},
-            ]  # fmt: skip
+                {
+                    "name": "cabinet",
+                    "line": "b",
+                    "model": "icpdas-et7018z",
+                    "address": 1,
+                    "format": "hex",
+                    "inputs": [{"input": 0, "couple": "T"}],
+                },
+            ]
         elif self.layout == "one line":
             at = IcpDas("m-7018r", couples="K", sources={0: self.read("at_degc")})
             line = rack.add(ModbusRtuLine({1: t_q, 2: at}))
@@ -153,19 +173,28 @@ class WiredMachine:
                 for i, name in ((1, "couples"), (2, "cabinet"))
             ]
         elif self.layout == "map":
-            plc = RegisterMap({
-                0: Register(source=self.read("t_q_degc"), kind="float32"),
-                2: Register(source=self.read("at_degc"), per_unit=100.0),
-            })  # fmt: skip
+            plc = RegisterMap(
+                {
+                    0: Register(source=self.read("t_q_degc"), kind="float32"),
+                    2: Register(source=self.read("at_degc"), per_unit=100.0),
+                }
+            )
             tcp = rack.add(ModbusTcpServer({1: plc}))
             self.lines.append({"name": "b", "protocol": "modbus-tcp", "tcp_port": tcp.port, **host})
             number = {"unit": "degc", "type": "int16"}
-            self.devices.append({
-                "name": "couples", "line": "b", "model": "modbus-map", "address": 1, "max_gap": 2, "inputs": [
-                    {"input": 0, "unit": "degc", "type": "float32", "address": 0},
-                    {"input": 1, **number, "address": 2, "scale": 0.01, "bad_values": {"32767": "stale"}},
-                ],
-            })  # fmt: skip
+            self.devices.append(
+                {
+                    "name": "couples",
+                    "line": "b",
+                    "model": "modbus-map",
+                    "address": 1,
+                    "max_gap": 2,
+                    "inputs": [
+                        {"input": 0, "unit": "degc", "type": "float32", "address": 0},
+                        {"input": 1, **number, "address": 2, "scale": 0.01, "bad_values": {"32767": "stale"}},
+                    ],
+                }
+            )
             self._inputs["at_degc"] = "couples", 1
             self.faults = {"t_q_degc": (plc.faults, 0), "at_degc": (plc.faults, 2)}
         else:
@@ -180,8 +209,15 @@ class WiredMachine:
         if self.layout != "map":
             self.faults = {"t_q_degc": (t_q.faults, 0), "at_degc": (at.faults, 0)}
         self.capa = rack.add(CapaNcdt({1: lambda: 250.0 + self.sources["y_um"]()}, 500.0))
-        self.lines.append({"name": "c", "protocol": "capancdt", "data_port": self.capa.data_port,
-                           "command_port": self.capa.command_port, **host})  # fmt: skip
+        self.lines.append(
+            {
+                "name": "c",
+                "protocol": "capancdt",
+                "data_port": self.capa.data_port,
+                "command_port": self.capa.command_port,
+                **host,
+            }
+        )
         self.devices.append({"name": "probe", "line": "c", "model": "capancdt-6200", "inputs": [{"input": 0}]})
         self.faults["y_um"] = self.capa.faults, 1
 
@@ -193,9 +229,11 @@ class WiredMachine:
             for channel, (device, number), more in zip(TABLE["channel"][:3], self._inputs.values(), limits, strict=True)
         ]
         table = {
-            "machine": {"name": self.name}, "sampling": {"poll_interval_s": 60.0},
-            "device": [{"name": name} for name in names], "channel": channels,
-        }  # fmt: skip
+            "machine": {"name": self.name},
+            "sampling": {"poll_interval_s": 60.0},
+            "device": [{"name": name} for name in names],
+            "channel": channels,
+        }
         return config(**{**table, **changes})
 
     async def _advance(self, t_s: float) -> None:

@@ -29,8 +29,10 @@ def report_month(days: float, seed: int) -> bool:
     row("largest step of the offset, µm (permitted 8)", f"{result.largest_step_um:.3f}")
     row("published before on disk", result.early)
     days_mb = result.rss_mb
-    row("resident memory after day 1, half, end, MB",
-        ", ".join(f"{days_mb[i]:.0f}" for i in (0, len(days_mb) // 2, -1)) if days_mb else "–")  # fmt: skip
+    row(
+        "resident memory after day 1, half, end, MB",
+        ", ".join(f"{days_mb[i]:.0f}" for i in (0, len(days_mb) // 2, -1)) if days_mb else "–",
+    )
     row("seconds: the month, its audit", f"{result.seconds:.0f}, {result.audit_seconds:.0f}")
     row(
         "audit of all files",
@@ -48,8 +50,10 @@ def report_kills(count: int, machines: int, seed: int) -> None:
     for moment in dict.fromkeys(kills.MOMENTS):
         row(f"kills: {moment}", sum(result.kills[moment] for result in results))
     row("offsets received, all on disk to the bit", sum(result.offsets - result.early for result in results))
-    row("published before on disk and saying so; of these not on disk",
-        f"{sum(r.early for r in results)}; {sum(r.early_lost for r in results)}")  # fmt: skip
+    row(
+        "published before on disk and saying so; of these not on disk",
+        f"{sum(r.early for r in results)}; {sum(r.early_lost for r in results)}",
+    )
     row("samples on disk, files, audited clean", f"{sum(r.recorded for r in results)}, {sum(r.files for r in results)}")
     row(
         "largest change between two offsets, share of the permitted",

@@ -22,11 +22,11 @@ from compensator.clock import NS, VirtualClock
 from compensator.config import LoadedConfig, parse_config
 from compensator.messages import Event, Offset, Sample, number
 from compensator.model.model_file import parse_model
-from compensator.recording import decode, first_sequence, read_messages, recordings
-from compensator.service import recorder as recorder_module
+from compensator.recording import recorder as recorder_module
+from compensator.recording.reading import decode, first_sequence, read_messages, recordings
+from compensator.recording.recorder import Recorder
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
-from compensator.service.recorder import Recorder
 from compensator.service.restart import resume
 from drivers.errors import DeviceDisconnected, DeviceTimeout
 from drivers.reading import Quality, Reading
@@ -37,8 +37,17 @@ from tests.service.simulated import CHANNELS, START_NS, FakeDevice
 DAY = 1440
 RATE_UM_PER_MIN = 8.0
 #: What can happen, and how often in a day.
-A_DAY = {"sensor": 3.0, "device": 1.0, "full": 0.5, "hang": 0.5, "clock": 0.3, "command": 2.0, "defect": 0.2,
-         "stop": 0.4, "kill": 0.6}  # fmt: skip
+A_DAY = {
+    "sensor": 3.0,
+    "device": 1.0,
+    "full": 0.5,
+    "hang": 0.5,
+    "clock": 0.3,
+    "command": 2.0,
+    "defect": 0.2,
+    "stop": 0.4,
+    "kill": 0.6,
+}
 
 
 @dataclass
@@ -125,10 +134,15 @@ class _Machine:
         resumed = resume(loaded, parse_model(QUILL, source="test"))
         recorder = Recorder(self.folder / "rec", MACHINE, {"config.toml": self.config_bytes, "model.toml": QUILL})
         daemon = self.daemon = Daemon(
-            config=self.config, compensation=resumed.compensation, devices={"module": self.device}, recorder=recorder,
-            publish=self._published, clock=self.clock, notes=resumed.notes,
+            config=self.config,
+            compensation=resumed.compensation,
+            devices={"module": self.device},
+            recorder=recorder,
+            publish=self._published,
+            clock=self.clock,
+            notes=resumed.notes,
             first_sequence=first_sequence(self.folder / "rec", MACHINE, self.clock.utc_ns(), 60.0),
-        )  # fmt: skip
+        )
         close = daemon._journal.close
 
         async def closing(state: bytes) -> None:
@@ -216,8 +230,9 @@ class _Machine:
 
     def _command(self) -> None:
         assert self.daemon is not None
-        name, payload = self.random.choice([("hold", b""), ("resume", b""), ("resume", b""), ("zero", b""),
-                                            ("zero", b'{"mode": "warm"}')])  # fmt: skip
+        name, payload = self.random.choice(
+            [("hold", b""), ("resume", b""), ("resume", b""), ("zero", b""), ("zero", b'{"mode": "warm"}')]
+        )
         self.daemon.command(name, payload)
         if name == "hold":
             self._later(60, lambda: self.daemon.command("resume", b"") and None)  # type: ignore[union-attr]

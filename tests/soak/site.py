@@ -17,7 +17,7 @@ from typing import Any
 
 import zenoh
 
-from compensator.recording import read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from sim_hardware.wire import IcpDas, ModbusTcpServer, Rack
 
 QUILL = Path(__file__).parents[2] / "compensator/model/quill.toml"
@@ -45,8 +45,12 @@ def session(**keys: Any) -> Any:
     """A Zenoh session that looks for nobody."""
     config = zenoh.Config()
     retry = {"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}
-    for key, value in {"scouting/multicast/enabled": False, "scouting/gossip/enabled": False, "connect/retry": retry,
-                       **{key.replace("__", "/"): value for key, value in keys.items()}}.items():  # fmt: skip
+    for key, value in {
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "connect/retry": retry,
+        **{key.replace("__", "/"): value for key, value in keys.items()},
+    }.items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
 
@@ -106,9 +110,16 @@ class Site:
     """
 
     def __init__(
-        self, folder: Path, *, name: str = "vmc-07", period_s: float = 0.5, polls: int = 2, connect: list[str],
-        recording: str = "recordings", extra: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        *,
+        name: str = "vmc-07",
+        period_s: float = 0.5,
+        polls: int = 2,
+        connect: list[str],
+        recording: str = "recordings",
+        extra: str = "",
+    ) -> None:
         self.folder, self.name, self.prefix = folder, name, f"shop/{name}"
         self.recordings = folder / recording
         self._rack = Rack()
@@ -120,8 +131,12 @@ class Site:
         couples = IcpDas("et-7018z", couples="T", sources={0: t_q, 1: lambda: 21.0})
         self._server = ModbusTcpServer({1: couples})
         self._period_s, self._polls, self._connect, self._recording, self._extra = (
-            period_s, polls, connect, recording, extra,
-        )  # fmt: skip
+            period_s,
+            polls,
+            connect,
+            recording,
+            extra,
+        )
         self.config = folder / "machine.toml"
 
     def __enter__(self) -> Site:

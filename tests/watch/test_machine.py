@@ -90,8 +90,10 @@ def test_an_old_offset_that_arrives_now_is_silent_and_the_clocks_are_doubted(hea
 
 
 def test_a_missing_channel_is_missing(heard: Heard) -> None:
-    heard.hear(offset=offset(5, state="degraded", reasons=["t_q_missing", "outside_validity:heat_w"]),
-               sample=sample(5, t_q=31.5, quality="open_circuit"))  # fmt: skip
+    heard.hear(
+        offset=offset(5, state="degraded", reasons=["t_q_missing", "outside_validity:heat_w"]),
+        sample=sample(5, t_q=31.5, quality="open_circuit"),
+    )
     machine = heard.machine
     assert machine["t_q_degc"] is None and machine["channels"]["t_q_degc"]["quality"] == "open_circuit"
     assert [reason["code"] for reason in machine["reasons"]] == ["t_q_missing", "outside_validity:heat_w"]
@@ -106,10 +108,23 @@ def test_a_reason_that_nobody_knows_is_said_to_be_unknown(heard: Heard) -> None:
 
 @pytest.mark.parametrize(
     "payload",
-    [b"", b"nonsense", b"[]", b"\xff\xfe", offset(6, schema=2), offset(6, seq=-1), offset(6, y_offset_um="3"),
-     offset(6, state="splendid"), offset(6, time_utc_ns=2**70), b'{"schema": 1}', b"[" * 100_000, b" " * (2**20 + 1),
-     offset(6).replace(b"-12.34", b"1e999"), offset(6).replace(b"-12.34", b"NaN")],
-)  # fmt: skip
+    [
+        b"",
+        b"nonsense",
+        b"[]",
+        b"\xff\xfe",
+        offset(6, schema=2),
+        offset(6, seq=-1),
+        offset(6, y_offset_um="3"),
+        offset(6, state="splendid"),
+        offset(6, time_utc_ns=2**70),
+        b'{"schema": 1}',
+        b"[" * 100_000,
+        b" " * (2**20 + 1),
+        offset(6).replace(b"-12.34", b"1e999"),
+        offset(6).replace(b"-12.34", b"NaN"),
+    ],
+)
 def test_malformed_messages_are_counted_and_change_nothing(heard: Heard, payload: bytes) -> None:
     heard.hear(offset=offset(5))
     before = heard.machine
@@ -196,9 +211,15 @@ def test_events_say_what_to_do(heard: Heard) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "data", "expected"),
-    [("adopt", {"ok": False}, "model before"), ("adopt", {"ok": True}, ""), ("command_refused", {"ok": False}, "who"),
-     ("recording", {}, "free space"), ("recording", {"removed": ["old.mcap"]}, ""), ("start", {}, "")],
-)  # fmt: skip
+    [
+        ("adopt", {"ok": False}, "model before"),
+        ("adopt", {"ok": True}, ""),
+        ("command_refused", {"ok": False}, "who"),
+        ("recording", {}, "free space"),
+        ("recording", {"removed": ["old.mcap"]}, ""),
+        ("start", {}, ""),
+    ],
+)
 def test_an_event_asks_for_something_only_where_something_is_wrong(
     heard: Heard, kind: str, data: dict[str, Any], expected: str
 ) -> None:
@@ -242,8 +263,12 @@ def test_the_day_is_one_point_a_minute_with_values_of_one_sample() -> None:
 
 def test_the_past_of_a_recording_says_nothing_of_now() -> None:
     machine = Machine("shop/vmc-07")
-    for kind, payload in (("offset", offset(3)), ("sample", sample(3)), ("estimate", estimate(3)),
-                          ("event", event(3, kind="zero", text="zero"))):  # fmt: skip
+    for kind, payload in (
+        ("offset", offset(3)),
+        ("sample", sample(3)),
+        ("estimate", estimate(3)),
+        ("event", event(3, kind="zero", text="zero")),
+    ):
         message = decoded(kind, payload)
         assert isinstance(message, (Offset, Sample, EstimateMessage, Event))
         machine.past(message)

@@ -33,8 +33,10 @@ def filled() -> Shop:
             t, key = START_NS + i * 60 * NS, f"shop/{name}/thermal/"
             state = {"state": "degraded", "reasons": ["t_q_missing"]} if 60 < i < 90 else {}
             shop.take(key + "y/offset", offset(i, t, machine=name, y_offset_um=-i / 3.0, **state))
-            shop.take(key + "sample", sample(i, t, t_q=None if state else 20.0 + i / 20.0,
-                                             quality="open_circuit" if state else "good"))  # fmt: skip
+            shop.take(
+                key + "sample",
+                sample(i, t, t_q=None if state else 20.0 + i / 20.0, quality="open_circuit" if state else "good"),
+            )
             shop.take(key + "estimate", estimate(i, t, residual_um=0.1))
             shop.take(key + "status", status(i, t, devices={"couples": EVIL}))
         clock.advance(60)
@@ -99,8 +101,13 @@ def test_nothing_but_looking_is_answered(server: PageServer, method: str) -> Non
 
 
 def test_what_is_not_there_is_not_there(server: PageServer) -> None:
-    for path in ("/machine.json", "/machine.json?prefix=shop/none", "/machine.json?prefix=shop%2Fvmc-07&since_s=x",
-                 "/../../etc/passwd", "/live.js"):  # fmt: skip
+    for path in (
+        "/machine.json",
+        "/machine.json?prefix=shop/none",
+        "/machine.json?prefix=shop%2Fvmc-07&since_s=x",
+        "/../../etc/passwd",
+        "/live.js",
+    ):
         assert ask(server, path)[0] == 404, path
     assert ask(server, "/", "HEAD")[2] == b""
 
@@ -117,11 +124,25 @@ def drawn(address: str, folder: Path, width: int, zone: str = "UTC", scheme: int
     if browser is None:
         pytest.skip("chromium is not installed")
     done = subprocess.run(
-        [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", "--dump-dom",
-         f"--window-size={width},900", f"--blink-settings=preferredColorScheme={scheme}",
-         "--virtual-time-budget=4000", "--enable-logging=stderr", address],
-        capture_output=True, text=True, timeout=100, check=True, env={**os.environ, "TZ": zone},
-    )  # fmt: skip
+        [
+            browser,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={folder / 'profile'}",
+            "--dump-dom",
+            f"--window-size={width},900",
+            f"--blink-settings=preferredColorScheme={scheme}",
+            "--virtual-time-budget=4000",
+            "--enable-logging=stderr",
+            address,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=True,
+        env={**os.environ, "TZ": zone},
+    )
     return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
 
 

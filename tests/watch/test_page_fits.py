@@ -48,10 +48,13 @@ def shop_in_trouble() -> Shop:
     clock = Clock()
     shop = Shop(clock)
     states: dict[str, dict[str, Any]] = {
-        "ok": {}, "degraded": {"reasons": ["predicting", "t_q_missing"]}, "hold": {"reasons": [LONG, "operator_hold"]},
+        "ok": {},
+        "degraded": {"reasons": ["predicting", "t_q_missing"]},
+        "hold": {"reasons": [LONG, "operator_hold"]},
         "fault": {"reasons": ["t_q_at_exchanged"], "y_offset_um": None},
-        "starting": {"reasons": ["no_zero"], "y_offset_um": None}, "silent": {},
-    }  # fmt: skip
+        "starting": {"reasons": ["no_zero"], "y_offset_um": None},
+        "silent": {},
+    }
     for i in range(90):
         for name, changes in states.items():
             if name == "silent" and i > 60:
@@ -69,9 +72,15 @@ def shop_in_trouble() -> Shop:
 
 @pytest.mark.parametrize(
     ("where", "said", "scheme"),
-    [("", "look6 machines", 0), ("", "look6 machines", 1), ("hold", "hold", 0), ("hold", "hold", 1),
-     ("starting", "startingno offset", 1), ("silent", "silentfor 30 min", 0)],
-)  # fmt: skip
+    [
+        ("", "look6 machines", 0),
+        ("", "look6 machines", 1),
+        ("hold", "hold", 0),
+        ("hold", "hold", 1),
+        ("starting", "startingno offset", 1),
+        ("silent", "silentfor 30 min", 0),
+    ],
+)
 def test_nothing_sticks_out(
     where: str, said: str, scheme: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

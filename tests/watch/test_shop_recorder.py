@@ -29,11 +29,17 @@ KEY = "shop/vmc-07/thermal/"
 def read(path: Path, *, all_of_it: bool = False) -> list[tuple[str, str, int, int, int, bytes]]:
     with path.open("rb") as file:
         return [
-            (channel.topic, schema.name if schema else "", message.sequence, message.log_time, message.publish_time,
-             message.data)
+            (
+                channel.topic,
+                schema.name if schema else "",
+                message.sequence,
+                message.log_time,
+                message.publish_time,
+                message.data,
+            )
             for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False)
             if all_of_it or channel.topic != "/summary"
-        ]  # fmt: skip
+        ]
 
 
 def recordings(folder: Path) -> list[Path]:
@@ -43,9 +49,19 @@ def recordings(folder: Path) -> list[Path]:
 def test_everything_is_there_as_it_came(tmp_path: Path) -> None:
     clock = Clock()
     with ShopRecorder(tmp_path, "shop", clock) as recorder:
-        sent = [(f"shop/{name}/thermal/{rest}", payload) for name in ("vmc-07", "vmc-08") for rest, payload in
-                (("y/offset", offset(5)), ("sample", sample(5)), ("estimate", estimate(5)), ("status", status(5)),
-                 ("event", event(5)), ("y/offset", b"nonsense"), ("strange", b"\xff"))]  # fmt: skip
+        sent = [
+            (f"shop/{name}/thermal/{rest}", payload)
+            for name in ("vmc-07", "vmc-08")
+            for rest, payload in (
+                ("y/offset", offset(5)),
+                ("sample", sample(5)),
+                ("estimate", estimate(5)),
+                ("status", status(5)),
+                ("event", event(5)),
+                ("y/offset", b"nonsense"),
+                ("strange", b"\xff"),
+            )
+        ]
         for key, payload in sent:
             clock.advance(1)
             recorder.take(key, payload)

@@ -133,6 +133,16 @@ def test_states_of_the_day_are_seen_in_a_terminal_that_is_not_tall(height: int) 
 def test_what_is_no_offset_is_no_number() -> None:
     clock = Clock()
     shop = Shop(clock)
-    shop.take("shop/a/thermal/y/offset", offset(1, machine="a", state="starting", reasons=["no_zero"], y_offset_um=None,
-                                                y_offset_rate_um_per_min=None, y_offset_std_um=None))  # fmt: skip
+    shop.take(
+        "shop/a/thermal/y/offset",
+        offset(
+            1,
+            machine="a",
+            state="starting",
+            reasons=["no_zero"],
+            y_offset_um=None,
+            y_offset_rate_um_per_min=None,
+            y_offset_std_um=None,
+        ),
+    )
     assert "⚠ starting  no offset, 0 s old" in shown(shop, 80)

@@ -12,13 +12,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from compensator.arrays import Vector
 from compensator.model.effects.base import Effect, Signals, register
 from compensator.model.effects.hypothesis import (
     Free,
     Hypothesis,
     Setting,
-    Vector,
-    Waves,
+    RecordSignals,
     late,
     lowpass,
     proposes,
@@ -71,7 +71,7 @@ class LatePath(Hypothesis):
 
     kind: ClassVar[str] = "delay"
 
-    def fixed(self, waves: Waves, values: Sequence[float]) -> Vector | None:
+    def fixed(self, waves: RecordSignals, values: Sequence[float]) -> Vector | None:
         """Return the difference that the delay makes."""
         named = dict(zip((f.name for f in self.free), values, strict=True))
         share = waves.share(self.path)
@@ -96,7 +96,7 @@ class LateSensor(LatePath):
 
     deployable: ClassVar[bool] = False
 
-    def fixed(self, waves: Waves, values: Sequence[float]) -> Vector | None:
+    def fixed(self, waves: RecordSignals, values: Sequence[float]) -> Vector | None:
         """Return what the share would have been at once, less what it is."""
         named = dict(zip((f.name for f in self.free), values, strict=True))
         share = waves.share(self.path)

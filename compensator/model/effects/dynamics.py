@@ -17,14 +17,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from compensator.arrays import Matrix, Vector
 from compensator.model.effects.base import Effect, Signals, register
 from compensator.model.effects.hypothesis import (
     ROW_RIDGE,
     Hypothesis,
-    Matrix,
     Setting,
-    Vector,
-    Waves,
+    RecordSignals,
     lowpass,
     proposes,
     row,
@@ -107,7 +106,7 @@ class MissingMode(Hypothesis):
 
     kind: ClassVar[str] = "dynamics"
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return what drives the path, behind the lag."""
         return lowpass(waves.source(self.path), values[0], waves.period_min)[:, None]
 
@@ -130,7 +129,7 @@ class MistimedMode(Hypothesis):
     kind: ClassVar[str] = "dynamics"
     instead_of_min: float = 1.0
 
-    def fixed(self, waves: Waves, values: Sequence[float]) -> Vector | None:
+    def fixed(self, waves: RecordSignals, values: Sequence[float]) -> Vector | None:
         """Return the difference that the other time constant makes."""
         share = waves.share(self.path)
         change = (self.instead_of_min / values[0] - 1.0) * (share - lowpass(share, values[0], waves.period_min))
@@ -162,7 +161,7 @@ class ChangedPaths(Hypothesis):
         """Number of parameters that the data spends on it: fewer than gains, because they are held together."""
         return 6
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return what drives the paths, behind each lag."""
         return np.hstack([row(u, self.taus_min, waves.period_min) for u in (waves.drive, waves.ambient_k)])
 
@@ -175,8 +174,13 @@ class ChangedPaths(Hypothesis):
     def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
         """Return the table that the engine runs."""
         count = len(self.taus_min)
-        return {"path": "DTF", "form": CHANGED, "tau_min": list(self.taus_min), "gain": list(amplitudes[:count]),
-                "gain_ambient": list(amplitudes[count:])}  # fmt: skip
+        return {
+            "path": "DTF",
+            "form": CHANGED,
+            "tau_min": list(self.taus_min),
+            "gain": list(amplitudes[:count]),
+            "gain_ambient": list(amplitudes[count:]),
+        }
 
     def explain(self, named: Mapping[str, float], rms_um: float) -> str:
         """Say what is changed."""

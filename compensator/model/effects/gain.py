@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import Hypothesis, Matrix, Setting, Waves, proposes, shown
+from compensator.model.effects.hypothesis import Hypothesis, Setting, RecordSignals, proposes, shown
 from compensator.model.effects.table import Table
 
 
@@ -47,7 +48,7 @@ class GainHypothesis(Hypothesis):
 
     kind: ClassVar[str] = "gain"
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return the path's share."""
         return waves.share(self.path)[:, None]
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Matrix, Vector
 from compensator.model.effects.base import kinds
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -23,12 +23,9 @@ ROW, ROW_LONGEST_MIN = 6, 600.0
 #: Weight that holds the gains of a row together.
 ROW_RIDGE = 1e-3
 
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Waves:
+class RecordSignals:
     """Signals of the base model over a record, as the effects see them.
 
     Parameters
@@ -131,15 +128,15 @@ class Hypothesis:
         """Number of parameters, searched and linear."""
         return len(self.free) + len(self.amplitudes)
 
-    def fixed(self, waves: Waves, values: Sequence[float]) -> Vector | None:
+    def fixed(self, waves: RecordSignals, values: Sequence[float]) -> Vector | None:
         """Return the part that has no amplitude, µm; None where there is none."""
         return None
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return one column for each amplitude, shape (n, len(amplitudes))."""
         return np.zeros((waves.size, 0))
 
-    def trial(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def trial(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return columns that a first scan may give any amplitude: the fixed part stands in where there is one."""
         fixed = self.fixed(waves, values)
         columns = self.columns(waves, values)

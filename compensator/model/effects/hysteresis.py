@@ -12,8 +12,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from compensator.arrays import Vector
 from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import Free, Hypothesis, Setting, Vector, Waves, proposes, shown
+from compensator.model.effects.hypothesis import Free, Hypothesis, Setting, RecordSignals, proposes, shown
 from compensator.model.effects.table import Table
 
 FORMS = ("play", "stick")
@@ -89,7 +90,7 @@ class HysteresisHypothesis(Hypothesis):
     acts_on: str = "DTF"
     law: str = "play"
 
-    def fixed(self, waves: Waves, values: Sequence[float]) -> Vector | None:
+    def fixed(self, waves: RecordSignals, values: Sequence[float]) -> Vector | None:
         """Return how far it stands behind."""
         share = waves.y_dtf_um + waves.y_tdtf_um if self.acts_on == "all" else waves.share(self.acts_on)
         return _trace(self.law, share, float(values[0])) - share

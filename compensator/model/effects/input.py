@@ -15,15 +15,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from compensator.arrays import Matrix, Vector
 from compensator.model.effects.base import Effect, Signals, register
 from compensator.model.effects.hypothesis import (
     ROW_RIDGE,
     Free,
     Hypothesis,
-    Matrix,
     Setting,
-    Vector,
-    Waves,
+    RecordSignals,
     late,
     lowpass,
     proposes,
@@ -35,11 +34,17 @@ from compensator.model.effects.table import Table
 
 CURVES = ("linear", "square", "abs", "power 5/3")
 _STREAM: Mapping[str, Callable[[float], float]] = {
-    "linear": lambda c: c, "square": lambda c: c * c, "abs": abs, "power 5/3": lambda c: abs(c) ** (5.0 / 3.0),
-}  # fmt: skip
+    "linear": lambda c: c,
+    "square": lambda c: c * c,
+    "abs": abs,
+    "power 5/3": lambda c: abs(c) ** (5.0 / 3.0),
+}
 _BATCH: Mapping[str, Callable[[Vector], Vector]] = {
-    "linear": lambda c: c, "square": np.square, "abs": np.abs, "power 5/3": lambda c: np.abs(c) ** (5.0 / 3.0),
-}  # fmt: skip
+    "linear": lambda c: c,
+    "square": np.square,
+    "abs": np.abs,
+    "power 5/3": lambda c: np.abs(c) ** (5.0 / 3.0),
+}
 _WORDS = {"linear": "", "square": " (its square)", "abs": " (its size)", "power 5/3": " (its size to the power of 5/3)"}
 
 
@@ -97,7 +102,7 @@ class InputHypothesis(Hypothesis):
     kind: ClassVar[str] = "input"
     curve: str = "linear"
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return the channel behind each lag."""
         named = dict(zip((f.name for f in self.free), values, strict=True))
         curved = _BATCH[self.curve](waves.channels[self.channel])
@@ -112,8 +117,13 @@ class InputHypothesis(Hypothesis):
         """Return the table that the engine runs."""
         named = dict(zip((f.name for f in self.free), values, strict=True))
         taus = [value for name, value in named.items() if name.startswith("tau")]
-        return {"channel": self.channel, "curve": self.curve, "tau_min": taus, "gain": list(amplitudes),
-                "delay_min": named.get("delay_min", 0.0)}  # fmt: skip
+        return {
+            "channel": self.channel,
+            "curve": self.curve,
+            "tau_min": taus,
+            "gain": list(amplitudes),
+            "delay_min": named.get("delay_min", 0.0),
+        }
 
     def explain(self, named: Mapping[str, float], rms_um: float) -> str:
         """Say what acts."""
@@ -143,7 +153,7 @@ class RowHypothesis(InputHypothesis):
         """Number of parameters that the data spends on it: fewer than gains, because they are held together."""
         return 5
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return the channel behind each lag."""
         curved = _BATCH[self.curve](waves.channels[self.channel])
         return row(curved - curved[0], self.taus_min, waves.period_min)
@@ -156,8 +166,13 @@ class RowHypothesis(InputHypothesis):
 
     def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
         """Return the table that the engine runs."""
-        return {"channel": self.channel, "curve": self.curve, "tau_min": list(self.taus_min), "gain": list(amplitudes),
-                "delay_min": 0.0}  # fmt: skip
+        return {
+            "channel": self.channel,
+            "curve": self.curve,
+            "tau_min": list(self.taus_min),
+            "gain": list(amplitudes),
+            "delay_min": 0.0,
+        }
 
     def explain(self, named: Mapping[str, float], rms_um: float) -> str:
         """Say what acts."""
@@ -199,12 +214,15 @@ def propose(setting: Setting) -> Iterator[Hypothesis]:
     for channel in setting.channels:
         unit = unit_of(channel)
         yield InputHypothesis(channel=channel, form="lag", free=one, amplitudes=(f"gain_um_per_{unit}",))
-        yield InputHypothesis(channel=channel, form="lag and delay", free=(tau, delay),
-                              amplitudes=(f"gain_um_per_{unit}",))  # fmt: skip
-        yield InputHypothesis(channel=channel, form="two lags", free=two,
-                              amplitudes=(f"gain_1_um_per_{unit}", f"gain_2_um_per_{unit}"))  # fmt: skip
-        yield InputHypothesis(channel=channel, form="square", curve="square", free=one,
-                              amplitudes=(f"gain_um_per_{unit}2",))  # fmt: skip
+        yield InputHypothesis(
+            channel=channel, form="lag and delay", free=(tau, delay), amplitudes=(f"gain_um_per_{unit}",)
+        )
+        yield InputHypothesis(
+            channel=channel, form="two lags", free=two, amplitudes=(f"gain_1_um_per_{unit}", f"gain_2_um_per_{unit}")
+        )
+        yield InputHypothesis(
+            channel=channel, form="square", curve="square", free=one, amplitudes=(f"gain_um_per_{unit}2",)
+        )
     if setting.rough:
         yield from rows(setting)
 

@@ -14,8 +14,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import Hypothesis, Matrix, Setting, Waves, proposes, shown
+from compensator.model.effects.hypothesis import Hypothesis, Setting, RecordSignals, proposes, shown
 from compensator.model.effects.stream import Function
 from compensator.model.effects.table import Table
 from compensator.model.transfer_function import SampledTransferFunction
@@ -77,7 +78,7 @@ class NonlinearHypothesis(Hypothesis):
     kind: ClassVar[str] = "nonlinear"
     function: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return the curve of the share, or the path's answer to the curve of its drive."""
         if self.form == "drive":
             drive = waves.source(self.path)
@@ -108,5 +109,6 @@ def propose(setting: Setting) -> Iterator[Hypothesis]:
     """Propose curves of every path."""
     for path in setting.paths:
         for form in FORMS:
-            yield NonlinearHypothesis(path=path, form=form, amplitudes=("change_per_100",),
-                                      function=setting.functions.get(path, ((), ())))  # fmt: skip
+            yield NonlinearHypothesis(
+                path=path, form=form, amplitudes=("change_per_100",), function=setting.functions.get(path, ((), ()))
+            )

@@ -12,7 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from compensator.model.effects.hypothesis import Free, Hypothesis, Matrix, Setting, Vector, Waves, proposes, shown
+from compensator.arrays import Matrix, Vector
+from compensator.model.effects.hypothesis import Free, Hypothesis, Setting, RecordSignals, proposes, shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,7 +24,7 @@ class Drift(Hypothesis):
     deployable: ClassVar[bool] = False
     worth_beside: ClassVar[float] = 0.75
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return the time, h."""
         hours: Vector = np.arange(waves.size, dtype=np.float64) * waves.period_min / 60.0
         return hours[:, None]
@@ -40,7 +41,7 @@ class Drift(Hypothesis):
 class Settling(Drift):
     """A ramp that dies out."""
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return 1 − exp(−t/τ)."""
         minutes: Vector = np.arange(waves.size, dtype=np.float64) * waves.period_min
         return np.asarray(1.0 - np.exp(-minutes / values[0]))[:, None]
@@ -62,7 +63,7 @@ class Step(Hypothesis):
     deployable: ClassVar[bool] = False
     worth_beside: ClassVar[float] = 0.75
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return 0 before and 1 after, over one sample."""
         minutes = np.arange(waves.size) * waves.period_min
         return np.asarray(np.clip((minutes - values[0]) / waves.period_min + 1.0, 0.0, 1.0))[:, None]
@@ -83,7 +84,7 @@ class Periodic(Hypothesis):
     deployable: ClassVar[bool] = False
     worth_beside: ClassVar[float] = 0.75
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return sine and cosine."""
         angle = 2.0 * np.pi * np.arange(waves.size) * waves.period_min / values[0]
         return np.column_stack((np.sin(angle), np.cos(angle)))

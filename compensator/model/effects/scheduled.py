@@ -18,13 +18,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Signals, register
 from compensator.model.effects.hypothesis import (
     ROW_RIDGE,
     Hypothesis,
-    Matrix,
     Setting,
-    Waves,
+    RecordSignals,
     lowpass,
     proposes,
     row,
@@ -112,7 +112,7 @@ class ScheduledHypothesis(Hypothesis):
     span: float = 1.0
     function: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return the path's share, drive or lag, times the channel."""
         channel = waves.channels[self.channel]
         c = (channel - (channel[0] if self.origin == "start" else 0.0)) / self.span
@@ -155,7 +155,7 @@ class RowScheduled(ScheduledHypothesis):
         """Number of parameters that the data spends on it: fewer than gains, because they are held together."""
         return 7
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return what drives the path, times the channel, behind each lag."""
         channel = waves.channels[self.channel]
         c = (channel - (channel[0] if self.origin == "start" else 0.0)) / self.span
@@ -169,9 +169,16 @@ class RowScheduled(ScheduledHypothesis):
 
     def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
         """Return the table that the engine runs."""
-        return {"path": self.path, "channel": self.channel, "form": "row", "origin": self.origin, "span": self.span,
-                "tau_min": list(self.taus_min), "gain": list(amplitudes[: len(self.taus_min)]),
-                "gain_share": list(amplitudes[len(self.taus_min) :])}  # fmt: skip
+        return {
+            "path": self.path,
+            "channel": self.channel,
+            "form": "row",
+            "origin": self.origin,
+            "span": self.span,
+            "tau_min": list(self.taus_min),
+            "gain": list(amplitudes[: len(self.taus_min)]),
+            "gain_share": list(amplitudes[len(self.taus_min) :]),
+        }
 
 
 @proposes
@@ -184,14 +191,25 @@ def propose(setting: Setting) -> Iterator[Hypothesis]:
             if setting.rough:
                 taus = setting.row_min
                 yield RowScheduled(
-                    path=path, channel=channel, form="row", law="row", origin=origin, span=span, function=function,
-                    taus_min=taus, amplitudes=tuple(
-                        f"{name}_{i}" for name in ("gain", "gain_share") for i in range(1, len(taus) + 1)
-                    ),
-                )  # fmt: skip
+                    path=path,
+                    channel=channel,
+                    form="row",
+                    law="row",
+                    origin=origin,
+                    span=span,
+                    function=function,
+                    taus_min=taus,
+                    amplitudes=tuple(f"{name}_{i}" for name in ("gain", "gain_share") for i in range(1, len(taus) + 1)),
+                )
             for law in ("share", "drive", "speed"):
                 yield ScheduledHypothesis(
-                    path=path, channel=channel, form=law, law=law,
-                    origin=origin, span=span, function=function,
-                    free=(setting.tau(),) if law == "speed" else (), amplitudes=("change",),
-                )  # fmt: skip
+                    path=path,
+                    channel=channel,
+                    form=law,
+                    law=law,
+                    origin=origin,
+                    span=span,
+                    function=function,
+                    free=(setting.tau(),) if law == "speed" else (),
+                    amplitudes=("change",),
+                )

@@ -14,7 +14,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from compensator.model.effects.hypothesis import Hypothesis, Matrix, Waves, lowpass, shown
+from compensator.arrays import Matrix
+from compensator.model.effects.hypothesis import Hypothesis, RecordSignals, lowpass, shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,7 +27,7 @@ class Unobserved(Hypothesis):
     times : tuple of (int, float)
         Record and time, min, of each switching.
     sizes : tuple of int
-        Samples of each record, to know which one a `Waves` is.
+        Samples of each record, to know which one a `RecordSignals` is.
     """
 
     kind: ClassVar[str] = "unobserved"
@@ -41,7 +42,7 @@ class Unobserved(Hypothesis):
         """Number of parameters: the lag, and time and size of each switching."""
         return 1 + 2 * len(self.times)
 
-    def columns(self, waves: Waves, values: Sequence[float]) -> Matrix:
+    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return each switching behind the lag; zero in other records than its own."""
         record = self.order.index(id(waves)) if id(waves) in self.order else 0
         minutes = np.arange(waves.size, dtype=np.float64) * waves.period_min

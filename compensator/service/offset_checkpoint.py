@@ -46,7 +46,7 @@ class Early(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     y_offset_um: float
 
 
-class EarlyNote:
+class OffsetCheckpoint:
     """The note of one machine.
 
     Parameters

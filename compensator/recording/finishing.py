@@ -25,14 +25,15 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from compensator import __version__, chain
+from compensator import __version__
 from compensator.clock import NS
-from compensator.container import PAYLOAD, Container, Damaged, Message, Torn
-from compensator.durable import sync_folder
 from compensator.errors import DataError
 from compensator.messages import encode
-from compensator.recording import end_of_chain, recordings
-from compensator.signature import Signer
+from compensator.recording import chain
+from compensator.recording.container import PAYLOAD, Container, Damaged, Message, Torn
+from compensator.recording.live_file import sync_folder
+from compensator.recording.reading import end_of_chain, recordings
+from compensator.recording.signature import Signer
 
 log = logging.getLogger("compensator")
 

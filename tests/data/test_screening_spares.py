@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from compensator.data.screening import screen
 from compensator.errors import DataError
-from compensator.identify.screening import screen
 from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
 
 
@@ -32,9 +32,19 @@ RISE = BASE["t_q_degc"] - BASE["at_degc"]
         {"heat_w": 30.0 * BASE["heat_w"]},
         {"y_um": np.where(np.arange(720) % 5 < 3, BASE["y_um"], np.nan)},
     ],
-    ids=["a cold shop", "a hot shop", "a hot spindle", "begins warm", "cooled below the air", "shrinks", "hardly grows",
-         "grows much, odd zero", "a strong heater", "y seldom measured"],
-)  # fmt: skip
+    ids=[
+        "a cold shop",
+        "a hot shop",
+        "a hot spindle",
+        "begins warm",
+        "cooled below the air",
+        "shrinks",
+        "hardly grows",
+        "grows much, odd zero",
+        "a strong heater",
+        "y seldom measured",
+    ],
+)
 def test_good_data_of_unusual_machines(changes):
     screen("good.csv", runs_from(columns(**changes)), 60.0, needs_heat=True)
 
@@ -62,9 +72,14 @@ def test_several_short_runs_count_together():
 
 @pytest.mark.parametrize(
     ("column", "values"),
-    [("at_degc", np.full(720, 21.0)), ("t_q_degc", np.full(720, 21.0)), ("y_um", BASE["y_um"] * 1e-3),
-     ("heat_w", BASE["heat_w"] * 1e-3), ("at_degc", BASE["at_degc"] * 1.8 + 32.0)],
-)  # fmt: skip
+    [
+        ("at_degc", np.full(720, 21.0)),
+        ("t_q_degc", np.full(720, 21.0)),
+        ("y_um", BASE["y_um"] * 1e-3),
+        ("heat_w", BASE["heat_w"] * 1e-3),
+        ("at_degc", BASE["at_degc"] * 1.8 + 32.0),
+    ],
+)
 def test_one_line_that_names_file_and_column(column, values):
     with pytest.raises(DataError) as refusal:
         screen("bad.csv", runs_from(columns(**{column: values})), 60.0, needs_heat=True)

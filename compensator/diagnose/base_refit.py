@@ -7,11 +7,10 @@ that of the paths alone, fitted anew without the block too: the first model may 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.joint import Part, response
 from compensator.diagnose.outcome import (
@@ -21,20 +20,17 @@ from compensator.diagnose.outcome import (
     RIVAL_TIMES,
     Diagnosis,
     Effect,
-    Mapped,
     Rival,
     how_to_tell_apart,
     rms_of,
     table_of,
     warnings_of,
-)  # fmt: skip
+)
 from compensator.diagnose.refit import Refit, Tried, refit
+from compensator.model.simulation import scores
 from compensator.model.thermal_model import Path, ThermalModel
+from compensator.progress import ExecutorMap, Progress
 from compensator.reasons import Caution
-from compensator.simulation import scores
-
-Vector = npt.NDArray[np.float64]
-Told = Callable[[int, int], None]
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
@@ -46,7 +42,7 @@ def is_far_off(model: ThermalModel, evidence: Evidence) -> bool:
     return isinstance(folds, float) and folds > FAR_OFF * evidence.spread_um
 
 
-def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told, mapped: Mapped) -> Diagnosis:
+def diagnose_anew(model: ThermalModel, evidence: Evidence, progress: Progress, executor_map: ExecutorMap) -> Diagnosis:
     """Fit the base anew with the channels that it lacks, and say what that is worth on held-out blocks.
 
     Parameters
@@ -55,39 +51,46 @@ def diagnose_anew(model: ThermalModel, evidence: Evidence, told: Told, mapped: M
         The base model.
     evidence : Evidence
         Its residual and signals.
-    told : callable
-        Is told how many blocks of how many are done.
-    mapped : callable
+    progress : callable
+        Called with how many blocks of how many are done.
+    executor_map : callable
         Does the fits without a block: `map`, or that of an executor.
     """
     y, open_ = evidence.y_um, evidence.deformation_um
     whole = refit(evidence)
-    before, after = _held_out(evidence, told, mapped)
+    before, after = _held_out(evidence, progress, executor_map)
     effects = _effects(evidence, whole)
     helps = bool(effects) and rms_of(after) <= rms_of(before)
     left = np.where(evidence.used, open_ - whole.predicted, np.nan)
     bare = np.where(evidence.used, open_ - whole.by_paths, np.nan)
     clean = rms_of(after) < NOISE_TIMES * evidence.noise_um
     return Diagnosis(
-        verdict="unexplained" if not effects else "explained" if clean else "partly_explained", effects=effects,
-        before=scores(y, y - before), after=scores(y, y - (after if effects else before)),
+        verdict="unexplained" if not effects else "explained" if clean else "partly_explained",
+        effects=effects,
+        before=scores(y, y - before),
+        after=scores(y, y - (after if effects else before)),
         held_out=f"{HELD_OUT}; before: the first model's paths alone, fitted anew to the others",
-        noise_floor_um=evidence.noise_um, model=_extended(model, whole, effects) if helps else model,
-        evidence=evidence, residual_before=bare, residual_after=left if effects else bare,
-        held_out_before=before, held_out_after=after if effects else before, tried=_tried(whole),
+        noise_floor_um=evidence.noise_um,
+        model=_extended(model, whole, effects) if helps else model,
+        evidence=evidence,
+        residual_before=bare,
+        residual_after=left if effects else bare,
+        held_out_before=before,
+        held_out_after=after if effects else before,
+        tried=_tried(whole),
         warnings=(*_words(model, whole, helps), *warnings_of(effects, before, after)),
-    )  # fmt: skip
+    )
 
 
-def _held_out(evidence: Evidence, told: Told, mapped: Mapped) -> tuple[Vector, Vector]:
+def _held_out(evidence: Evidence, progress: Progress, executor_map: ExecutorMap) -> tuple[Vector, Vector]:
     """Return the residual of the base and of the refit on every block, each without that block."""
     before, after = (np.full(evidence.used.size, np.nan) for _ in range(2))
     open_ = evidence.deformation_um
-    told(1, FOLDS + 1)
+    progress(1, FOLDS + 1)
     blocks = list(evidence.blocks(FOLDS))
-    fits = mapped(refit, [evidence.hidden(block) for block in blocks])
+    fits = executor_map(refit, [evidence.hidden(block) for block in blocks])
     for done, (block, seen) in enumerate(zip(blocks, fits, strict=True), start=2):
-        told(done, FOLDS + 1)
+        progress(done, FOLDS + 1)
         before[block] = (open_ - seen.by_paths)[block]
         after[block] = (open_ - seen.predicted)[block]
     return before, after
@@ -99,11 +102,15 @@ def _effects(evidence: Evidence, whole: Refit) -> tuple[Effect, ...]:
         wave = response(evidence, part)
         effects.append(
             Effect(
-                part=part, std=std, explanation=part.hypothesis.explain(part.named, float(np.std(wave[evidence.used]))),
-                rms_before_um=whole.rms_um[i], rms_after_um=whole.rms_um[i + 1], wave=wave,
+                part=part,
+                std=std,
+                explanation=part.hypothesis.explain(part.named, float(np.std(wave[evidence.used]))),
+                rms_before_um=whole.rms_um[i],
+                rms_after_um=whole.rms_um[i + 1],
+                wave=wave,
                 rivals=_rivals(part, whole.rivals[i], whole.rms_um[i + 1]),
             )
-        )  # fmt: skip
+        )
     return tuple(effects)
 
 
@@ -130,11 +137,15 @@ def _tried(whole: Refit) -> tuple[tuple[str, float], ...]:
 def _extended(model: ThermalModel, whole: Refit, effects: tuple[Effect, ...]) -> ThermalModel:
     error = whole.rms_um[-1]
     return dataclasses.replace(
-        model, dtf=Path(sampled=whole.dtf, unit=model.dtf.unit),
+        model,
+        dtf=Path(sampled=whole.dtf, unit=model.dtf.unit),
         tdtf=Path(sampled=whole.tdtf, unit=model.tdtf.unit) if model.tdtf and whole.tdtf else model.tdtf,
-        effects=(*model.effects, *(table_of(effect) for effect in effects)), y_std_um=error, alternatives={},
-        provenance={**model.provenance, "folds_rms_um": error}, sha256="",
-    )  # fmt: skip
+        effects=(*model.effects, *(table_of(effect) for effect in effects)),
+        y_std_um=error,
+        alternatives={},
+        provenance={**model.provenance, "folds_rms_um": error},
+        sha256="",
+    )
 
 
 def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, ...]:

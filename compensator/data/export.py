@@ -10,10 +10,10 @@ from typing import Any
 
 import msgspec
 
+from compensator.atomic_write import whole_file
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Sample
-from compensator.recording import decode, machines_in, read_messages
-from compensator.whole import whole_file
+from compensator.recording.reading import decode, machines_in, read_messages
 
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from compensator.framing import (
+from compensator.recording.framing import (
     ATTACHMENT_INDEX,
     CHANNEL,
     CHUNK_INDEX,
@@ -24,8 +24,14 @@ from compensator.framing import (
 
 #: So many faults are kept; the rest is counted.
 KEPT = 50
-_NAMES = {SCHEMA: "schema", CHANNEL: "channel", STATISTICS: "statistics", CHUNK_INDEX: "chunk index",
-          ATTACHMENT_INDEX: "attachment index", METADATA_INDEX: "metadata index"}  # fmt: skip
+_NAMES = {
+    SCHEMA: "schema",
+    CHANNEL: "channel",
+    STATISTICS: "statistics",
+    CHUNK_INDEX: "chunk index",
+    ATTACHMENT_INDEX: "attachment index",
+    METADATA_INDEX: "metadata index",
+}
 _THINGS = {CHUNK_INDEX: "chunk", ATTACHMENT_INDEX: "attachment", METADATA_INDEX: "metadata table"}
 
 #: What an entry says of what it leads to, in words.
@@ -85,14 +91,21 @@ class Index:
         first_ns = min((min(place[::2]) for place in places.values()), default=0)
         last_ns = max((max(place[::2]) for place in places.values()), default=0)
         if (start_ns, end_ns) != (first_ns, last_ns):
-            self._fault(f"chunk at byte {offset}", f"says that its messages are from {start_ns} to {end_ns} ns, "
-                        f"they are from {first_ns} to {last_ns} ns")  # fmt: skip
+            self._fault(
+                f"chunk at byte {offset}",
+                f"says that its messages are from {start_ns} to {end_ns} ns, they are from {first_ns} to {last_ns} ns",
+            )
         self._places, self._chunk_at, self._next = places, offset, offset + length
         self._chunk = {
-            "first message (ns)": first_ns, "last message (ns)": last_ns, "length": length, "message indexes": {},
-            "length of the message indexes": 0, "compression": compression, "compressed size": len(stored),
+            "first message (ns)": first_ns,
+            "last message (ns)": last_ns,
+            "length": length,
+            "message indexes": {},
+            "length of the message indexes": 0,
+            "compression": compression,
+            "compressed size": len(stored),
             "size": size,
-        }  # fmt: skip
+        }
         self._due[CHUNK_INDEX][offset] = self._chunk
         for channel, place in places.items():
             self._messages[channel] = self._messages.get(channel, 0) + len(place) // 2
@@ -130,8 +143,11 @@ class Index:
         stated = list(struct.iter_unpack("<QQ", entries)) if whole else []
         missing, wrong = len(due - set(stated)), len(stated) - len(due & set(stated))
         if missing or wrong or not whole:
-            self._fault(where, f"leads to {len(due) - missing} of the {len(due)} messages of the chunk at byte "
-                        f"{self._chunk_at}, and {wrong} time(s) to something else")  # fmt: skip
+            self._fault(
+                where,
+                f"leads to {len(due) - missing} of the {len(due)} messages of the chunk at byte "
+                f"{self._chunk_at}, and {wrong} time(s) to something else",
+            )
 
     def _close_chunk(self) -> None:
         """See that every message of the chunk had its index."""
@@ -162,12 +178,16 @@ class Index:
 
     def add_attachment(
         self, offset: int, length: int, log_ns: int, create_ns: int, size: int, name: str, media_type: str
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Note an attachment."""
         self._due[ATTACHMENT_INDEX][offset] = {
-            "length": length, "log time (ns)": log_ns, "creation time (ns)": create_ns, "size": size, "name": name,
+            "length": length,
+            "log time (ns)": log_ns,
+            "creation time (ns)": create_ns,
+            "size": size,
+            "name": name,
             "media type": media_type,
-        }  # fmt: skip
+        }
 
     def add_metadata(self, offset: int, length: int, name: str) -> None:
         """Note a metadata table."""
@@ -249,8 +269,11 @@ class Index:
             return
         for kind, entries in self._due.items():
             for offset in entries.keys() - self._found[kind]:
-                self._fault(_NAMES[kind], f"no entry leads to the {_THINGS[kind]} at byte {offset}"
-                            + (f", {entries[offset]['name']}" if "name" in entries[offset] else ""))  # fmt: skip
+                self._fault(
+                    _NAMES[kind],
+                    f"no entry leads to the {_THINGS[kind]} at byte {offset}"
+                    + (f", {entries[offset]['name']}" if "name" in entries[offset] else ""),
+                )
         for kind, described in self._described.items():
             for number in described.keys() - self._repeated[kind]:
                 self._fault(f"{_NAMES[kind]} {number}", "is not repeated in the summary")
@@ -263,20 +286,26 @@ class Index:
     def _totals(self) -> _Entry:
         any_there = bool(self._messages)
         return {
-            "messages": sum(self._messages.values()), "schemas": len(self._described[SCHEMA]),
-            "channels": len(self._described[CHANNEL]), "attachments": len(self._due[ATTACHMENT_INDEX]),
-            "metadata tables": len(self._due[METADATA_INDEX]), "chunks": len(self._due[CHUNK_INDEX]),
+            "messages": sum(self._messages.values()),
+            "schemas": len(self._described[SCHEMA]),
+            "channels": len(self._described[CHANNEL]),
+            "attachments": len(self._due[ATTACHMENT_INDEX]),
+            "metadata tables": len(self._due[METADATA_INDEX]),
+            "chunks": len(self._due[CHUNK_INDEX]),
             "first message (ns)": self._first_ns if any_there else 0,
-            "last message (ns)": self._last_ns if any_there else 0, "messages by channel": self._messages,
-        }  # fmt: skip
+            "last message (ns)": self._last_ns if any_there else 0,
+            "messages by channel": self._messages,
+        }
 
     def _places_of_groups(self, start: int, footer_at: int, stated_start: int, stated_offsets: int) -> None:
         """Hold footer and summary offsets against where the groups of the summary stand."""
         if stated_start != start:
             self._fault("footer", f"says that the summary begins at byte {stated_start}, it begins at byte {start}")
         if stated_offsets != self._offsets_at and (self._offsets_at or stated_offsets != footer_at):
-            self._fault("footer", f"says that the summary offsets begin at byte {stated_offsets}, "
-                        f"they begin at byte {self._offsets_at}")  # fmt: skip
+            self._fault(
+                "footer",
+                f"says that the summary offsets begin at byte {stated_offsets}, they begin at byte {self._offsets_at}",
+            )
         if not self._stated:  # readers walk through the summary
             return
         groups = [tuple(group) for group in self._groups]

@@ -19,7 +19,7 @@ import lz4.frame
 import zstandard
 
 from compensator.errors import DataError
-from compensator.framing import (
+from compensator.recording.framing import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
     CHANNEL,
@@ -39,11 +39,20 @@ from compensator.framing import (
     Fields,
     Torn,
 )
-from compensator.index import Index
+from compensator.recording.index import Index
 
 __all__ = [
-    "LONGEST", "MAGIC", "PAYLOAD", "Attachment", "Channel", "Container", "Contents", "Damaged", "Message", "Torn",
-]  # fmt: skip
+    "LONGEST",
+    "MAGIC",
+    "PAYLOAD",
+    "Attachment",
+    "Channel",
+    "Container",
+    "Contents",
+    "Damaged",
+    "Message",
+    "Torn",
+]
 
 MAGIC = b"\x89MCAP0\r\n"
 #: Longest record and chunk that is believed, bytes; ours are below 2 MiB.
@@ -382,8 +391,7 @@ class Container:
             record = self._buffer[start : self._at]
             if code == FOOTER:
                 break
-            if code not in (SCHEMA, CHANNEL, CHUNK_INDEX, ATTACHMENT_INDEX, STATISTICS, METADATA_INDEX,
-                            SUMMARY_OFFSET):  # fmt: skip
+            if code not in (SCHEMA, CHANNEL, CHUNK_INDEX, ATTACHMENT_INDEX, STATISTICS, METADATA_INDEX, SUMMARY_OFFSET):
                 raise Damaged(self.path, self._base + start, f"a record of kind {code} in the summary")
             self.index.summarise(
                 code, self._base + start, Fields(self.path, self._base + start, record, 9), len(record)

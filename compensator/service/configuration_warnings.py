@@ -64,12 +64,20 @@ def _open_doors(zenoh: Zenoh) -> list[Caution]:
     found = []
     outside = [endpoint for endpoint in zenoh.listen if not zenoh.is_loopback(endpoint)]
     if outside:
-        found.append(Caution("open_listen", f"zenoh.listen {', '.join(outside)}: whoever reaches it can publish "
-                             f"offsets and send commands in any name."))  # fmt: skip
+        found.append(
+            Caution(
+                "open_listen",
+                f"zenoh.listen {', '.join(outside)}: whoever reaches it can publish "
+                f"offsets and send commands in any name.",
+            )
+        )
     outside = [endpoint for endpoint in zenoh.connect if not zenoh.is_loopback(endpoint)]
     if outside and not zenoh.secured():
-        found.append(Caution("unsecured_connect", f"zenoh.connect {', '.join(outside)}: neither encrypted nor proven "
-                             f"who is there."))  # fmt: skip
+        found.append(
+            Caution(
+                "unsecured_connect", f"zenoh.connect {', '.join(outside)}: neither encrypted nor proven who is there."
+            )
+        )
     if zenoh.unproven_commands and not zenoh.on_loopback():
         figures = "zenoh.unproven_commands: commands are taken of which nobody proves who sent them."
         found.append(Caution("unproven_commands", figures))

@@ -7,14 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
+from compensator.data.record import Record
 from compensator.errors import DataError
 from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
-from compensator.tables import Record
-
-Vector = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,9 +73,14 @@ def simulate(model: ThermalModel, record: Record, *, source: str = "") -> dict[s
 
     result = {"t_s": record.t_s} | {
         new: column(old)
-        for new, old in (("heat_w", "heat_w"), ("y_pred_um", "y_um"), ("y_dtf_um", "y_dtf_um"),
-                         ("y_tdtf_um", "y_tdtf_um"), ("y_std_um", "y_std_um"))
-    }  # fmt: skip
+        for new, old in (
+            ("heat_w", "heat_w"),
+            ("y_pred_um", "y_um"),
+            ("y_dtf_um", "y_dtf_um"),
+            ("y_tdtf_um", "y_tdtf_um"),
+            ("y_std_um", "y_std_um"),
+        )
+    }
     if "y_um" in record.columns:
         result |= _residual(record.columns["y_um"], result["y_pred_um"])
     return result

@@ -21,8 +21,8 @@ import struct
 
 import msgspec
 
-from compensator.container import Attachment, Channel, Contents
 from compensator.messages import SCHEMA, Chain, ChainLink, ChainPart, Seal, encode
+from compensator.recording.container import Attachment, Channel, Contents
 
 #: Value before the first file of a machine.
 NOTHING = bytes(32)
@@ -137,8 +137,14 @@ class ChainWriter:
 
     def message(self, time_ns: int) -> bytes:
         """Return the message that lists the records since the last one."""
-        message = Chain(schema=SCHEMA, machine=self.machine, time_utc_ns=time_ns, before=self._before.hex(), parts=[],
-                        records=self.links)  # fmt: skip
+        message = Chain(
+            schema=SCHEMA,
+            machine=self.machine,
+            time_utc_ns=time_ns,
+            before=self._before.hex(),
+            parts=[],
+            records=self.links,
+        )
         self.listed()
         return encode(message)
 
@@ -150,9 +156,15 @@ class ChainWriter:
 def seal(machine: str, time_ns: int, reason: str, sequence: int, head: bytes, public_key: str = "") -> Seal:
     """Return a seal that is not signed yet."""
     return Seal(
-        schema=SCHEMA, machine=machine, time_utc_ns=time_ns, reason=reason, sequence=sequence, sha256=head.hex(),
-        public_key=public_key, signature="",
-    )  # fmt: skip
+        schema=SCHEMA,
+        machine=machine,
+        time_utc_ns=time_ns,
+        reason=reason,
+        sequence=sequence,
+        sha256=head.hex(),
+        public_key=public_key,
+        signature="",
+    )
 
 
 def signed_bytes(message: Seal) -> bytes:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from compensator.identify.runs import SHORTEST_RUN, noise_std, runs_of, walk_std, without_wild
-from compensator.tables import SHORT_GAP_SAMPLES, Record
+from compensator.data.record import SHORT_GAP_SAMPLES, Record
+from compensator.data.runs import SHORTEST_RUN, noise_std, runs_of, walk_std, without_wild
 
 N = 600
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from compensator.data.record import Record
+from compensator.data.runs import noise_std, runs_of, without_wild
+from compensator.data.screening import screen, screen_temperatures
 from compensator.errors import DataError
-from compensator.identify.runs import noise_std, runs_of, without_wild
-from compensator.identify.screening import screen, screen_temperatures
-from compensator.tables import Record
 from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
 
 
@@ -44,7 +44,7 @@ def spoil(name):
         "a fault's code": lambda: c["at_degc"].__setitem__(slice(300, 330), -9999.0),
         "T_Q and AT exchanged": lambda: c.update(t_q_degc=c["at_degc"], at_degc=c["t_q_degc"]),
         "T_Q far away": lambda: c.update(t_q_degc=c["at_degc"] + np.random.default_rng(1).normal(0, 0.1, 720)),
-    }  # fmt: skip
+    }
     change[name]()
     return c
 
@@ -52,16 +52,29 @@ def spoil(name):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("heat constant", "heat_w = 90 in every row"), ("T_Q constant", "t_q_degc = 25 in every row"),
-        ("y constant", "y_um = 0 in every row"), ("y in mm", "millimetres"), ("y in nm", "nanometres"),
-        ("heat in kW", "kilowatts"), ("heat in mW", "milliwatts"), ("AT in F", "°F"), ("both in F", "°F"),
-        ("T_Q in F", "°F"), ("kelvin", "kelvin"), ("millidegrees", "thousandths"), ("kilodegrees", "thousands"),
-        ("y missing", "y_um is missing"), ("one sensor twice", "the same in every row"), ("y is noise", "noise"),
-        ("T_Q far away", "near the heat source"), ("T_Q dead from 400 on", "from t_s = 24000 to 43140"),
+        ("heat constant", "heat_w = 90 in every row"),
+        ("T_Q constant", "t_q_degc = 25 in every row"),
+        ("y constant", "y_um = 0 in every row"),
+        ("y in mm", "millimetres"),
+        ("y in nm", "nanometres"),
+        ("heat in kW", "kilowatts"),
+        ("heat in mW", "milliwatts"),
+        ("AT in F", "°F"),
+        ("both in F", "°F"),
+        ("T_Q in F", "°F"),
+        ("kelvin", "kelvin"),
+        ("millidegrees", "thousandths"),
+        ("kilodegrees", "thousands"),
+        ("y missing", "y_um is missing"),
+        ("one sensor twice", "the same in every row"),
+        ("y is noise", "noise"),
+        ("T_Q far away", "near the heat source"),
+        ("T_Q dead from 400 on", "from t_s = 24000 to 43140"),
         ("y dead for two hours", "y_um = .* in every sample from t_s = 24000 to 31140"),
-        ("a fault's code", "at_degc = -9999 at t_s = 18000, 30 sample"), ("T_Q and AT exchanged", "exchanged"),
+        ("a fault's code", "at_degc = -9999 at t_s = 18000, 30 sample"),
+        ("T_Q and AT exchanged", "exchanged"),
     ],
-)  # fmt: skip
+)
 def test_bad_data(name, words):
     with pytest.raises(DataError, match=words):
         screen("bad.csv", runs_from(spoil(name)), 60.0, needs_heat=True)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import msgspec
 
-from compensator import chain
-from compensator.container import PAYLOAD, Container, Damaged
 from compensator.errors import DataError
 from compensator.messages import MESSAGES, Chain, Offset, Sample, Seal
+from compensator.recording import chain
+from compensator.recording.container import PAYLOAD, Container, Damaged
 
 _EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
 

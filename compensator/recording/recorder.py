@@ -2,8 +2,8 @@
 
 One file a day and at each start. The live file is not chunked, and every sample is brought to disk with one sync
 before its offset is published. The configuration, the model and the state of the compensation travel in each file as
-attachments. A hash chain runs over everything (`compensator.chain`) and from file to file; where a key is configured
-it is signed every hour and at the end. A finished file is rewritten compact by `compensator.service.finishing`.
+attachments. A hash chain runs over everything (`recording/chain.py`) and from file to file; where a key is configured
+it is signed every hour and at the end. A finished file is rewritten compact by `recording/finishing.py`.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from typing import Any
 
 import mcap
 
-from compensator import __version__, chain
+from compensator import __version__
 from compensator.clock import NS
-from compensator.container import Attachment, Channel, Contents
-from compensator.durable import LiveFile, sync_folder
 from compensator.messages import MESSAGES, encode, shipped_schema
-from compensator.recording import end_of_chain, recordings
-from compensator.service.finishing import Finisher, Retention
-from compensator.signature import Signer
+from compensator.recording import chain
+from compensator.recording.container import Attachment, Channel, Contents
+from compensator.recording.finishing import Finisher, Retention
+from compensator.recording.live_file import LiveFile, sync_folder
+from compensator.recording.reading import end_of_chain, recordings
+from compensator.recording.signature import Signer
 
 #: Topics of a recording; `chain` and `seal` come from the recorder itself.
 TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
@@ -50,9 +51,14 @@ class Recorder:
     """
 
     def __init__(
-        self, folder: Path, machine: str, attachments: dict[str, bytes], *, retention: Retention | None = None,
+        self,
+        folder: Path,
+        machine: str,
+        attachments: dict[str, bytes],
+        *,
+        retention: Retention | None = None,
         signer: Signer | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._folder = folder
         self._machine = machine
         self.attachments = attachments
@@ -180,8 +186,9 @@ class Recorder:
             "previous_file": previous[-1].name if previous else "",
             "previous_chain": before.hex(),
         }
-        attachments = [_attached(name, "application/toml", data, time_utc_ns)
-                       for name, data in self.attachments.items()]  # fmt: skip
+        attachments = [
+            _attached(name, "application/toml", data, time_utc_ns) for name, data in self.attachments.items()
+        ]
         if state:
             attachments.append(_attached("state.json", "application/json", state, time_utc_ns))
         live.begin(metadata, attachments)

@@ -5,28 +5,36 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Indices, Mask, Vector
+from compensator.data.record import SHORT_GAP_SAMPLES, Data, Record
 from compensator.errors import DataError, UsageError
 from compensator.messages import Sample, number
 from compensator.reasons import Caution
-from compensator.recording import decode, read_messages
-
-Vector = npt.NDArray[np.float64]
+from compensator.recording.reading import decode, read_messages
 
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
-#: A gap of up to this many model samples stays inside a record; the engine bridges it.
-SHORT_GAP_SAMPLES = 60
-
 
 #: What stands in an exported recording beside what was measured.
-EXPORTED = ("seq", "heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um", "y_offset_um",
-            "y_offset_rate_um_per_min", "y_offset_std_um", "state", "reasons")  # fmt: skip
+EXPORTED = (
+    "seq",
+    "heat_w",
+    "y_dtf_um",
+    "y_tdtf_um",
+    "y_pred_um",
+    "y_std_um",
+    "residual_um",
+    "y_offset_um",
+    "y_offset_rate_um_per_min",
+    "y_offset_std_um",
+    "state",
+    "reasons",
+)
 
 #: How files begin that somebody may take for a table, and what to do with them.
 _OTHER_FILES = (
@@ -42,38 +50,6 @@ _OTHER_FILES = (
 LARGEST = 1e30
 #: Longest table, in samples of the model: eleven years of minutes.
 MOST_SAMPLES = 6_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """A measured run at the model's sample period.
-
-    Parameters
-    ----------
-    t_s : numpy.ndarray, shape (n,)
-        Time of each sample from the start of the data, s, evenly spaced.
-    columns : dict of str to numpy.ndarray, shape (n,)
-        Channels by name; NaN where missing.
-    """
-
-    t_s: Vector
-    columns: dict[str, Vector]
-
-
-@dataclass(frozen=True, slots=True)
-class Data:
-    """What a DATA argument holds.
-
-    Parameters
-    ----------
-    records : tuple of Record
-        In order of time; a long gap starts a new one.
-    remarks : tuple of Caution
-        What had to be put right: gaps, rows out of order.
-    """
-
-    records: tuple[Record, ...]
-    remarks: tuple[Caution, ...]
 
 
 def load_data(path: Path, period_s: float, roles: Mapping[str, str] | None = None) -> Data:
@@ -248,10 +224,12 @@ def _read_mcap(path: Path) -> tuple[Vector, dict[str, Vector]]:
         sample = decode(record, path)
         assert isinstance(sample, Sample)
         times.append(sample.time_utc_ns)
-        rows.append({
-            name: number(channel.mean) if channel.quality == "good" else math.nan
-            for name, channel in sample.channels.items()
-        })  # fmt: skip
+        rows.append(
+            {
+                name: number(channel.mean) if channel.quality == "good" else math.nan
+                for name, channel in sample.channels.items()
+            }
+        )
     if not rows:
         raise DataError(f"{path}: no samples in it")
     names = dict.fromkeys(name for row in rows for name in row)
@@ -328,7 +306,7 @@ def _spacing(t_s: Vector) -> float:
     return float(np.median(steps)) * (1 + 1e-9) if steps.size else math.inf
 
 
-def _mean_by_slot(slot: npt.NDArray[np.int_], values: Vector, n: int) -> Vector:
+def _mean_by_slot(slot: Indices, values: Vector, n: int) -> Vector:
     good = ~np.isnan(values)
     total = np.bincount(slot[good], weights=values[good], minlength=n)
     count = np.bincount(slot[good], minlength=n)
@@ -337,21 +315,6 @@ def _mean_by_slot(slot: npt.NDArray[np.int_], values: Vector, n: int) -> Vector:
     return mean
 
 
-def _gaps(present: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _gaps(present: Mask) -> list[tuple[int, int]]:
     edges = np.diff(np.concatenate(([1], present.astype(int), [1])))
     return list(zip(np.flatnonzero(edges == -1).tolist(), np.flatnonzero(edges == 1).tolist(), strict=True))
-
-
-def require(path: Path, record: Record, names: Sequence[str]) -> None:
-    """Refuse a record that lacks a column.
-
-    Raises
-    ------
-    DataError
-        Naming file and column.
-    """
-    for name in names:
-        if name not in record.columns:
-            raise DataError(
-                f"{path}: no column {name}; it has: {', '.join(record.columns)}. Name it with --column {name}=NAME"
-            )

@@ -6,12 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Mask, Vector
+from compensator.data.record import SHORT_GAP_SAMPLES, Record
 from compensator.reasons import Caution
-from compensator.tables import SHORT_GAP_SAMPLES, Record
-
-Vector = npt.NDArray[np.float64]
 
 #: A single reading further from the median of its neighbours than this many noise deviations is wild.
 WILD_DEVIATIONS = 12.0
@@ -95,10 +93,15 @@ def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:
     rest = _rest_length((difference, at), heat)
     reference = float(np.mean(t_q[:rest])), float(np.mean(at[:rest]))
     return Run(
-        name=name, t_s=t_s, difference_k=difference - (reference[0] - reference[1]), ambient_k=at - reference[1],
-        y_um=columns["y_um"] if "y_um" in columns else np.full(t_s.size, np.nan), heat_w=heat, reference=reference,
+        name=name,
+        t_s=t_s,
+        difference_k=difference - (reference[0] - reference[1]),
+        ambient_k=at - reference[1],
+        y_um=columns["y_um"] if "y_um" in columns else np.full(t_s.size, np.nan),
+        heat_w=heat,
+        reference=reference,
         channels={c: v for c, v in columns.items() if c not in ("t_q_degc", "at_degc", "y_um", "heat_w")},
-    )  # fmt: skip
+    )
 
 
 def _rest_length(temperatures: Sequence[Vector], heat: Vector | None) -> int:
@@ -118,7 +121,7 @@ def _rest_length(temperatures: Sequence[Vector], heat: Vector | None) -> int:
     return max(1, int(np.argmax(moved)) if moved.any() else size)
 
 
-def _stretches(missing: npt.NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+def _stretches(missing: Mask) -> Iterator[tuple[int, int]]:
     """Yield the stretches between long gaps; ends that are missing are cut off."""
     present = np.flatnonzero(~missing)
     if present.size == 0:

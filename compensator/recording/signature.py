@@ -7,9 +7,9 @@ from typing import Any
 
 import msgspec
 
-from compensator.chain import signed_bytes
 from compensator.errors import ConfigError, UsageError
 from compensator.messages import Seal
+from compensator.recording.chain import signed_bytes
 
 _MISSING = "signatures need the package cryptography: pip install quill-compensator[sign]"
 

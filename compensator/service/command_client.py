@@ -79,8 +79,10 @@ def operator_here(settings: Zenoh) -> Operator | None:
         If that takes an operator's certificate: the machine's own gives no commands.
     """
     if settings.secured():
-        raise UsageError("--zenoh: missing; over TLS commands take an operator's certificate, expected a Zenoh "
-                         "configuration such as operator.json5")  # fmt: skip
+        raise UsageError(
+            "--zenoh: missing; over TLS commands take an operator's certificate, expected a Zenoh "
+            "configuration such as operator.json5"
+        )
     listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
     endpoints = [endpoint for endpoint in listened if not endpoint.endswith(":0")] + settings.connect
     if not endpoints:
@@ -151,8 +153,10 @@ def ask(
     except (zenoh.ZError, ValueError) as error:
         raise NotReached(f"{nobody}: nobody answers at {where}; does the service, or its router, run?") from error
     if settings.prefix in alive:
-        raise ServiceError(f"{key}: the service is alive and gives no answer: does the router's access list permit "
-                           f"{operator.name or 'this'}?")  # fmt: skip
+        raise ServiceError(
+            f"{key}: the service is alive and gives no answer: does the router's access list permit "
+            f"{operator.name or 'this'}?"
+        )
     there = f"alive there: {', '.join(sorted(alive))}" if alive else "none is alive there"
     raise NotReached(f"{nobody}: none of that prefix at {where}; {there}")
 

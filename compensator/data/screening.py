@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from compensator.arrays import Vector
+from compensator.data.runs import Run, noise_std
 from compensator.errors import DataError
-from compensator.identify.runs import Run, noise_std
-
-Vector = npt.NDArray[np.float64]
 
 #: Shortest data that is fitted at all, min.
 SHORTEST_MIN = 120.0
@@ -119,8 +117,10 @@ def check_scale(name: str, column: str, values: Vector) -> None:
         raise DataError(f"{name}: {column} runs from {known.min():.1f} to {known.max():.1f}: kelvin? expected °C")
     if known.size and known.min() < POSSIBLE_DEGC[0]:
         count = int(np.sum(known < POSSIBLE_DEGC[0]))
-        raise DataError(f"{name}: {column} = {known.min():g}, {count} sample(s) like it: a fault's code? expected °C, "
-                        "and an empty cell where a value is missing")  # fmt: skip
+        raise DataError(
+            f"{name}: {column} = {known.min():g}, {count} sample(s) like it: a fault's code? expected °C, "
+            "and an empty cell where a value is missing"
+        )
 
 
 def _check_possible(run: Run, column: str, values: Vector) -> None:
@@ -181,8 +181,10 @@ def _check_temperature(name: str, column: str, values: Vector, *, still: bool) -
     if air and 0.0 < np.ptp(values) < 0.2 and abs(middle) < 0.2:
         raise DataError(f"{name}: {column} is {middle:.4g} in the middle: thousands of degrees? expected °C")
     if not MACHINE_DEGC[0] <= middle <= MACHINE_DEGC[1]:
-        raise DataError(f"{name}: {column} is {middle:.1f} in the middle, expected °C from {MACHINE_DEGC[0]:g} to "
-                        f"{MACHINE_DEGC[1]:g}")  # fmt: skip
+        raise DataError(
+            f"{name}: {column} is {middle:.1f} in the middle, expected °C from {MACHINE_DEGC[0]:g} to "
+            f"{MACHINE_DEGC[1]:g}"
+        )
 
 
 def _check_pair(name: str, t_q: Vector, at: Vector) -> None:
@@ -194,8 +196,10 @@ def _check_pair(name: str, t_q: Vector, at: Vector) -> None:
             f"{name}: t_q_degc never comes closer than {coldest:.0f} K to at_degc: t_q_degc in °F? expected °C"
         )
     if abs(float(np.median(t_q))) < 0.2 and abs(float(np.median(at))) > 2.0:
-        raise DataError(f"{name}: t_q_degc is {np.median(t_q):.4g} in the middle, at_degc {np.median(at):.4g}: "
-                        "thousands of degrees? expected °C")  # fmt: skip
+        raise DataError(
+            f"{name}: t_q_degc is {np.median(t_q):.4g} in the middle, at_degc {np.median(at):.4g}: "
+            "thousands of degrees? expected °C"
+        )
     if np.allclose(t_q, at):
         raise DataError(f"{name}: t_q_degc and at_degc are the same in every row, expected two sensors")
 
@@ -215,8 +219,10 @@ def _check_deformation(name: str, y: Vector) -> None:
     if spread > high:
         raise DataError(f"{name}: y_um moves by {spread:.4g} in all: nanometres? expected µm, at most {high:g} of them")
     if float(np.std(known)) < NOISE_ALONE * noise_std(known):
-        raise DataError(f"{name}: y_um moves by {spread:.3g} µm and its noise alone is {noise_std(known):.2g} µm: "
-                        "no deformation in it to make a model from")  # fmt: skip
+        raise DataError(
+            f"{name}: y_um moves by {spread:.3g} µm and its noise alone is {noise_std(known):.2g} µm: "
+            "no deformation in it to make a model from"
+        )
 
 
 def _check_heat(name: str, runs: Sequence[Run]) -> None:
@@ -230,14 +236,22 @@ def _check_heat(name: str, runs: Sequence[Run]) -> None:
     ratio = float(np.ptp(difference) / np.ptp(heat))
     low, high = HEAT_K_PER_W
     if ratio > high:
-        raise DataError(f"{name}: heat_w spans {np.ptp(heat):.3g} while T_Q - AT spans {np.ptp(difference):.3g} K: "
-                        "kilowatts? expected W")  # fmt: skip
+        raise DataError(
+            f"{name}: heat_w spans {np.ptp(heat):.3g} while T_Q - AT spans {np.ptp(difference):.3g} K: "
+            "kilowatts? expected W"
+        )
     if ratio < low:
-        raise DataError(f"{name}: heat_w spans {np.ptp(heat):.4g} while T_Q - AT spans {np.ptp(difference):.3g} K: "
-                        "milliwatts? expected W")  # fmt: skip
+        raise DataError(
+            f"{name}: heat_w spans {np.ptp(heat):.4g} while T_Q - AT spans {np.ptp(difference):.3g} K: "
+            "milliwatts? expected W"
+        )
     if np.ptp(difference) > 0.0 and float(np.corrcoef(difference, heat)[0, 1]) < EXCHANGED_CORRELATION:
-        raise DataError(f"{name}: T_Q - AT falls while heat_w rises: T_Q and AT exchanged? expected T_Q near the heat "
-                        "source; --column t_q_degc=at_degc --column at_degc=t_q_degc exchanges them")  # fmt: skip
+        raise DataError(
+            f"{name}: T_Q - AT falls while heat_w rises: T_Q and AT exchanged? expected T_Q near the heat "
+            "source; --column t_q_degc=at_degc --column at_degc=t_q_degc exchanges them"
+        )
     if float(np.std(difference)) < NOISE_ALONE * noise_std(difference):
-        raise DataError(f"{name}: T_Q - AT moves by {np.ptp(difference):.2g} K while the heat changes by "
-                        f"{np.ptp(heat):.3g} W: is t_q_degc near the heat source?")  # fmt: skip
+        raise DataError(
+            f"{name}: T_Q - AT moves by {np.ptp(difference):.2g} K while the heat changes by "
+            f"{np.ptp(heat):.3g} W: is t_q_degc near the heat source?"
+        )

@@ -1,0 +1,17 @@
+"""Array types that signatures share."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+#: One number for each sample or parameter, shape (n,).
+Vector = npt.NDArray[np.float64]
+#: Rows and columns of numbers, shape (n, m).
+Matrix = npt.NDArray[np.float64]
+#: Which samples take part, shape (n,).
+Mask = npt.NDArray[np.bool_]
+#: Indices of samples, shape (n,).
+Indices = npt.NDArray[np.int_]
+#: Poles and zeros, shape (n,).
+ComplexVector = npt.NDArray[np.complex128]

@@ -1,0 +1,1 @@
+"""Data: tables, records and runs, and what is refused."""

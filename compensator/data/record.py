@@ -1,0 +1,61 @@
+"""Measured data at the model's sample period."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from compensator.arrays import Vector
+from compensator.errors import DataError
+from compensator.reasons import Caution
+
+#: A gap of up to this many model samples stays inside a record; the engine bridges it.
+SHORT_GAP_SAMPLES = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A measured run at the model's sample period.
+
+    Parameters
+    ----------
+    t_s : numpy.ndarray, shape (n,)
+        Time of each sample from the start of the data, s, evenly spaced.
+    columns : dict of str to numpy.ndarray, shape (n,)
+        Channels by name; NaN where missing.
+    """
+
+    t_s: Vector
+    columns: dict[str, Vector]
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """What a DATA argument holds.
+
+    Parameters
+    ----------
+    records : tuple of Record
+        In order of time; a long gap starts a new one.
+    remarks : tuple of Caution
+        What had to be put right: gaps, rows out of order.
+    """
+
+    records: tuple[Record, ...]
+    remarks: tuple[Caution, ...]
+
+
+def require(path: Path, record: Record, names: Sequence[str]) -> None:
+    """Refuse a record that lacks a column.
+
+    Raises
+    ------
+    DataError
+        Naming file and column.
+    """
+    for name in names:
+        if name not in record.columns:
+            raise DataError(
+                f"{path}: no column {name}; it has: {', '.join(record.columns)}. Name it with --column {name}=NAME"
+            )
