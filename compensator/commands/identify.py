@@ -175,9 +175,7 @@ def write(
 def finished(calibration: Calibration, criticism: Criticism) -> ThermalModel:
     """Return the model with what was found about it in its provenance."""
     found = figures(calibration, criticism)
-    kept = {
-        key: found[key] for key in ("method", "parts", "folds_rms_um", "warnings", "remarks", "ttf") if key in found
-    }
+    kept = {key: found[key] for key in ("method", "parts", "warnings", "remarks", "ttf") if key in found}
     return dataclasses.replace(calibration.model, provenance=dict(calibration.model.provenance) | kept)
 
 

@@ -38,8 +38,7 @@ FAR_OFF = 0.1
 
 def is_far_off(model: ThermalModel, evidence: Evidence) -> bool:
     """Tell whether the calibration itself says that the model misses much of the deformation."""
-    folds = model.provenance.get("folds_rms_um")
-    return isinstance(folds, float) and folds > FAR_OFF * evidence.spread_um
+    return model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um
 
 
 def diagnose_anew(model: ThermalModel, evidence: Evidence, progress: Progress, executor_map: ExecutorMap) -> Diagnosis:
@@ -143,7 +142,7 @@ def _extended(model: ThermalModel, whole: Refit, effects: tuple[Effect, ...]) ->
         effects=(*model.effects, *(table_of(effect) for effect in effects)),
         y_std_um=error,
         alternatives={},
-        provenance={**model.provenance, "folds_rms_um": error},
+        held_out_rms_um=error,
         sha256="",
     )
 

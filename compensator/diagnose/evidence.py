@@ -20,7 +20,7 @@ from compensator.arrays import Mask, Matrix, Vector
 from compensator.data.runs import Run, noise_std
 from compensator.errors import DataError
 from compensator.identify.output_error import low_frequency_ratio
-from compensator.model.effects.hypothesis import Setting, RecordSignals
+from compensator.model.effects.hypothesis import RecordSignals, Setting
 from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
@@ -218,8 +218,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         names = ", ".join(dict.fromkeys(run.name for run in runs))
         raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
     noise_um = noise_floor(model, runs)
-    folds = model.provenance.get("folds_rms_um", 0.0)
-    own = float(np.sqrt(max(float(folds) ** 2 - noise_um**2, 0.0))) if isinstance(folds, float) else 0.0
+    own = float(np.sqrt(max((model.held_out_rms_um or 0.0) ** 2 - noise_um**2, 0.0)))
     # A calibration that misses by more than this has not merely an error of its own, it lacks something.
     own = min(own, OWN_SHARE * float(np.nanstd(_measured(runs))))
     return gathered(runs, waves, residual, used, _setting(model, runs, waves), noise_um=noise_um, own_error_um=own)
@@ -302,7 +301,7 @@ def _setting(model: ThermalModel, runs: Sequence[Run], waves: Sequence[RecordSig
         },
         spans=moving,
         zeroed=frozenset(zeroed),
-        rough="folds_rms_um" in model.provenance,
+        rough=model.held_out_rms_um is not None,
         functions={name: (path.sampled.b, path.sampled.a) for name, path in paths.items() if path is not None},
     )
 

@@ -197,6 +197,7 @@ def calibrate(
         estimator=_estimator(runs, drives, noise, kind),
         validity=_validity(runs, used, kind),
         y_std_um=float(np.sqrt(max(chosen.rms**2 - noise["y_um"] ** 2, (0.3 * noise["y_um"]) ** 2))),
+        held_out_rms_um=chosen.rms,
         provenance=dict(provenance or {}),
     )
     fixed = (temperature.remark,) if temperature and temperature.remark else ()

@@ -182,7 +182,7 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
         estimator=_estimator(table.get("estimator"), kind),
         inputs=top.text("inputs", ("changes", "absolute"), "changes"),  # type: ignore[arg-type]
         validity=_validity(table.get("validity", {})),
-        y_std_um=_uncertainty(table.get("uncertainty", {"y_std_um": 0.0})),
+        **_uncertainty(table),
         effects=_effects(table.get("effect", [])),
         alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
         provenance=dict(_Table("provenance", table.get("provenance", {})).table),
@@ -227,8 +227,16 @@ def _estimator(value: object, kind: str) -> Estimator:
     )
 
 
-def _uncertainty(value: object) -> float:
-    return _Table("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0)
+def _uncertainty(top: Mapping[str, Any]) -> dict[str, float]:
+    table = _Table("uncertainty", top.get("uncertainty", {"y_std_um": 0.0}), ("y_std_um", "held_out_rms_um"))
+    found = {"y_std_um": table.number("y_std_um", low=0.0)}
+    # Version 0.1.0 wrote this figure into the provenance.
+    before = top.get("provenance", {})
+    if "held_out_rms_um" in table.table:
+        found["held_out_rms_um"] = table.number("held_out_rms_um", low=0.0)
+    elif isinstance(before, Mapping) and isinstance(before.get("folds_rms_um"), float):
+        found["held_out_rms_um"] = before["folds_rms_um"]
+    return found
 
 
 def _validity(value: object) -> dict[str, tuple[float, float]]:

@@ -117,6 +117,9 @@ def _lines(model: ThermalModel) -> Iterator[str]:
         yield from ("[validity]", *_pairs("validity", {key: list(bounds) for key, bounds in model.validity.items()}))
     yield from ("", "# Standard deviation of the model's own error in y, um.", "[uncertainty]")
     yield from _pairs("uncertainty", {"y_std_um": model.y_std_um})
+    if model.held_out_rms_um is not None:
+        yield "# Free-run error of the calibration on held-out data, um."
+        yield from _pairs("uncertainty", {"held_out_rms_um": model.held_out_rms_um})
     for number, effect in enumerate(model.effects, start=1):
         yield from _effect(f"effect {number}", effect)
     if model.provenance:

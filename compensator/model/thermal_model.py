@@ -144,6 +144,8 @@ class ThermalModel:
         Range of `t_q_degc`, `at_degc`, `heat_w`, … on which the model was made.
     y_std_um : float
         Standard deviation of the model's own error in y, µm, over and above sensor noise.
+    held_out_rms_um : float, optional
+        Free-run error of the calibration on held-out data, µm; None for a model that no calibration on a machine made.
     effects : tuple of EffectTable
         Effects added to the base.
     alternatives : mapping of str to (str, Path)
@@ -164,6 +166,7 @@ class ThermalModel:
     inputs: Literal["changes", "absolute"] = "changes"
     validity: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     y_std_um: float = 0.0
+    held_out_rms_um: float | None = None
     effects: tuple[EffectTable, ...] = ()
     alternatives: Mapping[str, tuple[str, Path]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -17,8 +17,8 @@ from compensator.model.effects.base import Effect, Signals, register
 from compensator.model.effects.hypothesis import (
     Free,
     Hypothesis,
-    Setting,
     RecordSignals,
+    Setting,
     late,
     lowpass,
     proposes,

@@ -22,8 +22,8 @@ from compensator.model.effects.base import Effect, Signals, register
 from compensator.model.effects.hypothesis import (
     ROW_RIDGE,
     Hypothesis,
-    Setting,
     RecordSignals,
+    Setting,
     lowpass,
     proposes,
     row,

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import Hypothesis, Setting, RecordSignals, proposes, shown
+from compensator.model.effects.hypothesis import Hypothesis, RecordSignals, Setting, proposes, shown
 from compensator.model.effects.table import Table
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import Free, Hypothesis, Setting, RecordSignals, proposes, shown
+from compensator.model.effects.hypothesis import Free, Hypothesis, RecordSignals, Setting, proposes, shown
 from compensator.model.effects.table import Table
 
 FORMS = ("play", "stick")

@@ -16,7 +16,7 @@ import numpy as np
 
 from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import Hypothesis, Setting, RecordSignals, proposes, shown
+from compensator.model.effects.hypothesis import Hypothesis, RecordSignals, Setting, proposes, shown
 from compensator.model.effects.stream import Function
 from compensator.model.effects.table import Table
 from compensator.model.transfer_function import SampledTransferFunction

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from compensator.arrays import Matrix, Vector
-from compensator.model.effects.hypothesis import Free, Hypothesis, Setting, RecordSignals, proposes, shown
+from compensator.model.effects.hypothesis import Free, Hypothesis, RecordSignals, Setting, proposes, shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
