@@ -1,0 +1,120 @@
+"""What version 0.1.0 recorded audits clean, and what its commands gave comes out again.
+
+Only the command line and files, so that nothing that is moved about inside matters here.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.reference import kept
+
+EXPECTED: dict[str, Any] = json.loads((kept.KEPT / "expected.json").read_text(encoding="utf-8"))
+#: Relative: of what follows from the numbers alone, and of what is fitted.
+SAME, FITTED = 1e-9, 1e-6
+#: Rows of `simulate` are rounded to so much.
+ROUNDED = 2e-9
+
+
+def check(wanted: Any, found: Any, rel: float = 0.0) -> None:
+    differences = kept.differences(wanted, found, rel)
+    assert not differences, "\n".join(differences[:20])
+
+
+def check_columns(wanted: dict[str, Any], found: dict[str, Any], rel: float) -> None:
+    """Compare tables; columns may have come."""
+    for name, column in wanted.items():
+        assert name in found, name
+        there = found[name]
+        assert (there["rows"], there["known"]) == (column["rows"], column["known"]), name
+        tolerance = rel * (column["rms"] or 0.0) + ROUNDED
+        for a, b in zip([column["rms"], *column["sampled"]], [there["rms"], *there["sampled"]], strict=True):
+            assert a == b or (a is not None and b is not None and abs(a - b) <= tolerance), (name, a, b)
+
+
+# ---------------------------------------------------------------------- recordings
+
+
+@pytest.mark.parametrize("scene", EXPECTED["recordings"])
+def test_a_recording_audits_clean(scene: str) -> None:
+    wanted = EXPECTED["recordings"][scene]
+    folder = kept.KEPT / "recordings" / scene
+    check(wanted["said"], kept.said(folder).as_json())
+    found = kept.replay(folder)
+    assert found["exit"] == 0
+    check(wanted["replay"], found)
+
+
+@pytest.mark.parametrize("key", EXPECTED["keys"])
+def test_signatures(key: str) -> None:
+    wanted = EXPECTED["keys"][key]
+    public = kept.KEPT / "keys" / f"{wanted['key']}.pub.pem"
+    check(wanted["replay"], kept.replay(kept.KEPT / "recordings" / wanted["scene"], "--public-key", public))
+
+
+@pytest.mark.parametrize("name", EXPECTED["tampered"])
+def test_what_was_changed_is_found_as_before(name: str, tmp_path: Path) -> None:
+    with kept.tampered(name, tmp_path) as folder:
+        check(EXPECTED["tampered"][name], kept.replay(folder))
+
+
+@pytest.mark.parametrize("name", EXPECTED["compare"])
+def test_another_model_over_a_recording(name: str, tmp_path: Path) -> None:
+    wanted, found = EXPECTED["compare"][name], kept.compared(name, tmp_path / "c.csv")
+    assert found["exit"] == wanted["exit"]
+    check(wanted["result"], found["result"], SAME)
+    check_columns(wanted["columns"], found["columns"], SAME)
+
+
+@pytest.mark.parametrize("scene", EXPECTED["export"])
+def test_export(scene: str, tmp_path: Path) -> None:
+    check(EXPECTED["export"][scene], kept.exported(scene, tmp_path / "e.csv"))
+
+
+def test_every_code_that_was_published_is_explained() -> None:
+    codes = {code for wanted in EXPECTED["recordings"].values() for code in wanted["said"]["states"]}
+    codes |= {code for wanted in EXPECTED["recordings"].values() for code in wanted["said"]["reasons"]}
+    codes |= {c for wanted in EXPECTED["recordings"].values() for c in wanted["replay"]["result"]["remark_codes"]}
+    assert len(codes) > 20
+    for code in sorted(codes):
+        assert kept.call("explain", code)[0] == 0, code
+
+
+# ---------------------------------------------------------------------- tables
+
+
+@pytest.mark.parametrize("name", EXPECTED["simulate"])
+def test_simulate(name: str, tmp_path: Path) -> None:
+    """Also with every model file that version 0.1.0 wrote."""
+    wanted, found = EXPECTED["simulate"][name], kept.simulated(name, tmp_path / "s.csv")
+    assert found["exit"] == wanted["exit"] == 0
+    check(wanted["result"], found["result"], SAME)
+    check_columns(wanted["columns"], found["columns"], SAME)
+
+
+@pytest.mark.parametrize("name", EXPECTED["identify"])
+def test_identify(name: str, tmp_path: Path) -> None:
+    wanted = EXPECTED["identify"][name]
+    code, result = kept.identified(name, tmp_path / "model.toml")
+    assert code == wanted["exit"] == 0
+    check(wanted["result"], result, FITTED)
+    check(kept.model_table(kept.KEPT / "identify" / f"{name}.toml"), kept.model_table(tmp_path / "model.toml"), FITTED)
+
+
+@pytest.mark.parametrize("name", EXPECTED["diagnose"])
+def test_diagnose(name: str, tmp_path: Path) -> None:
+    """From the published model, from one that version 0.1.0 identified, and over one of its recordings."""
+    wanted = EXPECTED["diagnose"][name]
+    code, result = kept.diagnosed(name, tmp_path)
+    assert code == wanted["exit"] == 0
+    check(wanted["result"], result, FITTED)
+    before, now = (
+        json.loads(path.read_text(encoding="utf-8"))
+        for path in (kept.KEPT / "diagnose" / f"{name}.json", tmp_path / "diagnosis.json")
+    )
+    check(kept.bare(before), kept.bare(now), FITTED)
+    check(kept.model_table(kept.KEPT / "diagnose" / f"{name}.toml"), kept.model_table(tmp_path / "model.toml"), FITTED)
