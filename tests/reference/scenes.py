@@ -7,11 +7,11 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from compensator.signature import Signer
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from compensator.recording import recordings
-from compensator.signature import Signer
 from drivers.errors import DeviceTimeout
 from drivers.reading import Reading
 from tests.reference.machine import MACHINE, START_NS, Machine, checked, disk
