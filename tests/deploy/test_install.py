@@ -47,7 +47,7 @@ def test_the_wheel_holds_all_that_is_used_and_nothing_else(wheel: Path) -> None:
     for folder in ("systemd", "zenoh", "receiver"):
         there = {path.name for path in (ROOT / "deploy" / folder).iterdir() if path.is_file()}
         assert {f"{folder}/{name}" for name in there} == {name for name in shipped if name.startswith(f"{folder}/")}
-    assert {"install.py", "README.md", "machine.example.toml"} <= shipped
+    assert {"install.py", "README.md", "OPERATING.md", "machine.example.toml"} <= shipped
     assert not [name for name in shipped if "__pycache__" in name or name.endswith(".pyc")]
     # What the installer puts into the system comes out of the wheel.
     assert set(install.SYSTEM_FILES | install.JOURNAL_LIMITS) <= shipped

@@ -31,9 +31,9 @@ CLASSES = {"Settings": Settings(), "Drift": Drift, "Hypothesis": Hypothesis, "Un
 def constant(room: str, holder: str, name: str) -> Any:
     if holder in CLASSES:
         return getattr(CLASSES[holder], name)
-    for place in (f"compensator.{room}.{holder}", f"compensator.{room}.effects.{holder}", f"compensator.{holder}"):
+    for place in (room, f"{room}.effects", "data", "recording", ""):
         try:
-            return getattr(importlib.import_module(place), name)
+            return getattr(importlib.import_module(".".join(filter(None, ("compensator", place, holder)))), name)
         except ModuleNotFoundError:
             continue
     raise AssertionError(f"no module {holder}")
