@@ -1,4 +1,4 @@
-"""The commissioning guide and the operator's page: their commands, the table of codes (`python -m tests.deploy.guide`)."""
+"""The pages of deploy that have commands; their table of codes (`python -m tests.deploy.guide` renews it)."""
 
 from __future__ import annotations
 

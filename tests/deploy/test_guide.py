@@ -1,4 +1,4 @@
-"""Commissioning guide and operator's page: their commands exist, the tables match the code, the links lead somewhere."""
+"""Commissioning guide and operator's page: commands exist, tables match the code, links lead somewhere."""
 
 from __future__ import annotations
 

@@ -140,7 +140,7 @@ def test_installed_killed_stuck_stopped_and_removed(
 
     # A second time, as an upgrade: nothing is built anew, a running service is restarted and becomes ready.
     said = installer("install", "--wheel", str(wheel), "--no-deps")
-    assert "is there already" in said and f"restarted {UNIT}" in said
+    assert "installed already" in said and f"restarted {UNIT}" in said
     compensates()
 
     # The journal's fields.
