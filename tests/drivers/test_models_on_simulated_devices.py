@@ -32,11 +32,11 @@ def sources(values: dict[int, float]) -> dict[int, Any]:
 
 
 def icp(model: str, **more: Any) -> IcpDas:
-    return IcpDas(model, sources=sources(TEMPERATURES), couples="K", **more)
+    return IcpDas(model, sources=sources(TEMPERATURES), ranges="K", **more)
 
 
 def adam(model: str) -> Adam:
-    return Adam(model, sources=sources(TEMPERATURES), couples="K")
+    return Adam(model, sources=sources(TEMPERATURES), ranges="K")
 
 
 COUPLES = {"inputs": [{"input": 0, "couple": "K"}, {"input": 3, "couple": "K"}]}

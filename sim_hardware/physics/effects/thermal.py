@@ -19,7 +19,7 @@ def _spread(heat_w: Array, nodes: tuple[int, ...] | list[int], watts: float) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoolantJacket(Effect):
-    """Coolant flows through a jacket and draws a place towards its own temperature, always.
+    """Coolant flows through a jacket and pulls a place towards its own temperature.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class CoolantJacket(Effect):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BearingFriction(Effect):
-    """The spindle's bearing heats the nose, where T_Q hardly feels it.
+    """The spindle's bearing heats the nose, far from T_Q.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class FanOnFilm(Effect):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WetGuide(Effect):
-    """Coolant on wets the gap between quill and headstock and bridges it: the heat leaves another way.
+    """Flowing coolant wets the gap between quill and headstock and bridges it: the heat leaves by another path.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class WetGuide(Effect):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SecondMass(Effect):
-    """A further mass hangs on the housing, warms slowly and moves the tool: a mode that the model misses.
+    """A further mass on the housing warms slowly and moves the tool: a mode that the model lacks.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ class HiddenSource(Effect):
     heat_w : float
         Heat while it is on, W.
     switch_s : tuple of float
-        Times at which it goes on, off, on …, s.
+        Times at which it is switched on, off, on …, s.
     place : str
         Where it sits: ``"nose"``, ``"housing"``, ``"front"``, ``"rear"``, ``"base"``.
     """
