@@ -23,131 +23,76 @@ log = logging.getLogger("compensator")
 
 
 class Command(NamedTuple):
-    """A command.
+    """A command; its arguments are described by the function of its name in `commands.arguments`.
 
     Parameters
     ----------
     name, text, example : str
         Its name, one line for the help, and an example.
-    describe : callable
-        Adds its arguments to a parser.
     place : str
-        Module and function that run it, loaded when it is called; `run` of the module of its name where none is given.
-        The function takes the arguments and returns an `Answer`, or None where there is nothing to print.
+        Module of the package, and function, that run it; by default `run` in the module of its name in `commands`.
+        The module is loaded when the command is called; the function takes the arguments and returns an `Answer`, or
+        None where there is nothing to print.
     """
 
     name: str
     text: str
     example: str
-    describe: Callable[[argparse.ArgumentParser], None]
     place: str = ""
+
+    def describe(self, parser: argparse.ArgumentParser) -> None:
+        """Add its arguments to a parser."""
+        getattr(arguments, self.name)(parser)
 
 
 #: The commands by the user who needs them.
-USERS: dict[str, tuple[Command, ...]] = {
-    "to try it": (
-        Command(
-            "demo",
-            "the whole loop on simulated hardware",
-            "demo --out demo-out",
-            arguments.demo,
-            "compensator.demo.command:run",
-        ),
-    ),
+USERS = {
+    "to try it": (Command("demo", "the whole loop on simulated hardware", "demo --out demo-out", "demo.command:run"),),
     "calibration engineer": (
-        Command(
-            "identify",
-            "a model from measured runs",
-            "identify run.csv --validate other.csv --out model.toml",
-            arguments.identify,
-        ),
-        Command(
-            "simulate",
-            "run a model over measured data",
-            "simulate run.csv --model quill --out predicted.csv",
-            arguments.simulate,
-        ),
+        Command("identify", "a model from measured runs", "identify run.csv --validate other.csv --out model.toml"),
+        Command("simulate", "run a model over measured data", "simulate run.csv --model quill --out predicted.csv"),
         Command(
             "diagnose",
             "what a model lacks, from measured data",
             "diagnose day.mcap --model model.toml --out diagnosis",
-            arguments.diagnose,
         ),
         Command(
             "adopt",
             "bring another model into the running service, without a jump",
             "adopt diagnosis/model.toml --config machine.toml",
-            arguments.adopt,
-            "compensator.commands.adopt:adopt",
+            "commands.adopt:adopt",
         ),
-        Command(
-            "back",
-            "return to the model before",
-            "back --config machine.toml",
-            arguments.back,
-            "compensator.commands.adopt:back",
-        ),
+        Command("back", "return to the model before", "back --config machine.toml", "commands.adopt:back"),
     ),
     "operator": (
-        Command(
-            "watch",
-            "live view of one machine or many",
-            "watch --connect tcp/127.0.0.1:7447 --prefix shop",
-            arguments.watch,
-        ),
-        Command("explain", "a state, reason or warning in words", "explain degraded", arguments.explain),
-        Command(
-            "zero",
-            "set the machine's present state as zero",
-            "zero --config machine.toml",
-            arguments.zero,
-            "compensator.commands.order:zero",
-        ),
-        Command(
-            "hold",
-            "freeze the offset",
-            "hold --config machine.toml",
-            arguments.order,
-            "compensator.commands.order:hold",
-        ),
+        Command("watch", "live view of one machine or many", "watch --connect tcp/127.0.0.1:7447 --prefix shop"),
+        Command("explain", "a state, reason or warning in words", "explain degraded"),
+        Command("zero", "set the machine's present state as zero", "zero --config machine.toml", "commands.order:zero"),
+        Command("hold", "freeze the offset", "hold --config machine.toml", "commands.order:hold"),
         Command(
             "resume",
             "let the offset follow again after hold",
             "resume --prefix shop/vmc-07 --zenoh operator.json5",
-            arguments.order,
-            "compensator.commands.order:resume",
+            "commands.order:resume",
         ),
-        Command("report", "a page of recordings, or of a folder with results", "report recordings/", arguments.report),
+        Command("report", "a page of recordings, or of a folder with results", "report recordings/"),
     ),
     "CNC integrator": (
-        Command(
-            "bridge",
-            "write the offset to a control that speaks OPC UA",
-            "bridge opcua --config bridge.toml",
-            arguments.bridge,
-        ),
-        Command(
-            "router",
-            "a Zenoh router, where no zenohd is installed",
-            "router --config router.json5",
-            arguments.router,
-        ),
+        Command("bridge", "write the offset to a control that speaks OPC UA", "bridge opcua --config bridge.toml"),
+        Command("router", "a Zenoh router, where no zenohd is installed", "router --config router.json5"),
     ),
     "auditor": (
         Command(
             "replay",
             "audit recordings: nothing was changed, every sample is reproduced",
             "replay recordings/*.mcap",
-            arguments.replay,
         ),
-        Command("export", "recordings as a table", "export day.mcap --out day.csv", arguments.export),
+        Command("export", "recordings as a table", "export day.mcap --out day.csv"),
     ),
     "at the machine": (
-        Command(
-            "check", "validate a configuration; opens nothing", "check --config machine.toml", arguments.of_service
-        ),
-        Command("probe", "one reading of every device", "probe --config machine.toml", arguments.of_service),
-        Command("run", "the service", "run --config machine.toml", arguments.of_service),
+        Command("check", "validate a configuration; opens nothing", "check --config machine.toml"),
+        Command("probe", "one reading of every device", "probe --config machine.toml"),
+        Command("run", "the service", "run --config machine.toml"),
     ),
 }
 COMMANDS = tuple(command for commands in USERS.values() for command in commands)
@@ -180,8 +125,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def load(command: Command) -> Callable[[argparse.Namespace], Answer | None]:
     """Import a command's module and return the function that runs it."""
-    module, _, function = (command.place or f"compensator.commands.{command.name}:run").partition(":")
-    loaded: Callable[[argparse.Namespace], Answer | None] = getattr(importlib.import_module(module), function)
+    module, _, function = (command.place or f"commands.{command.name}:run").partition(":")
+    loaded: Callable[[argparse.Namespace], Answer | None]
+    loaded = getattr(importlib.import_module(f"compensator.{module}"), function)
     return loaded
 
 

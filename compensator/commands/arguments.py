@@ -29,9 +29,12 @@ def demo(parser: argparse.ArgumentParser) -> None:
     _page(parser)
 
 
-def of_service(parser: argparse.ArgumentParser) -> None:
+def run(parser: argparse.ArgumentParser) -> None:
     """Describe the argument of `run`, `check` and `probe`."""
     parser.add_argument("--config", required=True, metavar="FILE", help="configuration of the service")
+
+
+check = probe = run
 
 
 def simulate(parser: argparse.ArgumentParser) -> None:
@@ -137,7 +140,7 @@ def adopt(parser: argparse.ArgumentParser) -> None:
 
 def back(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `back`; `adopt` has them as well."""
-    of_service(parser)
+    run(parser)
     add = parser.add_argument
     add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
     words = "adopt it even where the recordings do not determine its state; its standard deviation is then larger"
@@ -145,7 +148,7 @@ def back(parser: argparse.ArgumentParser) -> None:
     add("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the service's reply, s (60)")
 
 
-def order(parser: argparse.ArgumentParser) -> None:
+def hold(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `hold` and `resume`; `zero` has them as well."""
     add = parser.add_argument
     add("--config", metavar="FILE", help="configuration of the service; without it, --prefix and --zenoh")
@@ -154,9 +157,12 @@ def order(parser: argparse.ArgumentParser) -> None:
     add("--timeout", type=float, default=5.0, metavar="S", help="how long to wait for the service's reply, s (5)")
 
 
+resume = hold
+
+
 def zero(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `zero`."""
-    order(parser)
+    hold(parser)
     words = "rest: the machine is at rest; warm: it is not; auto (the default): the service decides"
     parser.add_argument("--mode", choices=("auto", "rest", "warm"), default="auto", help=words)
 

@@ -188,9 +188,9 @@ def _reading(spot: _Spot, words: Sequence[int]) -> Reading:
     if not math.isfinite(value):
         return Reading.bad(Quality.INVALID, f"not a finite number ({value})")
     if given.maximum is not None and value > given.maximum:
-        return Reading.bad(Quality.OVER, f"{value:g} {given.unit}, plausible up to {given.maximum:g}")
+        return Reading.bad(Quality.OVER, f"{value:g} {given.unit}, plausible up to {given.maximum:g} {given.unit}")
     if given.minimum is not None and value < given.minimum:
-        return Reading.bad(Quality.UNDER, f"{value:g} {given.unit}, plausible from {given.minimum:g}")
+        return Reading.bad(Quality.UNDER, f"{value:g} {given.unit}, plausible from {given.minimum:g} {given.unit}")
     return Reading.good(value)
 
 
