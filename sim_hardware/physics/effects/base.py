@@ -48,12 +48,8 @@ class Effect(Action):
 
     kind: ClassVar[str] = ""
     path: ClassVar[str | None] = None
+    channel: ClassVar[str | None] = None
     thermal: ClassVar[bool] = False
-
-    @property
-    def channel(self) -> str | None:
-        """Measured channel that the effect follows."""
-        return None
 
     def alter(self, design: QuillDesign) -> QuillDesign:
         """Return the design with the permanent changes of the effect."""

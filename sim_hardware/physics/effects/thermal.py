@@ -30,14 +30,10 @@ class CoolantJacket(Effect):
     """
 
     kind: ClassVar[str] = "input"
+    channel: ClassVar[str | None] = "coolant_degc"
     thermal: ClassVar[bool] = True
     w_per_k: float
     place: str = "jacket"
-
-    @property
-    def channel(self) -> str:
-        """Measured channel that the effect follows."""
-        return "coolant_degc"
 
     def add_heat(self, heat_w: Array, t_s: float, inputs: Inputs, degc: Array, places: Places) -> None:
         """Add the coolant's heat, W."""
@@ -59,14 +55,10 @@ class BearingFriction(Effect):
     """
 
     kind: ClassVar[str] = "input"
+    channel: ClassVar[str | None] = "spindle_rpm"
     thermal: ClassVar[bool] = True
     full_speed_w: float
     exponent: float = 2.0
-
-    @property
-    def channel(self) -> str:
-        """Measured channel that the effect follows."""
-        return "spindle_rpm"
 
     def add_heat(self, heat_w: Array, t_s: float, inputs: Inputs, degc: Array, places: Places) -> None:
         """Add the friction's heat, W."""
@@ -87,13 +79,9 @@ class FanOnFilm(Effect):
 
     kind: ClassVar[str] = "scheduled"
     path: ClassVar[str] = "DTF"
+    channel: ClassVar[str | None] = "fan_rpm"
     thermal: ClassVar[bool] = True
     full_speed_factor: float
-
-    @property
-    def channel(self) -> str:
-        """Measured channel that the effect follows."""
-        return "fan_rpm"
 
     def forced_factor(self, inputs: Inputs) -> float:
         """Return the factor on the forced film coefficient."""
@@ -115,14 +103,10 @@ class WetGuide(Effect):
 
     kind: ClassVar[str] = "scheduled"
     path: ClassVar[str] = "DTF"
+    channel: ClassVar[str | None] = "coolant_flow_lpm"
     thermal: ClassVar[bool] = True
     w_per_k: float
     threshold_lpm: float = 0.5
-
-    @property
-    def channel(self) -> str:
-        """Measured channel that the effect follows."""
-        return "coolant_flow_lpm"
 
     def add_heat(self, heat_w: Array, t_s: float, inputs: Inputs, degc: Array, places: Places) -> None:
         """Move heat from the guided nodes to the housing, W."""
