@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import importlib
 import re
+import shlex
 import typing
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from compensator.cli import _parser
 from compensator.config import Config
 from compensator.identify.settings import Settings
 from compensator.model.effects import kinds
@@ -149,6 +151,14 @@ def test_the_reader_of_tables_sees_what_is_there_and_what_is_not() -> None:
     text = "| file | what |\n| --- | --- |\n| `a.py`, `b` | x |\n\n| key | what |\n| --- | --- |\n| `c.py` | x |\n"
     assert named_files(text) == ["a.py", "b"]
     assert len(named_files((TOP / "compensator/README.md").read_text(encoding="utf-8"))) > 10
+
+
+def test_commands_of_the_top_page_parse() -> None:
+    blocks = "".join(CODE.findall((TOP / "README.md").read_text(encoding="utf-8")))
+    lines = re.findall(r"^\$ compensator (.*)$", blocks, flags=re.MULTILINE)
+    assert len(lines) >= 6
+    for line in lines:
+        _parser().parse_args(shlex.split(line, comments=True))
 
 
 # ---------------------------------------------------------------------------- the configuration
