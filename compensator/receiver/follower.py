@@ -137,7 +137,7 @@ class Follower:
     ...     b'"reasons": [], "model_sha256": ""}')
     True
     >>> print(follower.advance(1.0).text)  # 6 µm/min: 0.1 µm in a second
-    +1.90 µm, following: The offset is still under way at the permitted rate. (to -12.00 µm) [catching_up]
+    +1.90 µm, following: The offset is still moving to its value at the permitted rate. (to -12.00 µm) [catching_up]
     """
 
     machine: str
