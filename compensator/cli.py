@@ -23,155 +23,79 @@ log = logging.getLogger("compensator")
 
 
 class Command(NamedTuple):
-    """A command.
+    """A command; its arguments are described by the function of its name in `commands.arguments`.
 
     Parameters
     ----------
     name, text, example : str
-        What stands in the help.
-    describe : callable
-        Adds its arguments to a parser.
-    run : str
-        Module and function that do it, loaded when it is called; the function takes the arguments and returns an
-        `Answer`, or None where there is nothing to print.
+        Its name, one line for the help, and an example.
+    place : str
+        Module of the package, and function, that run it; by default `run` in the module of its name in `commands`.
+        The module is loaded when the command is called; the function takes the arguments and returns an `Answer`, or
+        None where there is nothing to print.
     """
 
     name: str
     text: str
     example: str
-    describe: Callable[[argparse.ArgumentParser], None]
-    run: str
+    place: str = ""
+
+    def describe(self, parser: argparse.ArgumentParser) -> None:
+        """Add its arguments to a parser."""
+        getattr(arguments, self.name)(parser)
 
 
-COMMANDS = (
-    Command(
-        "demo",
-        "the whole loop on simulated hardware",
-        "demo --out demo-out",
-        arguments.demo,
-        "compensator.demo.command:run",
+#: The commands by the user who needs them.
+USERS = {
+    "to try it": (Command("demo", "the whole loop on simulated hardware", "demo --out demo-out", "demo.command:run"),),
+    "calibration engineer": (
+        Command("identify", "a model from measured runs", "identify run.csv --validate other.csv --out model.toml"),
+        Command("simulate", "run a model over measured data", "simulate run.csv --model quill --out predicted.csv"),
+        Command(
+            "diagnose",
+            "what a model lacks, from measured data",
+            "diagnose day.mcap --model model.toml --out diagnosis",
+        ),
+        Command(
+            "adopt",
+            "bring another model into the running service, without a jump",
+            "adopt diagnosis/model.toml --config machine.toml",
+            "commands.adopt:adopt",
+        ),
+        Command("back", "return to the model before", "back --config machine.toml", "commands.adopt:back"),
     ),
-    Command("run", "the service", "run --config machine.toml", arguments.of_service, "compensator.commands.run:run"),
-    Command(
-        "check",
-        "validate a configuration; opens nothing",
-        "check --config machine.toml",
-        arguments.of_service,
-        "compensator.commands.check:run",
+    "operator": (
+        Command("watch", "live view of one machine or many", "watch --connect tcp/127.0.0.1:7447 --prefix shop"),
+        Command("explain", "a state, reason or warning in words", "explain degraded"),
+        Command("zero", "set the machine's present state as zero", "zero --config machine.toml", "commands.order:zero"),
+        Command("hold", "freeze the offset", "hold --config machine.toml", "commands.order:hold"),
+        Command(
+            "resume",
+            "let the offset follow again after hold",
+            "resume --prefix shop/vmc-07 --zenoh operator.json5",
+            "commands.order:resume",
+        ),
+        Command("report", "a page of recordings, or of a folder with results", "report recordings/"),
     ),
-    Command(
-        "probe",
-        "one reading of every device",
-        "probe --config machine.toml",
-        arguments.of_service,
-        "compensator.commands.probe:run",
+    "CNC integrator": (
+        Command("bridge", "write the offset to a control that speaks OPC UA", "bridge opcua --config bridge.toml"),
+        Command("router", "a Zenoh router, where no zenohd is installed", "router --config router.json5"),
     ),
-    Command(
-        "simulate",
-        "run a model over measured data",
-        "simulate run.csv --model quill --out predicted.csv",
-        arguments.simulate,
-        "compensator.commands.simulate:run",
+    "auditor": (
+        Command(
+            "replay",
+            "audit recordings: nothing was changed, every sample is reproduced",
+            "replay recordings/*.mcap",
+        ),
+        Command("export", "recordings as a table", "export day.mcap --out day.csv"),
     ),
-    Command(
-        "identify",
-        "a model from measured runs",
-        "identify run.csv --validate other.csv --out model.toml",
-        arguments.identify,
-        "compensator.commands.identify:run",
+    "at the machine": (
+        Command("check", "validate a configuration; opens nothing", "check --config machine.toml"),
+        Command("probe", "one reading of every device", "probe --config machine.toml"),
+        Command("run", "the service", "run --config machine.toml"),
     ),
-    Command(
-        "diagnose",
-        "what a model lacks, from measured data",
-        "diagnose day.mcap --model model.toml --out diagnosis",
-        arguments.diagnose,
-        "compensator.commands.diagnose:run",
-    ),
-    Command(
-        "replay",
-        "audit recordings: nothing changed, all comes out again",
-        "replay recordings/*.mcap",
-        arguments.replay,
-        "compensator.commands.replay:run",
-    ),
-    Command(
-        "report",
-        "a page for people: of recordings, or of a folder with results",
-        "report recordings/",
-        arguments.report,
-        "compensator.commands.report:run",
-    ),
-    Command(
-        "adopt",
-        "the running service takes a model over without a jump",
-        "adopt diagnosis/model.toml --config machine.toml",
-        arguments.adopt,
-        "compensator.commands.adopt:adopt",
-    ),
-    Command(
-        "back",
-        "the service returns to the model before",
-        "back --config machine.toml",
-        arguments.back,
-        "compensator.commands.adopt:back",
-    ),
-    Command(
-        "zero",
-        "the service takes the machine's state for zero",
-        "zero --config machine.toml",
-        arguments.zero,
-        "compensator.commands.order:zero",
-    ),
-    Command(
-        "hold",
-        "the service freezes the offset",
-        "hold --config machine.toml",
-        arguments.order,
-        "compensator.commands.order:hold",
-    ),
-    Command(
-        "resume",
-        "the service goes on after hold",
-        "resume --prefix shop/vmc-07 --zenoh operator.json5",
-        arguments.order,
-        "compensator.commands.order:resume",
-    ),
-    Command(
-        "router",
-        "a Zenoh router, where no zenohd is installed",
-        "router --config router.json5",
-        arguments.router,
-        "compensator.commands.router:run",
-    ),
-    Command(
-        "watch",
-        "live view of one machine or many",
-        "watch --connect tcp/127.0.0.1:7447 --prefix shop",
-        arguments.watch,
-        "compensator.commands.watch:run",
-    ),
-    Command(
-        "export",
-        "recordings as a table",
-        "export day.mcap --out day.csv",
-        arguments.export,
-        "compensator.commands.export:run",
-    ),
-    Command(
-        "bridge",
-        "the offset to a control that speaks OPC UA",
-        "bridge opcua --config bridge.toml",
-        arguments.bridge,
-        "compensator.commands.bridge:run",
-    ),
-    Command(
-        "explain",
-        "a state, reason or warning in words",
-        "explain degraded",
-        arguments.explain,
-        "compensator.commands.explain:run",
-    ),
-)
+}
+COMMANDS = tuple(command for commands in USERS.values() for command in commands)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -200,21 +124,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def load(command: Command) -> Callable[[argparse.Namespace], Answer | None]:
-    """Return what does a command."""
-    module, _, function = command.run.partition(":")
-    loaded: Callable[[argparse.Namespace], Answer | None] = getattr(importlib.import_module(module), function)
+    """Import a command's module and return the function that runs it."""
+    module, _, function = (command.place or f"commands.{command.name}:run").partition(":")
+    loaded: Callable[[argparse.Namespace], Answer | None]
+    loaded = getattr(importlib.import_module(f"compensator.{module}"), function)
     return loaded
 
 
 def _in_words(error: Exception) -> str:
-    """Say what went wrong in one line: "FILE: No such file or directory", not "[Errno 2] …"."""
+    """Return an error as one line: "FILE: No such file or directory", not "[Errno 2] …"."""
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename2 or error.filename}: {error.strerror or error}"
     return str(error)
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says in one line what is wrong, as everything else does, and where the rest stands."""
+    """Reports wrong usage in one line, like every other error, and where the options are listed."""
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""
@@ -224,17 +149,29 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="compensator",
-        description="Thermal error compensation for machine tools.",
-        epilog="example: compensator demo --out demo-out",
+        usage="compensator [-h] [--version] COMMAND ...",
+        description=f"Thermal error compensation for machine tools.\n\n{_overview()}",
+        epilog="`compensator COMMAND --help` has its options and an example.\nexample: compensator demo --out demo-out",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=__version__)
-    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+    # The overview lists the commands: argparse cannot group them.
+    subparsers = parser.add_subparsers(prog="compensator", required=True, metavar="COMMAND", help=argparse.SUPPRESS)
     for command in COMMANDS:
         one = subparsers.add_parser(
-            command.name, help=command.text, description=command.text, epilog=f"example: compensator {command.example}"
+            command.name, description=command.text, epilog=f"example: compensator {command.example}"
         )
         one.set_defaults(command=command)
         one.add_argument("--debug", action="store_true", help="show where an error comes from")
         one.add_argument("--json", action="store_true", help="print the result as JSON")
         command.describe(one)
     return parser
+
+
+def _overview() -> str:
+    """Return the commands by user, one line each."""
+    groups = (
+        f"{user}:\n" + "\n".join(f"  {command.name:<10} {command.text}" for command in commands)
+        for user, commands in USERS.items()
+    )
+    return "\n\n".join(groups)

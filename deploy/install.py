@@ -1,20 +1,20 @@
 #!/usr/bin/env python3
-"""Install, upgrade, take back and remove the thermal error compensation on a machine's PC.
+"""Install, upgrade, roll back and remove the thermal error compensation on a machine's PC.
 
-Needs Python 3.11 with venv and nothing else. Every command may be given twice; what is done already is left alone.
+Needs Python 3.11 with venv and nothing else. Every command may be repeated; what is done already is left as it is.
 
     install.py install --wheels DIR          the newest quill_compensator-*.whl in DIR, dependencies from DIR, offline
     install.py install --wheel FILE          dependencies from the package index that pip is set up for
     install.py machine NAME --config FILE    folder and configuration of a machine, checked, service enabled and started
-    install.py back                          the version before
+    install.py back                          the previous version
     install.py uninstall [--purge]           the program; with --purge configuration, recordings and user, too
 
-Each version lies in a virtual environment of its own, PREFIX/versions/VERSION-HASH; PREFIX/current and PREFIX/previous
+Each version is in a virtual environment of its own, PREFIX/versions/VERSION-HASH; PREFIX/current and PREFIX/previous
 point to two of them. Before anything is switched the new version checks every machine's configuration. A service that
 does not become ready with the new version gets the old one back. Configurations and recordings are never touched, and
-a unit or rule that somebody has changed stays: the new one is put beside it as `.new`.
+a unit or rule that was changed here stays: the new one is written next to it as `.new`.
 
-One file, because it runs before anything else of the program is there.
+One file, because it runs before the rest of the program is installed.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ class InstallError(Exception):
 
 
 class Installation:
-    """Everything below a prefix, and the system's files that belong to it.
+    """The versions below a prefix, and the system's files that belong to them.
 
     Parameters
     ----------
     prefix : str
-        Folder of the versions, as the machine will see it.
+        Folder of the versions, as a path on the machine.
     destdir : str
         Folder that stands for `/`; with it nothing of the running system is touched.
     """
@@ -71,7 +71,7 @@ class Installation:
         self._manifest = self.root / "manifest.json"
 
     def path(self, name: str) -> Path:
-        """Return where a path of the machine lies now."""
+        """Return where a path of the machine is now, below `destdir`."""
         return Path(self._destdir + name) if self._destdir else Path(name)
 
     @contextlib.contextmanager
@@ -82,7 +82,7 @@ class Installation:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                raise InstallError(f"{self.root}: another installer is at work") from error
+                raise InstallError(f"{self.root}: another installer is running") from error
             yield
 
     # ------------------------------------------------------------------ versions
@@ -93,18 +93,18 @@ class Installation:
         return link.resolve() if link.is_symlink() and link.exists() else None
 
     def extras(self) -> list[str]:
-        """Return the extras that the version in use was installed with: an upgrade brings them along."""
+        """Return the extras of the version in use: an upgrade keeps them."""
         current = self.link("current")
         return (current / ".complete").read_text(encoding="utf-8").split() if current else []
 
     def build(self, wheel: Path, wheels: Path | None, extras: Sequence[str], *, dependencies: bool) -> Path:
-        """Make the virtual environment of a wheel; a whole one is left as it is, half of one is made anew."""
+        """Make the virtual environment of a wheel; a complete one stays, an incomplete one is made again."""
         digest = hashlib.sha256(wheel.read_bytes() + " ".join(extras).encode()).hexdigest()
         version = self.root / "versions" / f"{wheel.name.split('-')[1]}-{digest[:8]}"
         if (version / ".complete").exists():
-            say(f"{version.name}: is there already")
+            report(f"{version.name}: installed already")
             return version
-        say(f"{version.name}: installs into {version}")
+        report(f"{version.name}: installing into {version}")
         shutil.rmtree(version, ignore_errors=True)
         run([sys.executable, "-m", "venv", str(version)])
         pip = [str(version / "bin/python"), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
@@ -113,13 +113,13 @@ class Installation:
         run([*pip, *offline, *([] if dependencies else ["--no-deps"]), wanted])
         for path in (version, version / "share/compensator"):
             if not path.is_dir():
-                raise InstallError(f"{wheel}: no {path.relative_to(version)} in it, expected a whole wheel")
+                raise InstallError(f"{wheel}: no {path.relative_to(version)} in it, expected a complete wheel")
         (version / ".complete").write_text(" ".join(extras) + "\n", encoding="utf-8")
         os.sync()
         return version
 
     def point(self, name: str, version: Path) -> None:
-        """Let `current` or `previous` point to a version, from one moment to the next."""
+        """Let `current` or `previous` point to a version, atomically."""
         link = self.root / name
         new = self.root / f".{name}.new"
         new.unlink(missing_ok=True)
@@ -132,35 +132,35 @@ class Installation:
         for version in sorted((self.root / "versions").iterdir()):
             if version.resolve() not in keep:
                 shutil.rmtree(version)
-                say(f"{version.name}: removed")
+                report(f"{version.name}: removed")
 
     # ------------------------------------------------------------------ the system's files
 
-    def put_system_files(self, version: Path, *, journal_limits: bool) -> None:
-        """Bring units, rules and folders' descriptions to their places."""
+    def write_system_files(self, version: Path, *, journal_limits: bool) -> None:
+        """Write units, rules and descriptions of folders to their places."""
         share = version / "share/compensator"
         known = self._known()
         here = any(self.path(place).exists() for place in JOURNAL_LIMITS.values())
         files = SYSTEM_FILES | (JOURNAL_LIMITS if journal_limits or here else {})
         for name, place in files.items():
             data = (share / name).read_bytes().replace(PREFIX.encode(), self._prefix.encode())
-            self._put(self.path(place), place, data, known)
+            self._write(self.path(place), place, data, known)
         command = self.path(COMMAND)
         if not command.exists() or command.is_symlink():
             command.parent.mkdir(parents=True, exist_ok=True)
             command.unlink(missing_ok=True)
             command.symlink_to(f"{self._prefix}/current/bin/compensator")
 
-    def _put(self, path: Path, place: str, data: bytes, known: dict[str, list[str]]) -> None:
+    def _write(self, path: Path, place: str, data: bytes, known: dict[str, list[str]]) -> None:
         digest, beside = hashlib.sha256(data).hexdigest(), path.with_name(path.name + ".new")
         found = hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else None
         if found == digest:
             return
         if found is not None and found not in known.get(place, []):
             beside.write_bytes(data)
-            say(f"{path}: has been changed here and stays; the new one is {beside.name}")
+            report(f"{path}: was changed here and stays; the new one is {beside.name}")
             return
-        # Known before it is there: a power cut between the two leaves no file that nobody owns.
+        # Recorded before it is written: a power cut in between leaves no file without an owner.
         known[place] = [*known.get(place, []), digest]
         self._manifest.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -168,13 +168,13 @@ class Installation:
         part.write_bytes(data)
         part.replace(path)
         beside.unlink(missing_ok=True)
-        say(f"{path}: written")
+        report(f"{path}: written")
 
     def _known(self) -> dict[str, list[str]]:
         return json.loads(self._manifest.read_text(encoding="utf-8")) if self._manifest.exists() else {}
 
     def remove_system_files(self) -> None:
-        """Remove what was put there; what somebody has changed stays."""
+        """Remove the files written; those that were changed here stay."""
         known = self._known()
         for place in (SYSTEM_FILES | JOURNAL_LIMITS).values():
             path = self.path(place)
@@ -183,9 +183,9 @@ class Installation:
                 continue
             if hashlib.sha256(path.read_bytes()).hexdigest() in known.get(place, []):
                 path.unlink()
-                say(f"{path}: removed")
+                report(f"{path}: removed")
             else:
-                say(f"{path}: has been changed here and stays")
+                report(f"{path}: was changed here and stays")
         command = self.path(COMMAND)
         if command.is_symlink():
             command.unlink()
@@ -197,7 +197,7 @@ class Installation:
         return sorted(self.path(CONFIGURATIONS).glob("*/machine.toml"))
 
     def check(self, version: Path, config: Path) -> None:
-        """Have a version check a configuration; nothing is opened."""
+        """Let a version check a configuration; nothing is opened."""
         done = subprocess.run(
             [str(version / "bin/compensator"), "check", "--config", str(config)],
             capture_output=True,
@@ -215,16 +215,16 @@ class Installation:
                 f"{config}: recording.folder = {table['recording']['folder']!r}, expected a folder below "
                 f"{RECORDINGS}/{name}/, the only place that the service may write to"
             )
-        say(f"{config}: good for {version.name}")
+        report(f"{config}: valid for {version.name}")
 
     def activate(self, version: Path, system: System, *, journal_limits: bool = False) -> None:
-        """Switch to a version, restart what runs, and switch back where a service does not become ready.
+        """Switch to a version, restart running services, and switch back where one does not become ready.
 
         Raises
         ------
         InstallError
-            If a configuration is not good for it (nothing was switched), or a service did not become ready (the
-            version before is in use again).
+            If it cannot use a configuration (nothing was switched), or a service did not become ready (the previous
+            version is in use again).
         """
         for config in self.machines():
             self.check(version, config)
@@ -242,18 +242,18 @@ class Installation:
             raise InstallError(f"{', '.join(failed)} did not start with {version.name}; back to {before.name}{end}")
         if failed:
             raise InstallError(f"{', '.join(failed)} did not start: journalctl -u {failed[0]} -n 20")
-        say(f"{version.name}: in use" + (f", restarted {', '.join(running)}" if running else ""))
+        report(f"{version.name}: in use" + (f", restarted {', '.join(running)}" if running else ""))
 
     def _switch(self, version: Path, previous: Path | None, system: System, journal_limits: bool) -> None:
         if previous is not None and previous != version:
             self.point("previous", previous)
         self.point("current", version)
-        self.put_system_files(version, journal_limits=journal_limits)
+        self.write_system_files(version, journal_limits=journal_limits)
         system.reload()
 
 
 class System:
-    """What is asked of the running system; nothing where files go to another root.
+    """The running system; not touched where files go to another root.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ class System:
         self._systemd = touch and Path("/run/systemd/system").is_dir()
 
     def reload(self) -> None:
-        """Have the system read its files again: user, folders, device names, units."""
+        """Let the system read its files again: user, folders, device names, units."""
         if self._touch:
             run(["systemd-sysusers", SYSTEM_FILES["systemd/compensator.sysusers.conf"]])
             run(["systemd-tmpfiles", "--create", SYSTEM_FILES["systemd/compensator.tmpfiles.conf"]])
@@ -277,37 +277,37 @@ class System:
             run(["udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=usb-serial"])
 
     def forget(self) -> None:
-        """Have the system see that the units are gone."""
+        """Let the system notice that the units are gone."""
         if self._systemd:
             run(["systemctl", "daemon-reload"])
 
     def running(self) -> list[str]:
-        """Return the services that run or try to."""
+        """Return the services that are running or starting."""
         if not self._systemd:
             return []
         done = run(["systemctl", "list-units", "--plain", "--no-legend", "--state=active,activating,failed", *UNITS])
         return [line.split()[0] for line in done.splitlines() if line.strip()]
 
     def restarted(self, unit: str) -> bool:
-        """Restart a service and tell whether it became ready."""
+        """Restart a service and return whether it became ready."""
         return subprocess.run(["systemctl", "restart", unit], check=False).returncode == 0
 
     def enable(self, unit: str) -> None:
-        """Have a service start now and with the PC."""
+        """Start a service now and with the PC."""
         if self._systemd:
             run(["systemctl", "enable", "--now", unit])
-            say(f"{unit}: runs, and starts with the PC")
+            report(f"{unit}: runs, and starts with the PC")
 
     def disable(self) -> None:
-        """Stop all services, for good."""
+        """Stop and disable all services."""
         wanted = Path("/etc/systemd/system/multi-user.target.wants").glob("compensator[@-]*.service")
         units = sorted({*self.running(), *(path.name for path in wanted)}) if self._systemd else []
         if units:
             run(["systemctl", "disable", "--now", *units])
-            say(f"{', '.join(units)}: stopped")
+            report(f"{', '.join(units)}: stopped")
 
     def check_python(self) -> None:
-        """Refuse a Python that cannot make the environment, or that the service could not see.
+        """Refuse a Python that cannot make the environment, or that the service could not read.
 
         Raises
         ------
@@ -319,7 +319,7 @@ class System:
         real = Path(sys.executable).resolve()
         if self._touch and real.parts[1] in ("home", "root"):
             raise InstallError(
-                f"{real}: services see no home folders, expected a Python outside, such as /usr/bin/python3"
+                f"{real}: services cannot read home folders, expected a Python outside, such as /usr/bin/python3"
             )
 
     def own(self, path: Path, mode: int) -> None:
@@ -362,7 +362,7 @@ def _version_of(wheel: Path) -> list[int]:
 
 
 def machine(given: argparse.Namespace, installation: Installation, system: System) -> None:
-    """Make the folder of a machine, put its configuration there, check it, and start its service."""
+    """Make the folder of a machine, write its configuration, check it, and start its service."""
     version = installation.link("current")
     if version is None:
         raise InstallError(f"{installation.root}: nothing is installed, expected `install.py install` first")
@@ -373,7 +373,7 @@ def machine(given: argparse.Namespace, installation: Installation, system: Syste
         if source is not None:
             _copy(source, folder / name, system)
     if not (folder / "machine.toml").exists():
-        raise InstallError(f"{folder / 'machine.toml'}: is not there, expected --config FILE")
+        raise InstallError(f"{folder / 'machine.toml'}: missing, expected --config FILE")
     installation.check(version, folder / "machine.toml")
     system.enable(f"compensator@{given.name}.service")
 
@@ -384,24 +384,24 @@ def _copy(source: Path, target: Path, system: System) -> None:
         beside = target.with_name(target.name + ".new")
         beside.write_bytes(data)
         system.own(beside, 0o640)
-        say(f"{target}: differs and stays; the other one is {beside.name}")
+        report(f"{target}: differs and stays; the new one is {beside.name}")
         return
     if not target.exists():
         target.write_bytes(data)
-        say(f"{target}: written")
+        report(f"{target}: written")
     system.own(target, 0o640)
 
 
 def back(given: argparse.Namespace, installation: Installation, system: System) -> None:
-    """Return to the version before; given again it returns from there."""
+    """Return to the previous version; repeated, it returns from there."""
     previous = installation.link("previous")
     if previous is None:
-        raise InstallError(f"{installation.root}: no version before is kept")
+        raise InstallError(f"{installation.root}: no previous version is kept")
     installation.activate(previous, system)
 
 
 def uninstall(given: argparse.Namespace, installation: Installation, system: System) -> None:
-    """Remove the program; configuration and recordings only where that is asked for."""
+    """Remove the program; configuration and recordings only with `--purge`."""
     system.disable()
     installation.remove_system_files()
     for name in ("current", "previous", "manifest.json", ".lock"):
@@ -414,15 +414,15 @@ def uninstall(given: argparse.Namespace, installation: Installation, system: Sys
         if given.purge:
             shutil.rmtree(path, ignore_errors=True)
         elif path.exists():
-            say(f"{path}: stays")
+            report(f"{path}: stays")
     if given.purge:
         system.remove_user()
-        say("configuration, recordings, logs and user: removed")
+        report("configuration, recordings, logs and user: removed")
     system.forget()
 
 
-def say(text: str) -> None:
-    """Say what was done."""
+def report(text: str) -> None:
+    """Print what was done."""
     print(text, flush=True)
 
 
@@ -449,9 +449,11 @@ def _parser() -> argparse.ArgumentParser:
     one = commands.add_parser("install", help="install or upgrade")
     one.set_defaults(command=install)
     one.add_argument("--wheel", type=Path, help="the program")
-    one.add_argument("--wheels", type=Path, help="folder of wheels: the program and all that it needs; offline")
-    one.add_argument("--extra", action="append", default=[], help="sign or tls: with the package cryptography; stays")
-    one.add_argument("--no-deps", action="store_true", help="what it needs is brought in otherwise")
+    one.add_argument("--wheels", type=Path, help="folder of wheels: the program and its dependencies; offline")
+    one.add_argument(
+        "--extra", action="append", default=[], help="sign or tls: both need the package cryptography; kept by upgrades"
+    )
+    one.add_argument("--no-deps", action="store_true", help="do not install dependencies")
     one.add_argument(
         "--journal-limits", action="store_true", help="limit this PC's journal to 1 GB and a year, on disk"
     )
@@ -459,8 +461,8 @@ def _parser() -> argparse.ArgumentParser:
     one.set_defaults(command=machine)
     one.add_argument("name")
     one.add_argument("--config", type=Path, help="becomes /etc/compensator/NAME/machine.toml, unless there is one")
-    one.add_argument("--model", type=Path, action="append", default=[], help="model file to put beside it")
-    commands.add_parser("back", help="the version before").set_defaults(command=back)
+    one.add_argument("--model", type=Path, action="append", default=[], help="model file to copy next to it")
+    commands.add_parser("back", help="return to the previous version").set_defaults(command=back)
     one = commands.add_parser("uninstall", help="remove the program")
     one.set_defaults(command=uninstall)
     one.add_argument("--purge", action="store_true", help="remove configuration, recordings and user, too")

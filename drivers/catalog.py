@@ -52,7 +52,7 @@ def build(lines: Sequence[Mapping[str, object]], devices: Sequence[Mapping[str, 
     devices : sequence of Mapping
         The `[[device]]` tables.
     source : str
-        Name of the file, with which each message begins.
+        Name of the file, at the start of each message.
 
     Raises
     ------
@@ -66,18 +66,19 @@ def build(lines: Sequence[Mapping[str, object]], devices: Sequence[Mapping[str, 
     for index, table in enumerate(devices):
         where = _where(table, index, "devices", source)
         family = _family(table, where)
-        about = settings(table, family.kind, where)
-        if about.name in fleet:
-            raise where.wrong("name", about.name, "another one than the devices before have")
-        line_about = _line_of(about, family, known, where)
-        # A controller with a line of its own has no address: a second one on its line collides as well.
-        address = getattr(about, "address", "its own line")
-        other = taken.setdefault((about.line, address), about.name)
-        if other != about.name:
-            raise where.error(f"address {address} on line {about.line!r} is that of {other!r} and of {about.name!r}")
-        if about.line not in made:
-            made[about.line] = _new_line(line_about)
-        fleet[about.name] = family.make(about, made[about.line], where)
+        config = settings(table, family.kind, where)
+        if config.name in fleet:
+            raise where.wrong("name", config.name, "a name that no other device has")
+        line_config = _line_of(config, family, known, where)
+        # A controller with a line of its own has no address: a second one on that line collides, too.
+        address = getattr(config, "address", None)
+        other = taken.setdefault((config.line, address), config.name)
+        if other != config.name:
+            spot = f"line {config.line!r}" if address is None else f"address {address} on line {config.line!r}"
+            raise where.error(f"{spot} is used by {other!r} and by {config.name!r}")
+        if config.line not in made:
+            made[config.line] = _new_line(line_config)
+        fleet[config.name] = family.make(config, made[config.line], where)
     return Fleet(fleet)
 
 
@@ -87,14 +88,14 @@ def _lines(tables: Sequence[Mapping[str, object]], source: str) -> dict[str, Lin
     taken: dict[str, str] = {}
     for index, table in enumerate(tables):
         where = _where(table, index, "lines", source)
-        about = line_settings(_table(table, where), where)
-        if about.name in lines:
-            raise where.wrong("name", about.name, "another one than the lines before have")
-        for end in about.ends():
+        config = line_settings(_table(table, where), where)
+        if config.name in lines:
+            raise where.wrong("name", config.name, "a name that no other line has")
+        for end in config.endpoints():
             if end in taken:
-                raise where.error(f"{end} is on line {taken[end]!r} and on line {about.name!r}, expected one line")
-            taken[end] = about.name
-        lines[about.name] = about
+                raise where.error(f"{end} is on line {taken[end]!r} and on line {config.name!r}, expected one line")
+            taken[end] = config.name
+        lines[config.name] = config
     return lines
 
 
@@ -107,12 +108,12 @@ def _where(table: object, index: int, tables: str, source: str) -> Where:
 
 
 def _in_one_line(text: str) -> str:
-    """Escape what would tear a message apart: TOML allows line breaks in a name."""
+    """Escape line breaks, which TOML allows in a name."""
     return "".join(char if char.isprintable() else repr(char)[1:-1] for char in text)
 
 
 def _table(table: object, where: Where) -> Mapping[str, object]:
-    """Return a table that is one."""
+    """Return a table, or raise where it is none."""
     if not isinstance(table, Mapping):
         raise where.error(f"is {table!r}, expected a table")
     return table
@@ -129,25 +130,25 @@ def _family(given: object, where: Where) -> Family:
     return MODELS[model]
 
 
-def _line_of(about: DeviceSettings, family: Family, known: Mapping[str, LineSettings], where: Where) -> LineSettings:
+def _line_of(config: DeviceSettings, family: Family, known: Mapping[str, LineSettings], where: Where) -> LineSettings:
     """Find the line of a device, with a protocol that its model speaks."""
-    if about.line not in known:
+    if config.line not in known:
         names = _in_one_line(", ".join(known)) or "there is none"
-        raise where.wrong("line", about.line, f"the name of a line ({names})")
-    line = known[about.line]
+        raise where.wrong("line", config.line, f"the name of a line ({names})")
+    line = known[config.line]
     if line.protocol not in family.protocols:
-        expected = f"a line with protocol {' or '.join(family.protocols)} for {about.model}"
-        raise where.error(f"key 'line' is {about.line!r} with protocol {line.protocol!r}, expected {expected}")
+        expected = f"a line with protocol {' or '.join(family.protocols)} for {config.model}"
+        raise where.error(f"key 'line' is {config.line!r} with protocol {line.protocol!r}, expected {expected}")
     return line
 
 
-def _new_line(about: LineSettings) -> Line:
+def _new_line(config: LineSettings) -> Line:
     """Make a line; it opens with its first request."""
-    if isinstance(about, CapancdtLine):
-        return CapancdtLink(about)
-    if isinstance(about, SerialLine) and about.protocol == "dcon":
-        return DconLine(about)
-    return ModbusLine(about)
+    if isinstance(config, CapancdtLine):
+        return CapancdtLink(config)
+    if isinstance(config, SerialLine) and config.protocol == "dcon":
+        return DconLine(config)
+    return ModbusLine(config)
 
 
 __all__ = ["MODELS", "DriverConfigError", "Fleet", "build"]

@@ -1,4 +1,4 @@
-"""What a device gives: readings with a quality, and the shape every device has."""
+"""Readings with a quality, and the interface of every device."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Reading:
     value : float
         In the input's unit; NaN unless the quality is good.
     quality : Quality
-        What is known of it.
+        Of the value.
     minimum, maximum : float
-        Extremes over the readings that `value` is the mean of (a streaming device gives many at once).
+        Extremes of the readings that `value` is the mean of (a streaming device returns many at once).
     count : int
-        How many readings `value` is the mean of; 0 when there is none.
+        Number of readings that `value` is the mean of; 0 where there is none.
     detail : str
         A few words for an engineer where the quality is not good.
     """
@@ -57,7 +57,7 @@ class Reading:
 
 
 class Device(Protocol):
-    """What the service sees of any device."""
+    """A device, as the service sees it."""
 
     @property
     def name(self) -> str:
@@ -75,7 +75,7 @@ class Device(Protocol):
         Raises
         ------
         DriverError
-            Naming the device, when no reading could be had at all.
+            Naming the device, where no input could be read.
         """
 
     async def close(self) -> None:

@@ -25,7 +25,7 @@ class Where:
     Parameters
     ----------
     source : str
-        Name of the file or whatever holds the tables.
+        Name of the file that holds the tables.
     table : str
         The table in words, as in `devices[1] "spindle-couples"`.
     """
@@ -52,7 +52,7 @@ def settings(table: object, kind: type[SettingsT], where: Where) -> SettingsT:
     Parameters
     ----------
     table : object
-        What stands in the configuration; a mapping if it is right.
+        From the configuration; a mapping where it is right.
     kind : type
         Class of the settings. Nested tables are converted by a second call, so that messages name their
         place.
@@ -80,7 +80,7 @@ def settings(table: object, kind: type[SettingsT], where: Where) -> SettingsT:
 
 
 def _in_words(error: msgspec.ValidationError, table: Mapping[str, Any], where: Where) -> DriverConfigError:
-    """Name key, value and expectation of what msgspec found."""
+    """Turn an error of msgspec into one with key, value and expectation."""
     found = _AT.match(str(error))
     if found is None or not found["path"]:
         return where.error(str(error))
@@ -93,5 +93,5 @@ def _in_words(error: msgspec.ValidationError, table: Mapping[str, Any], where: W
 
 
 def one_of(choices: Mapping[str, object] | tuple[str, ...]) -> str:
-    """Put choices in words: `one of K, J, T`."""
+    """Return choices in words: `one of K, J, T`."""
     return f"one of {', '.join(choices)}"

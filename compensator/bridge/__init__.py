@@ -1,1 +1,1 @@
-"""Programs that bring the offset to a control over a protocol of the control's own."""
+"""Bridges: the offset to a control over the control's own protocol."""

@@ -17,12 +17,12 @@ from compensator.bridge.register import Register
 from compensator.bridge.settings import OpcUa
 from compensator.errors import ConfigError
 from compensator.reasons import Caution
-from compensator.receiver import Applied, Reason, Receiver
+from compensator.receiver import Applied, Receiver
 from compensator.receiver.subscriber import monotonic_s
 
 log = logging.getLogger("compensator")
 
-#: What `state_node` gets: the follower's states, and 4 where nothing may be written.
+#: Values of `state_node`: the follower's states, and 4 where nothing may be written.
 STATES = ("starting", "following", "holding", "fading", "trouble")
 #: The counter of `heartbeat_node` fits into every integer of a PLC.
 HEARTBEAT_MODULUS = 2**15
@@ -36,7 +36,7 @@ _INTEGERS = (
     ua.VariantType.Int64,
     ua.VariantType.UInt64,
 )
-#: What a connection that is lost, refused or silent raises.
+#: Raised by a connection that is lost, refused or silent.
 _GONE = (OSError, ua.UaError, asyncio.TimeoutError, ConnectionError)
 
 
@@ -46,18 +46,18 @@ class Bridge:
     Parameters
     ----------
     settings : OpcUa
-        Where, in which unit and with which sign.
+        Server, node, unit and sign.
     receiver : Receiver
         Entered by the caller; its `step_max_s` should be two cycles.
-    say : callable, optional
-        Takes a line whenever state or reasons change; the log where none is given.
+    report : callable, optional
+        Called with a line whenever state or reasons change; the log by default.
     """
 
-    def __init__(self, settings: OpcUa, receiver: Receiver, say: Callable[[str], None] = log.info) -> None:
+    def __init__(self, settings: OpcUa, receiver: Receiver, report: Callable[[str], None] = log.info) -> None:
         self._settings = settings
         self._receiver = receiver
-        self._say = say
-        self._said = ""
+        self._report = report
+        self._reported = ""
         self._beat = 0
         self.register = Register(
             receiver.follower,
@@ -68,21 +68,21 @@ class Bridge:
         )
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Run until `stop` is set; what the PLC holds then stands.
+        """Run until `stop` is set; the PLC then keeps its value.
 
         Raises
         ------
         ConfigError
-            Where a node is of a type that cannot hold what is meant for it.
+            Where a node is of a type that cannot hold its value.
         """
         while not stop.is_set():
             try:
                 async with await self._client() as client:
-                    await self._connected(client, stop)
+                    await self._serve(client, stop)
             except _GONE as error:
                 figures = f"{self._settings.endpoint}: {type(error).__name__} {error}".rstrip(". ")
                 self.register.lost(Caution("plc_not_reached", f"{figures}.").marked)
-            await self._apart(stop)
+            await self._wait_disconnected(stop)
 
     async def _client(self) -> Client:
         settings = self._settings
@@ -91,7 +91,7 @@ class Bridge:
             client.set_user(settings.user)
             client.set_password(Path(settings.password_file).read_text(encoding="utf-8").strip())
         if settings.security_policy:
-            # A server compares the certificate's name of the program with what the program calls itself.
+            # A server compares the application's URI in the certificate with the one that the application sends.
             client.application_uri = _application_uri(Path(settings.certificate)) or client.application_uri
             await client.set_security(
                 getattr(security_policies, f"SecurityPolicy{settings.security_policy}"),
@@ -102,7 +102,7 @@ class Bridge:
             )
         return client
 
-    async def _connected(self, client: Client, stop: asyncio.Event) -> None:
+    async def _serve(self, client: Client, stop: asyncio.Event) -> None:
         nodes = await self._nodes(client)
         self.register.lost("")
         while not stop.is_set():
@@ -132,7 +132,7 @@ class Bridge:
 
     async def _cycle(self, nodes: dict[str, tuple[Any, ua.VariantType]]) -> None:
         node, kind = nodes["offset_node"]
-        may_move = self.register.seen(monotonic_s(), float(await node.read_value()))
+        may_move = self.register.check(monotonic_s(), float(await node.read_value()))
         enabled = "enable_node" not in nodes or bool(await nodes["enable_node"][0].read_value())
         if may_move and enabled:
             self._receiver.follower.follow()
@@ -149,27 +149,22 @@ class Bridge:
         for key, number in (("state_node", state), ("heartbeat_node", self._beat)):
             if key in nodes:
                 await _write(nodes[key][0], number, nodes[key][1])
-        self._tell(applied)
+        self._report_news(applied)
 
-    async def _apart(self, stop: asyncio.Event) -> None:
-        """Without the PLC: go on hearing what is published, until the next try."""
+    async def _wait_disconnected(self, stop: asyncio.Event) -> None:
+        """Follow what is published without the PLC, until the next attempt."""
         self._receiver.follower.hold()
         end_s = monotonic_s() + self._settings.retry_s
         while not stop.is_set() and monotonic_s() < end_s:
-            self._tell(self._receiver.poll())
+            self._report_news(self._receiver.poll())
             await _pause(stop, min(self._settings.cycle_s, self._settings.retry_s))
 
-    def _tell(self, applied: Applied) -> None:
-        # The way to go and the age change all the time: without them.
-        codes = " ".join(
-            (Reason(r.code) if r.code in ("catching_up", "expired") else r).marked for r in applied.reasons
-        )
-        news = (
-            f"trouble: {self.register.trouble}" if self.register.trouble else f"{applied.state}: {codes}".rstrip(": ")
-        )
-        if news != self._said:
-            self._said = news
-            self._say(news)
+    def _report_news(self, applied: Applied) -> None:
+        trouble = self.register.trouble
+        news = f"trouble: {trouble}" if trouble else f"{applied.state}: {applied.steady_reasons}".rstrip(": ")
+        if news != self._reported:
+            self._reported = news
+            self._report(news)
 
 
 def _application_uri(path: Path) -> str:
@@ -183,7 +178,7 @@ def _application_uri(path: Path) -> str:
 
 
 async def _write(node: Any, value: float, kind: ua.VariantType) -> None:
-    # Without time and status: PLCs refuse to be told those.
+    # Without time and status: PLCs refuse to have those written.
     await node.write_value(ua.DataValue(ua.Variant(value, kind)))
 
 

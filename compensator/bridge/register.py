@@ -1,7 +1,7 @@
-"""A value in somebody else's memory that follows the offset: what may be written to it, and when not.
+"""A value in the PLC's memory that follows the offset: what may be written to it, and when.
 
-Knows no protocol and no clock. The value is trusted only as far as it was read back: after a start, a lost
-connection, a write of unknown outcome or somebody else's write the offset goes on from what the PLC holds.
+Knows no protocol and no clock. Only a value that was read back is trusted: after a start, a lost connection, a write of
+unknown outcome or another writer the offset continues from the PLC's value.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ class Register:
     Parameters
     ----------
     follower : Follower
-        Says what should be applied; is put back to what the PLC holds.
+        Has the offset to apply; is rebased to the PLC's value.
     sign : int
         1 or −1.
     unit_um : float
         µm for each unit of the value.
     tolerance_um : float
-        How far what is read back may be from what was written, µm.
+        Largest difference of the value read back from the value written, µm.
     resume_after_s : float
-        How long a value that somebody else wrote must stand, s.
+        How long the value of another writer must not change, s.
     single : bool
         Whether it holds 32 bits.
 
     Attributes
     ----------
     trouble : str
-        Why nothing is written, in words; empty where it is.
+        Why nothing is written, in words; empty while the offset is written.
     """
 
     def __init__(
@@ -54,16 +54,16 @@ class Register:
         self.single = single
         self.trouble = ""
         self._written: float | None = None
-        self._stands: tuple[float, float] | None = None  # value, since
+        self._found: tuple[float, float] | None = None  # value, since
         self._known = False
 
     def lost(self, why: str) -> None:
-        """Note that what the PLC holds is not known any more."""
+        """Forget the PLC's value: it is no longer known."""
         self.trouble = why
-        self._known, self._written, self._stands = False, None, None
+        self._known, self._written, self._found = False, None, None
 
-    def seen(self, now_s: float, value: float) -> bool:
-        """Take what was read; tell whether the offset may move.
+    def check(self, now_s: float, value: float) -> bool:
+        """Check a value that was read; return whether the offset may move.
 
         Parameters
         ----------
@@ -73,23 +73,22 @@ class Register:
             In the PLC's unit.
         """
         if not self._known:
-            # A first value is taken at once: nobody was progress anything else before.
-            return self._go_on_from(value)
+            return self._continue_from(value)
         if self._written is None or self._same(value, self._written):
             return True
-        if self._stands is None or not self._same(value, self._stands[0]):
-            self._stands = (value, now_s)
+        if self._found is None or not self._same(value, self._found[0]):
+            self._found = (value, now_s)
         found_um, left_um = value / self._per_um, self._written / self._per_um
-        figures = f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: somebody else writes there."
+        figures = f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: it has another writer."
         self.trouble = Caution("plc_written_over", figures).marked
-        if now_s - self._stands[1] < self._resume_after_s:
+        if now_s - self._found[1] < self._resume_after_s:
             return False
-        return self._go_on_from(value)
+        return self._continue_from(value)
 
     def _same(self, a: float, b: float) -> bool:
         return abs(a - b) <= self._tolerance_um * abs(self._per_um)  # false for NaN
 
-    def _go_on_from(self, value: float) -> bool:
+    def _continue_from(self, value: float) -> bool:
         offset_um = value / self._per_um
         largest = self._follower.limits.offset_max_um
         if not (math.isfinite(offset_um) and abs(offset_um) <= largest):
@@ -97,17 +96,17 @@ class Register:
             self.trouble = Caution("plc_beyond_limit", figures).marked
             return False
         self._follower.rebase(offset_um)
-        self._known, self._written, self._stands = True, value, None
+        self._known, self._written, self._found = True, value, None
         self.trouble = ""
         return True
 
     def value(self, offset_um: float) -> float | None:
-        """Return what is to be written for an offset; None where the PLC holds it already.
+        """Return the value to write for an offset; None where the PLC holds it already.
 
         Parameters
         ----------
         offset_um : float
-            What is to be applied, µm.
+            Offset to apply, µm.
         """
         value = offset_um * self._per_um
         if self.single:
@@ -115,5 +114,5 @@ class Register:
         return None if value == self._written else value
 
     def wrote(self, value: float) -> None:
-        """Note a write that was confirmed."""
+        """Note a confirmed write."""
         self._written = value

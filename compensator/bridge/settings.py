@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from compensator.errors import ConfigError
 from compensator.receiver import ReceiverError, Settings, load_settings
 from compensator.receiver.settings import read_table
 
-#: µm for each unit that the PLC may count in.
+#: µm for each unit that the PLC may use.
 UNITS_UM = {"mm": 1000.0, "um": 1.0}
-#: Security policies of OPC UA that are fit for use.
+#: Security policies of OPC UA that are secure.
 POLICIES = ("Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss")
 _FILES = ("password_file", "certificate", "private_key", "server_certificate")
 
@@ -27,25 +28,25 @@ class OpcUa:
     offset_node : str
         A REAL or LREAL, such as `ns=2;s=/Plc/DB100.DBD0:REAL`.
     unit : str
-        `mm` or `um`: what it counts in.
+        `mm` or `um`: unit of the value.
     sign : int
-        1 or −1: whether the control adds or subtracts it. There is no default: it is found on the machine.
+        1 or −1: whether the control adds or subtracts it. There is no default: it is determined on the machine.
     sign_checked : str
-        Who found it when and how, in words.
+        Who determined it, when and how, in words.
     cycle_s : float
         How often it is read and written, s.
     readback_tolerance_um : float
-        How far what is read back may be from what was written, µm.
+        Largest difference of the value read back from the value written, µm.
     resume_after_s : float
-        After a difference, how long the PLC's value must stand before the offset goes on from it, s.
+        After a difference, how long the PLC's value must not change before the offset continues from it, s.
     retry_s, timeout_s : float
-        Pause before the next try to connect, and how long an answer may take, s.
+        Pause before the next attempt to connect, and how long an answer may take, s.
     heartbeat_node, state_node, enable_node : str
         Optional: an integer that counts up each cycle; one for the state; a BOOL of the PLC, false holds the offset.
     user, password_file : str
-        Login; the password stands alone in a file.
+        Login; the file holds the password alone.
     security_policy, certificate, private_key, server_certificate : str
-        Signed and encrypted: one of the policies and the files for it. Without, the line is open.
+        Signed and encrypted: one of the policies and its files. Without them the connection is open.
     """
 
     endpoint: str
@@ -100,12 +101,12 @@ def load_bridge(path: str | Path) -> tuple[Settings, OpcUa]:
     except ReceiverError as error:
         raise ConfigError(str(error)) from error
     folder = Path(path).parent
-    values = {field.name: getattr(opcua, field.name) for field in fields(opcua)}
-    files = {key: str((folder / values[key]).resolve()) for key in _FILES if values[key]}
+    given = {key: getattr(opcua, key) for key in _FILES}
+    files: dict[str, Any] = {key: str((folder / name).resolve()) for key, name in given.items() if name}
     for key, file in files.items():
         if not Path(file).is_file():
-            raise ConfigError(f"{path}: opcua.{key} = {values[key]!r}: no such file")
-    return receiver, OpcUa(**{**values, **files})
+            raise ConfigError(f"{path}: opcua.{key} = {given[key]!r}: no such file")
+    return receiver, replace(opcua, **files)
 
 
 def _check(opcua: OpcUa, path: str) -> None:

@@ -1,4 +1,4 @@
-"""Arguments of the commands; apart from them, so that asking for help loads no numbers."""
+"""Arguments of the commands, in a module of their own so that asking for help loads no numerics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (defaul
 
 
 def _page(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--page", type=Path, metavar="FILE", help="write the page here (too): .html, .pdf, or .png")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="also write the page here: .html, .pdf, or .png")
 
 
 def demo(parser: argparse.ArgumentParser) -> None:
@@ -20,14 +20,21 @@ def demo(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder for the results")
     add("--hours", type=float, default=24.0, help="length of the simulated run, h (default 24)")
     add("--seed", type=int, default=1, help="seed of the simulated day (default 1)")
-    add("--live", action="store_true", help="one machine that runs on in real time after these hours, to try things on")
-    add("--port", type=int, default=7447, help="where it listens on loopback, with --live (default 7447)")
+    add(
+        "--live",
+        action="store_true",
+        help="one machine that runs on in real time after these hours, to experiment with",
+    )
+    add("--port", type=int, default=7447, help="its port on loopback, with --live (default 7447)")
     _page(parser)
 
 
-def of_service(parser: argparse.ArgumentParser) -> None:
+def run(parser: argparse.ArgumentParser) -> None:
     """Describe the argument of `run`, `check` and `probe`."""
     parser.add_argument("--config", required=True, metavar="FILE", help="configuration of the service")
+
+
+check = probe = run
 
 
 def simulate(parser: argparse.ArgumentParser) -> None:
@@ -44,21 +51,21 @@ def export(parser: argparse.ArgumentParser) -> None:
     words = "recordings of one machine, in any order"
     parser.add_argument("recording", type=Path, nargs="+", metavar="FILE.mcap", help=words)
     parser.add_argument("--out", type=Path, required=True, metavar="CSV")
-    words = "of a shop's recording (watch --record): the machine, such as shop/vmc-07"
+    words = "machine in a shop's recording (watch --record), such as shop/vmc-07"
     parser.add_argument("--machine", default="", metavar="PREFIX", help=words)
 
 
 def bridge(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `bridge`."""
-    parser.add_argument("protocol", choices=("opcua",), help="what the control speaks")
+    parser.add_argument("protocol", choices=("opcua",), help="protocol of the control")
     parser.add_argument("--config", required=True, metavar="FILE", help="TOML with [receiver] and [opcua]")
-    parser.add_argument("--check", action="store_true", help="look at the file, open nothing")
+    parser.add_argument("--check", action="store_true", help="check the file, open nothing")
 
 
 def explain(parser: argparse.ArgumentParser) -> None:
     """Describe the argument of `explain`."""
     parser.add_argument(
-        "code", metavar="CODE", nargs="?", help="such as degraded, or t_q_missing; all where none is given"
+        "code", metavar="CODE", nargs="?", help="such as degraded, or t_q_missing; without it, all codes"
     )
 
 
@@ -66,29 +73,32 @@ def identify(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `identify`."""
     add = parser.add_argument
     add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
-    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html comes beside it")
+    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html is written next to it")
     _page(parser)
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
     add("--name", help="name of the model (default: that of the file)")
+    add = parser.add_argument_group("structure of the model").add_argument
     words = "with a TTF, or from T_Q - AT straight to y (default: with one where heat_w is known)"
     add("--kind", choices=("auto", "heat", "direct"), default="auto", help=words)
-    words = "TDTF given (I), from a whole ETVE (II), from its end (III), at once with the DTF (IV, the default)"
+    add("--ttf", type=int, nargs=3, default=(2, 2, 0), metavar=("NB", "NF", "NK"), help="structure of the TTF (2 2 0)")
+    words = "structure of DTF and TDTF (default: chosen on held-out folds)"
+    add("--order", type=int, nargs=3, metavar=("NF", "NB_DTF", "NB_TDTF"), help=words)
+    words = "heat that the DTF is fitted with: from T_Q as in the service (default), or the known one"
+    add("--drive", choices=("ttf", "known"), default="ttf", help=words)
+    add = parser.add_argument_group("the effect of the ambient").add_argument
+    words = "TDTF given (I), from a whole ETVE (II), from its end (III), jointly with the DTF (IV, the default)"
     add("--method", choices=("I", "II", "III", "IV"), default="IV", help=words)
     words = "method I: gain and time constant of the first-order TDTF"
     add("--tdtf", type=float, nargs=2, metavar=("UM_PER_K", "MIN"), help=words)
     words = "methods II and III: a run without any heat source"
     add("--etve", type=Path, action="append", default=[], metavar="DATA", help=words)
     add("--etve-end-h", type=float, default=6.0, metavar="H", help="method III: length of the end, h (6)")
-    add("--ttf", type=int, nargs=3, default=(2, 2, 0), metavar=("NB", "NF", "NK"), help="structure of the TTF (2 2 0)")
-    words = "structure of DTF and TDTF (default: chosen on held-out folds)"
-    add("--order", type=int, nargs=3, metavar=("NF", "NB_DTF", "NB_TDTF"), help=words)
-    words = "heat that the DTF is fitted with: from T_Q as in the service (default), or the known one"
-    add("--drive", choices=("ttf", "known"), default="ttf", help=words)
-    add("--folds", type=int, default=5, help="blocks of time held out in turn (5)")
-    add("--fit-until", type=float, metavar="H", help="fit up to this hour, judge on the rest")
-    words = "a run that only judges; may be repeated"
+    add = parser.add_argument_group("validation").add_argument
+    words = "a run for validation only; may be repeated"
     add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
-    add("--reference", metavar="MODEL", help="another model to put the coefficients beside")
+    add("--fit-until", type=float, metavar="H", help="fit up to this hour, validate on the rest")
+    add("--folds", type=int, default=5, help="number of held-out blocks of time (5)")
+    add("--reference", metavar="MODEL", help="another model, whose coefficients are listed for comparison")
 
 
 def diagnose(parser: argparse.ArgumentParser) -> None:
@@ -96,7 +106,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
     add("--model", required=True, help="a model file, or quill")
-    add("--out", type=Path, required=True, metavar="DIR", help="diagnosis.json, model.toml and report.html come there")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
     _page(parser)
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
@@ -106,7 +116,7 @@ def replay(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `replay`."""
     add = parser.add_argument
     add("recording", type=Path, nargs="+", metavar="FILE.mcap", help="recordings, or a folder of them")
-    add("--public-key", type=Path, metavar="FILE", help="Ed25519 key, PEM, that they must be signed with")
+    add("--public-key", type=Path, metavar="FILE", help="Ed25519 public key, PEM, of their signatures")
     add("--model", metavar="OTHER", help="no audit: what this model would have done; a model file, or quill")
     add("--out", type=Path, metavar="CSV", help="with --model: both offsets, sample by sample")
     _page(parser)
@@ -116,7 +126,7 @@ def replay(parser: argparse.ArgumentParser) -> None:
 def report(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `report`."""
     add = parser.add_argument
-    words = "recordings, a folder of them, or a folder that demo, identify or diagnose made"
+    words = "recordings, a folder of them, or a folder with results of demo, identify or diagnose"
     add("what", type=Path, nargs="+", metavar="DIR_OR_FILE", help=words)
     words = "the page: .html, .pdf, or .png for its first picture (default: NAME-report.html here)"
     add("--out", type=Path, metavar="FILE", help=words)
@@ -129,44 +139,47 @@ def adopt(parser: argparse.ArgumentParser) -> None:
 
 
 def back(parser: argparse.ArgumentParser) -> None:
-    """Describe the arguments of `back`, which `adopt` has too."""
-    of_service(parser)
+    """Describe the arguments of `back`; `adopt` has them as well."""
+    run(parser)
     add = parser.add_argument
     add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
-    words = "take it even where the recordings do not determine its state; the standard deviation says what that costs"
+    words = "adopt it even where the recordings do not determine its state; its standard deviation is then larger"
     add("--force", action="store_true", help=words)
     add("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the service's reply, s (60)")
 
 
-def order(parser: argparse.ArgumentParser) -> None:
-    """Describe the arguments of `hold` and `resume`, which `zero` has too."""
+def hold(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `hold` and `resume`; `zero` has them as well."""
     add = parser.add_argument
-    add("--config", metavar="FILE", help="configuration of the service; where it is not at hand, --prefix and --zenoh")
+    add("--config", metavar="FILE", help="configuration of the service; without it, --prefix and --zenoh")
     add("--prefix", metavar="PREFIX", help="zenoh.prefix of the machine, such as shop/vmc-07")
     add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
     add("--timeout", type=float, default=5.0, metavar="S", help="how long to wait for the service's reply, s (5)")
 
 
+resume = hold
+
+
 def zero(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `zero`."""
-    order(parser)
-    words = "rest: the machine is at rest; warm: it is not; auto (the default): the service judges"
+    hold(parser)
+    words = "rest: the machine is at rest; warm: it is not; auto (the default): the service decides"
     parser.add_argument("--mode", choices=("auto", "rest", "warm"), default="auto", help=words)
 
 
 def router(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `router`."""
     add = parser.add_argument
-    add("--config", required=True, type=Path, metavar="FILE", help="Zenoh's own configuration, as zenohd takes it")
-    add("--check", action="store_true", help="look at the configuration, open nothing")
-    words = "have Zenoh log to stdout as well; warn says why a link is refused"
+    add("--config", required=True, type=Path, metavar="FILE", help="Zenoh's own configuration, as for zenohd")
+    add("--check", action="store_true", help="check the configuration, open nothing")
+    words = "let Zenoh log to stdout; warn shows why a link is refused"
     add("--log", choices=("error", "warn", "info", "debug"), help=words)
 
 
 def watch(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `watch`."""
     add = parser.add_argument
-    words = "listen where the service of this configuration is reached, and show its last day from its recordings"
+    words = "watch the service of this configuration, with its last day from its recordings"
     add("--config", metavar="FILE", help=words)
     words = "listen at this endpoint, such as tcp/127.0.0.1:7447; may be repeated, the first that answers is used"
     add("--connect", action="append", default=[], metavar="ENDPOINT", help=words)
@@ -174,10 +187,10 @@ def watch(parser: argparse.ArgumentParser) -> None:
     add("--zenoh", type=Path, metavar="FILE", help=words)
     words = "watch this machine, or all below (default: that of the configuration, else everything)"
     add("--prefix", help=words)
-    add("--once", action="store_true", help="look once and end; --json does so, too")
-    add("--wait", type=float, default=0.0, metavar="S", help="with --once: listen for so long as well, s (0)")
+    add("--once", action="store_true", help="look once and end, as --json does")
+    add("--wait", type=float, default=0.0, metavar="S", help="with --once: how long to listen, s (0)")
     add("--page", action="store_true", help="serve a live page on 127.0.0.1 instead of drawing in the terminal")
-    add("--port", type=int, default=8710, help="port of the page (8710; 0 takes a free one)")
+    add("--port", type=int, default=8710, help="port of the page (8710; 0: any free one)")
     words = "record everything that arrives, of all machines, as MCAP in this folder"
     add("--record", type=Path, metavar="FOLDER", help=words)
     add("--foxglove", action="store_true", help="serve Foxglove on 127.0.0.1 (needs the extra foxglove)")

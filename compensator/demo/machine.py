@@ -53,8 +53,8 @@ def hardware(world: World) -> Iterator[Hardware]:
     """
     source = world.source
     with Rack() as rack:
-        spindle = IcpDas("m-7018r", couples="K", sources={0: source("t_q_degc")})
-        cabinet = IcpDas("et-7018z", couples="T", sources={0: source("at_degc")})
+        spindle = IcpDas("m-7018r", ranges="K", sources={0: source("t_q_degc")})
+        cabinet = IcpDas("et-7018z", ranges="T", sources={0: source("at_degc")})
         rtu = rack.add(ModbusRtuLine({1: spindle}))
         tcp = rack.add(ModbusTcpServer({1: cabinet}))
         plc = rack.add(
@@ -69,7 +69,7 @@ def hardware(world: World) -> Iterator[Hardware]:
                 }
             )
         )
-        dcon = rack.add(DconLine({2: IcpDas("m-7018r", couples="K", sources={0: source("base_degc")})}))
+        dcon = rack.add(DconLine({2: IcpDas("m-7018r", ranges="K", sources={0: source("base_degc")})}))
         capa = rack.add(CapaNcdt({1: lambda: PROBE_RANGE_UM / 2 + source("y_um")()}, PROBE_RANGE_UM))
         lines = {
             "rtu": rtu.port,

@@ -1,11 +1,11 @@
-"""Brings the published offset to a control: checks, follows, limits, holds, and says why.
+"""Bring the published offset to a control: check, follow, limit, hold, and give the reasons.
 
 Stands alone: this folder needs Python 3.11 and `eclipse-zenoh` and nothing else of the package, so it may be copied
-beside a control's own program. `Follower` is the whole of the behaviour and knows no clock, thread or socket;
-`Receiver` is the thin layer of Zenoh around it.
+into a control's own program. `Follower` is the whole behaviour, without clock, thread or socket; `Receiver` is the thin
+layer of Zenoh around it.
 
 ```
-ReceiverError            one line: file, key, value, what was expected; the receiver cannot be started like this
+ReceiverError            the receiver cannot be started: one line with file, key, value and what was expected
 ```
 """
 

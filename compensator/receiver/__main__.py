@@ -1,4 +1,4 @@
-"""`python -m compensator.receiver --config receiver.toml`: shows what a control would apply; writes to none."""
+"""`python -m compensator.receiver --config receiver.toml`: show what a control would apply; write to none."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def main() -> int:
     except ReceiverError as error:
         sys.stderr.write(f"compensator.receiver: {error}\n")
         return error.exit_code
-    said: object = None
+    reported: object = None
     with receiver:
         while not ended.wait(0.1):
             applied = receiver.poll()
-            # A changed number in a detail (an age, a way to go) is no news.
+            # A changed figure in a detail (an age, a distance) is not worth a line.
             news = (applied.seq, applied.state, tuple(reason.code for reason in applied.reasons))
-            if news != said:
-                said = news
+            if news != reported:
+                reported = news
                 sys.stdout.write(applied.text + "\n")
                 sys.stdout.flush()
     return 0

@@ -1,4 +1,4 @@
-"""The receiver's one error: it cannot be started like this. Whatever arrives is data, and never raises."""
+"""The receiver's one error: it cannot be started. Messages that arrive are data, and never raise."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What a receiver does with offsets: pure behaviour, no thread, clock or socket.
+"""The receiver's behaviour, without thread, clock or socket.
 
-The applied offset is moved by one function only, `Follower.advance`, and never by more than
-`offset_rate_max_um_per_min` allows for the time since the call before (and never for more than `step_max_s` of it).
-So nothing can jump: not a start, a message, a new service, a reconnection, or a program that was stopped for an hour.
+Only `Follower.advance` moves the applied offset, by at most what `offset_rate_max_um_per_min` allows for the time since
+the previous call (and for at most `step_max_s` of it). So a start, a message, a new service, a reconnection, or a
+program that was stopped for an hour cannot make it jump.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from .errors import ReceiverError
 from .message import OffsetMessage, Rejected, parse_offset
 from .reasons import Reason
 
-#: Part of `valid_for_s` for which the published rate is followed: it is the growth until the next sample, and
-#: services allow two to three samples.
+#: Part of `valid_for_s` for which the published rate is followed: the rate holds until the next sample, and a message
+#: is valid for two to three samples.
 RATE_PART = 0.5
 #: Closer than this the offset counts as arrived, µm.
 ARRIVED_UM = 0.01
@@ -39,7 +39,7 @@ class Limits:
     step_max_s : float
         Longest time between two calls of `advance` that counts for moving, s.
     clock_tolerance_s : float
-        How far in the future a message may lie by the wall clock, s.
+        How far a message may be ahead of the wall clock, s.
     """
 
     offset_max_um: float
@@ -57,16 +57,16 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Applied:
-    """What is to be applied now, and why.
+    """The offset to apply now, and why.
 
     Parameters
     ----------
     offset_um : float
         To be added to the commanded Y, µm.
     state : str
-        `starting`: nothing usable yet, what was there stands; `following`; `holding`; `fading`: to zero, on demand.
+        `starting`: no usable message yet, the offset stays; `following`; `holding`; `fading`: to zero, on demand.
     reasons : tuple of Reason
-        Why it does not follow, or follows with a remark; in words by `Reason.text`.
+        Why it does not follow, or remarks while it does; in words by `Reason.text`.
     arrived : bool
         Whether the offset is where it should be; false while it holds.
     age_s : float or None
@@ -87,9 +87,15 @@ class Applied:
 
     @property
     def text(self) -> str:
-        """Return it as one line for people."""
+        """Return offset, state and reasons as one line for people."""
         why = " ".join(reason.marked for reason in self.reasons)
         return f"{self.offset_um:+.2f} µm, {self.state}" + (f": {why}" if why else "")
+
+    @property
+    def steady_reasons(self) -> str:
+        """Return the reasons without the figures that change at every call, for logs that report changes only."""
+        changing = ("catching_up", "expired")
+        return " ".join((Reason(r.code) if r.code in changing else r).marked for r in self.reasons)
 
 
 @dataclass(slots=True)
@@ -112,14 +118,14 @@ class Follower:
     limits : Limits
         What it may do.
     applied_um : float
-        What is applied at the control already, µm; it moves on from there.
+        Offset at the control at the start, µm; it moves from there.
     last_sequence : int
-        Highest number that was used before a restart; −1 where none is known.
+        Highest number used before a restart; −1 where none is known.
 
     Raises
     ------
     ReceiverError
-        Where what is applied already is not a number within the limits: a person has to put that right first.
+        Where the offset at the control is not a number within the limits: a person has to correct it first.
 
     Examples
     --------
@@ -131,7 +137,7 @@ class Follower:
     ...     b'"reasons": [], "model_sha256": ""}')
     True
     >>> print(follower.advance(1.0).text)  # 6 µm/min: 0.1 µm in a second
-    +1.90 µm, following: The offset is still under way at the permitted rate. (to -12.00 µm) [catching_up]
+    +1.90 µm, following: The offset is still moving to its value at the permitted rate. (to -12.00 µm) [catching_up]
     """
 
     machine: str
@@ -144,12 +150,12 @@ class Follower:
     _rejected: Reason | None = None
     _mode: Literal["follow", "hold", "fade"] = "follow"
     _fade_rate_um_per_min: float = 0.0
-    _before_s: float | None = None
+    _advanced_s: float | None = None
 
     def __post_init__(self) -> None:
         self.rebase(self.applied_um)
 
-    # ------------------------------------------------------------------ what others want
+    # ------------------------------------------------------------------ modes
 
     def follow(self) -> None:
         """Follow the machine, again after `hold` or `fade`."""
@@ -160,7 +166,7 @@ class Follower:
         self._mode = "hold"
 
     def fade(self, rate_um_per_min: float) -> None:
-        """Take the offset away, at this rate and never faster than the limit; nothing else ever does so.
+        """Move the offset to zero, at this rate and never faster than the limit; nothing else does so.
 
         Raises
         ------
@@ -172,24 +178,24 @@ class Follower:
         self._mode, self._fade_rate_um_per_min = "fade", rate_um_per_min
 
     def rebase(self, applied_um: float) -> None:
-        """Go on from what the control holds, where that is not what was applied last.
+        """Continue from the offset that the control holds, where it is not the one applied last.
 
         Raises
         ------
         ReceiverError
-            Where that is not a number within the limits.
+            Where it is not a number within the limits.
         """
         if not (math.isfinite(applied_um) and abs(applied_um) <= self.limits.offset_max_um):
             raise ReceiverError(
                 f"applied offset = {applied_um} µm: expected at most offset_max_um = {self.limits.offset_max_um:g}; "
-                f"put the control right first"
+                f"correct the control first"
             )
         self.applied_um = float(applied_um)
 
-    # ------------------------------------------------------------------ what arrives
+    # ------------------------------------------------------------------ messages
 
     def receive(self, now_s: float, payload: bytes, *, age_s: float | None = None, asked: bool = False) -> bool:
-        """Take a message, or drop it with a reason.
+        """Accept a message, or drop it with a reason.
 
         Parameters
         ----------
@@ -198,10 +204,10 @@ class Follower:
         payload : bytes
             As it arrived.
         age_s : float, optional
-            Wall clock minus the message's time, s, where that is to be judged; else it counts as measured just now.
-            From here on only the monotonic clock counts, so a wall clock that is set later changes nothing.
+            Wall clock minus the message's time, s, where it is to be checked; else the message counts as measured just
+            now. From here on only the monotonic clock counts, so setting the wall clock later changes nothing.
         asked : bool
-            Whether it is the answer to a query: an answer may be overtaken by a newer message, and that is no replay.
+            Whether it is the answer to a query: a newer message may overtake an answer, which is not a replay.
 
         Returns
         -------
@@ -226,8 +232,8 @@ class Follower:
     def _check(self, message: OffsetMessage, age_s: float | None, asked: bool) -> bool:
         if message.machine != self.machine:
             raise Rejected(Reason("other_machine", f"{message.machine[:64]}, expected {self.machine}"))
-        # The same message twice is what a query at the start brings about. After a restart the newest one may be
-        # asked for again; its age is judged like any other's.
+        # A query at the start brings the same message twice. After a restart the newest one may be queried again; its
+        # age is checked like any other's.
         again = message.seq == self.last_sequence
         if again and (self._held is not None or not asked):
             if self._held is not None and message == self._held.message:
@@ -250,22 +256,22 @@ class Follower:
         if age_s > min(message.valid_for_s, self.limits.valid_max_s):
             raise Rejected(Reason("late", f"{age_s:.1f} s old by the wall clock, valid for {message.valid_for_s:g} s"))
 
-    # ------------------------------------------------------------------ what is applied
+    # ------------------------------------------------------------------ the applied offset
 
     def advance(self, now_s: float, payload: bytes | None = None) -> Applied:
-        """Move on in time and say what is to be applied; the only way in which the offset ever moves.
+        """Advance in time and return the offset to apply; nothing else moves the offset.
 
         Parameters
         ----------
         now_s : float
-            Monotonic clock, s. One that goes back counts as standing still.
+            Monotonic clock, s. One that goes back counts as stopped.
         payload : bytes, optional
-            A message that arrived just now.
+            A message that has just arrived.
         """
         if payload is not None:
             self.receive(now_s, payload)
-        elapsed_s = 0.0 if self._before_s is None else now_s - self._before_s
-        self._before_s = now_s
+        elapsed_s = 0.0 if self._advanced_s is None else now_s - self._advanced_s
+        self._advanced_s = now_s
         step_s = min(max(elapsed_s, 0.0), self.limits.step_max_s)
         state, target_um, reasons = self._wanted(now_s)
         arrived = False
@@ -291,15 +297,15 @@ class Follower:
         )
 
     def _move(self, target_um: float, step_um: float) -> None:
-        way = target_um - self.applied_um
-        if abs(way) <= step_um:
+        distance_um = target_um - self.applied_um
+        if abs(distance_um) <= step_um:
             self.applied_um = target_um
         else:
-            moved = self.applied_um + math.copysign(step_um, way)
+            moved = self.applied_um + math.copysign(step_um, distance_um)
             self.applied_um = max(-self.limits.offset_max_um, min(self.limits.offset_max_um, moved))
 
     def _wanted(self, now_s: float) -> tuple[FollowerState, float | None, list[Reason]]:
-        """Return the state, where the offset should be (None: where it is), and the reasons so far."""
+        """Return the state, the target of the offset (None: it stays), and the reasons so far."""
         reasons = [] if self._rejected is None else [self._rejected]
         if self.alive is False:
             reasons.append(Reason("service_gone"))
@@ -329,5 +335,5 @@ class Follower:
     # ------------------------------------------------------------------ over a restart
 
     def snapshot(self) -> dict[str, Any]:
-        """Return what must outlive a restart."""
+        """Return what must survive a restart."""
         return {"machine": self.machine, "last_sequence": self.last_sequence}

@@ -1,4 +1,4 @@
-"""One published offset, checked to the last key: what is not wholly right is dropped with a reason."""
+"""One published offset, every key checked: a message with any error is dropped with a reason."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class OffsetMessage:
     Parameters
     ----------
     machine : str
-        Whose.
+        Machine that published it.
     seq : int
         Never repeats for a machine.
     time_utc_ns : int
@@ -48,7 +48,7 @@ class OffsetMessage:
     y_offset_um : float or None
         To be added to the commanded Y, µm; a number whenever the state is `ok` or `degraded`.
     y_offset_rate_um_per_min : float
-        How it goes on until the next one, µm/min; 0 where none is known.
+        Rate until the next offset, µm/min; 0 where none is known.
     state : str
         `starting`, `ok`, `degraded`, `hold` or `fault`.
     reasons : tuple of str
@@ -71,7 +71,7 @@ class OffsetMessage:
 
 
 def parse_offset(payload: bytes) -> OffsetMessage:
-    """Decode and check a payload; keys that are not known are left alone.
+    """Decode and check a payload; unknown keys are ignored.
 
     Raises
     ------
@@ -124,14 +124,14 @@ def _decode(payload: bytes) -> dict[str, Any]:
 
 
 def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is no JSON number")
+    raise ValueError(f"{name} is not a JSON number")
 
 
 def _pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Two values under one key: nobody can say which one is meant."""
+    """Refuse two values under one key: either could be meant."""
     table = dict(pairs)
     if len(table) != len(pairs):
-        raise ValueError("a key stands twice")
+        raise ValueError("a key occurs twice")
     return table
 
 
@@ -147,8 +147,8 @@ def _integer(table: dict[str, Any], key: str) -> int:
 
 
 def _number(table: dict[str, Any], key: str) -> float | None:
-    """Return a finite number or None for null; a key that is missing is an error, as is anything else."""
-    value = table.get(key, "nothing")
+    """Return a finite number, or None for null; a missing key or any other value is an error."""
+    value = table.get(key, "missing")
     if value is None:
         return None
     if not isinstance(value, (int, float)) or isinstance(value, bool):

@@ -6,7 +6,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,18 +30,18 @@ class Settings:
     offset_rate_max_um_per_min : float
         Largest rate, µm/min; not below the service's, or the offset lags behind.
     connect : tuple of str
-        Where router or service are found, such as `tcp/127.0.0.1:7447`. Either this or `zenoh_config`.
+        Addresses of router or service, such as `tcp/127.0.0.1:7447`. Either this or `zenoh_config`.
     zenoh_config : str
         A Zenoh configuration (JSON5) of mode `client`, with certificates for instance; relative to the file.
     check_clock : bool
-        Compare every message's time with the wall clock here, for hosts that keep their clocks together. Answers to
-        queries, and what arrives after a standstill, are compared in any case: their age shows in nothing else.
+        Compare every message's time with the wall clock here, for hosts with synchronised clocks. Answers to queries,
+        and messages after a standstill, are always compared: nothing else shows their age.
     clock_tolerance_s : float
-        How far a message may lie in the future, s.
+        How far a message may be ahead of the wall clock, s.
     valid_max_s : float
         Longest time that one message may be used, s.
     state_file : str
-        Keeps the last number over a restart, so that older messages stay dropped; relative to the file. Empty: none.
+        Keeps the last number over a restart, so that older messages are still dropped; relative to the file.
     """
 
     machine: str
@@ -118,19 +118,18 @@ def settings_from(table: Mapping[str, Any], *, source: str, folder: Path | None 
     settings = read_table(Settings, table, source=source, name="receiver")
     _check(settings, source)
     folder = Path() if folder is None else folder
-    absolute = {
+    absolute: dict[str, Any] = {
         key: str((folder / getattr(settings, key)).resolve()) if getattr(settings, key) else ""
         for key in ("zenoh_config", "state_file")
     }
-    values = {field.name: getattr(settings, field.name) for field in fields(settings)}
-    return Settings(**{**values, **absolute})
+    return replace(settings, **absolute)
 
 
 def _check(settings: Settings, source: str) -> None:
     if not settings.machine:
         raise ReceiverError(f"{source}: receiver.machine = '': expected the service's machine.name")
     if not _PREFIX.fullmatch(settings.prefix):
-        raise ReceiverError(f"{source}: receiver.prefix = {settings.prefix!r}: expected names parted by /")
+        raise ReceiverError(f"{source}: receiver.prefix = {settings.prefix!r}: expected names separated by /")
     if bool(settings.connect) == bool(settings.zenoh_config):
         raise ReceiverError(
             f"{source}: receiver.connect = {list(settings.connect)}: expected addresses such as "

@@ -1,8 +1,8 @@
 """The thin layer of Zenoh around `Follower`.
 
-Everything is taken out of Zenoh's buffers in `poll`, on the caller's thread: no callback runs beside it, a slow caller
-blocks nobody, and no thread hangs the program's exit. Only the first connection is made by a thread of its own,
-because an address that does not answer would keep the caller's loop waiting.
+`poll` empties Zenoh's buffers on the caller's thread: there are no callbacks, a slow caller blocks nothing, and no
+thread delays the program's exit. Only the first connection is made by a separate thread, because an address that does
+not answer would block the caller's loop.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -23,17 +24,17 @@ from .follower import Applied, Follower
 from .reasons import Reason
 from .settings import Settings
 
-#: One try to reach the router, ms, and the pause before the next, s.
+#: One attempt to reach the router, ms, and the pause before the next, s.
 CONNECT_TIMEOUT_MS = 1000
 CONNECT_PAUSE_S = 0.5
-#: How long an answer to "what is the latest?" is waited for, ms.
+#: How long to wait for the answer to the query of the latest offset, s.
 ANSWER_TIMEOUT_S = 5.0
 _BUFFER = 32
 _CONNECTING = Reason("not_connected")
 
 
 def monotonic_s() -> float:
-    """Return a clock that nobody sets and that goes on while the computer sleeps, s."""
+    """Return a clock that cannot be set and that runs while the computer sleeps, s."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
@@ -50,7 +51,7 @@ def client_config(settings: Settings) -> Any:
             config = zenoh.Config.from_file(settings.zenoh_config)
         except zenoh.ZError as error:
             raise ReceiverError(f"{settings.zenoh_config}: {error}; expected a Zenoh configuration") from error
-        # Between two peers a router passes nothing on, and nobody would say so.
+        # A router forwards nothing between two peers, and no message would say so.
         if json.loads(config.get_json("mode") or "null") != "client":
             raise ReceiverError(f"{settings.zenoh_config}: mode = {config.get_json('mode')}: expected 'client'")
     else:
@@ -72,19 +73,19 @@ class Receiver:
     Parameters
     ----------
     settings : Settings
-        Whose offset, from where, and what it may do.
+        Machine, addresses and limits.
     applied_um : float
-        What is applied at the control already, µm.
+        Offset at the control at the start, µm.
     step_max_s : float
-        Longest time between two calls of `poll` that counts, s: the offset moves for no more than that, and what
-        arrives after a longer one is used only if the wall clock says that it is fresh.
+        Longest time between two calls of `poll` that counts, s: the offset moves for no more than that, and messages
+        after a longer pause are used only if they are fresh by the wall clock.
     clock, utc_ns : callable, optional
         Monotonic clock, s, and wall clock, ns.
 
     Attributes
     ----------
     follower : Follower
-        Take `follow`, `hold`, `fade` and `rebase` from here.
+        Has `follow`, `hold`, `fade` and `rebase`.
 
     Raises
     ------
@@ -128,7 +129,7 @@ class Receiver:
         self.close()
 
     def close(self) -> None:
-        """Leave Zenoh; may be called twice. What is applied at the control stands."""
+        """Leave Zenoh; may be called twice. The offset at the control stays."""
         self._ended.set()
         if self._opener.is_alive():
             self._opener.join(CONNECT_TIMEOUT_MS / 1000.0 + 2.0)
@@ -143,55 +144,45 @@ class Receiver:
         """Whether the first connection was made."""
         return self._session is not None
 
-    # ------------------------------------------------------------------ the loop's part
+    # ------------------------------------------------------------------ the loop
 
     def poll(self) -> Applied:
-        """Take what arrived, move on in time, and say what is to be applied; never waits."""
+        """Process new messages, advance in time, and return the offset to apply; never waits."""
         now_s = self._clock()
-        # After a standstill of this program nobody knows how long a message has been waiting.
-        stood = self._polled_s is not None and now_s - self._polled_s > self.follower.limits.step_max_s
+        # After a standstill of this program a message may have been waiting for any time.
+        paused = self._polled_s is not None and now_s - self._polled_s > self.follower.limits.step_max_s
         self._polled_s = now_s
         if self._session is None and self._opened:
             self._declare(self._opened.pop())
         if self._session is not None:
-            self._take_tokens()
-            self._take_answers(now_s)
+            self._receive_tokens()
+            self._receive_answers(now_s)
             while (sample := self._offsets.try_recv()) is not None:
-                self._take(now_s, sample, judge=stood or self._settings.check_clock, asked=False)
+                self._receive(now_s, sample, check_age=paused or self._settings.check_clock, asked=False)
         applied = self.follower.advance(now_s)
         remarks = tuple(r for r in (self._remark, None if self.connected else _CONNECTING) if r is not None)
-        if not remarks:
-            return applied
-        return Applied(
-            offset_um=applied.offset_um,
-            state=applied.state,
-            reasons=applied.reasons + remarks,
-            arrived=applied.arrived,
-            age_s=applied.age_s,
-            seq=applied.seq,
-            service_state=applied.service_state,
-        )
+        return replace(applied, reasons=applied.reasons + remarks)
 
-    def _take(self, now_s: float, sample: Any, *, judge: bool, asked: bool) -> None:
+    def _receive(self, now_s: float, sample: Any, *, check_age: bool, asked: bool) -> None:
         payload = sample.payload.to_bytes() if sample.kind == zenoh.SampleKind.PUT else b""
-        age_s = (self._utc_ns() - _time_of(payload)) / 1e9 if judge else None
+        age_s = (self._utc_ns() - _time_of(payload)) / 1e9 if check_age else None
         if self.follower.receive(now_s, payload, age_s=age_s, asked=asked):
             self._save()
 
-    def _take_answers(self, now_s: float) -> None:
+    def _receive_answers(self, now_s: float) -> None:
         for answers in list(self._answers):
             try:
                 while (reply := answers.try_recv()) is not None:
                     if reply.ok is not None:
-                        self._take(now_s, reply.ok, judge=True, asked=True)
+                        self._receive(now_s, reply.ok, check_age=True, asked=True)
             except zenoh.ZError:  # all answers are in
                 self._answers.remove(answers)
 
-    def _take_tokens(self) -> None:
+    def _receive_tokens(self) -> None:
         while (token := self._tokens.try_recv()) is not None:
             self.follower.alive = token.kind == zenoh.SampleKind.PUT
-            if self.follower.alive:  # a service, or the way to it, is new: it may have published meanwhile
-                self._ask()
+            if self.follower.alive:  # a new service, or a new route to it: it may have published meanwhile
+                self._query_latest()
 
     # ------------------------------------------------------------------ connecting
 
@@ -213,11 +204,11 @@ class Receiver:
         self._session = session
         self._offsets = session.declare_subscriber(self._key("y/offset"), ring(_BUFFER))
         self._tokens = session.liveliness().declare_subscriber(self._key("alive"), ring(_BUFFER), history=True)
-        self._ask()
+        self._query_latest()
 
-    def _ask(self) -> None:
+    def _query_latest(self) -> None:
         if len(self._answers) < _BUFFER:
-            # A ring would take the answers with it when the last one is in.
+            # A ring would lose the answers when the query ends.
             handler: Any = zenoh.handlers.FifoChannel(_BUFFER)
             self._answers.append(self._session.get(self._key("y/offset"), handler, timeout=ANSWER_TIMEOUT_S))
 
@@ -258,7 +249,7 @@ class Receiver:
 
 
 def _time_of(payload: bytes) -> int:
-    """Return the message's own time, ns; 0 (so: too old) where there is none, the check of the message says why."""
+    """Return the message's own time, ns; 0 (too old) where there is none: the check of the message gives the reason."""
     try:
         value = json.loads(payload)["time_utc_ns"]
     except (ValueError, TypeError, KeyError, RecursionError):

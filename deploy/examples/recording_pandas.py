@@ -1,4 +1,4 @@
-"""A recording in pandas: how well the offset fits what was measured.  python recording_pandas.py FILE.mcap."""
+"""A recording in pandas: how well the offset fits the measured deformation.  python recording_pandas.py FILE.mcap."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def main(path: str) -> None:
     data.index = pd.to_datetime(data["time_utc_ns"], utc=True)
     print(f"{len(data)} samples, {data.index[0]:%Y-%m-%d %H:%M} to {data.index[-1]:%H:%M} UTC")
     print(data["state"].value_counts().to_string())
-    # The offset is added to the commanded Y: what is left of the deformation is their sum.
+    # The offset is added to the commanded Y: the remaining error is the sum of both.
     data["left_um"] = data["y_um"] + data["y_offset_um"]
     print(data[["y_um", "y_offset_um", "left_um"]].astype(float).describe().loc[["mean", "std", "min", "max"]].round(2))
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-2.0-or-later
-"""From a wanted offset to `axis.L.eoffset-counts`: what was lost is made good, and nothing jumps.
+"""From a wanted offset to `axis.L.eoffset-counts`: lost changes are repeated, and nothing jumps.
 
 LinuxCNC adds up *changes* of the counts, and only while the machine is on, homed, enabled and not being cleared; a
-change at any other time is gone for good. So the counts say nothing of the offset. What counts is
-`axis.L.eoffset-request`, the sum that LinuxCNC has taken, and each step here is the difference to it.
+change at any other time is lost. So the counts do not show the offset. `axis.L.eoffset-request` does, the sum that
+LinuxCNC has accepted, and each step here is the difference to it.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from dataclasses import dataclass
 
 #: Pause after the axis has become ready: `is-all-homed` reads true for a moment while LinuxCNC starts.
 SETTLE_S = 0.1
-#: How long a change of the counts may take to show in the request, and how many may get lost in a row.
+#: How long a change of the counts may take to show in the request, and how many may be lost in a row.
 ANSWER_S, MISSES_MAX = 0.2, 3
-#: While nothing arrives, one count is tried this often.
+#: While no change arrives, one count is tried this often.
 PAUSE_S = 1.0
-#: An offset that should move and does not is nudged after this, and again; the second time it counts as stuck.
+#: An offset that should move and does not is nudged after this time; after the second nudge it counts as stuck.
 NUDGE_S = 3.0
 #: Longest time between two steps that counts for moving.
 STEP_MAX_S = 0.02
 _COUNTS_MAX = 2**31 - 1
-_UNLINKED = "axis.L.eoffset-counts does not follow this component: link it, and nothing else to it"
+_UNLINKED = "axis.L.eoffset-counts does not follow this component: link it as the only writer"
 _UNHEARD = "axis.L.eoffset-request does not follow the counts"
-_STUCK = "axis.L.eoffset stays while eoffset-request asks: is OFFSET_AV_RATIO above 0?"
+_STUCK = "axis.L.eoffset does not follow eoffset-request: is OFFSET_AV_RATIO above 0?"
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class AxisView:
     scale_um : float
         µm for each count.
     request_um, eoffset_um : float
-        Sum that LinuxCNC has taken, and how far it has moved.
+        Sum that LinuxCNC has accepted, and how far it has moved.
     ready : bool
         Whether a change of the counts is taken and moves the axis at once.
     limited : bool
@@ -58,16 +58,16 @@ class Reconciler:
     Parameters
     ----------
     counts : int
-        `axis.L.eoffset-counts` as found: the first value that is written must be the one that is there.
+        `axis.L.eoffset-counts` as found: the first value written must be the present one.
     slew_um_per_s : float
-        How fast an offset that LinuxCNC has lost (off, cleared) is brought back.
+        How fast an offset that LinuxCNC has lost (off, cleared) is restored.
 
     Attributes
     ----------
     counts : int
-        What the component's pin must show.
+        Value of the component's pin.
     trouble : str
-        What keeps the offset from the axis, in words; empty where nothing does.
+        Why the offset does not reach the axis, in words; empty where it does.
     """
 
     def __init__(self, counts: int, slew_um_per_s: float) -> None:
@@ -85,7 +85,7 @@ class Reconciler:
         self._nudges = 0
 
     def step(self, now_s: float, wanted_um: float, view: AxisView) -> int:
-        """Return what the counts must be now.
+        """Return the counts to set now.
 
         Parameters
         ----------
@@ -98,12 +98,12 @@ class Reconciler:
         """
         elapsed_s = 0.0 if self._before_s is None else min(max(now_s - self._before_s, 0.0), STEP_MAX_S)
         self._before_s = now_s
-        # What is saved up is one count or one long step, never a whole pause.
+        # The allowance is limited to one count or one long step, never that of a whole pause.
         self._allowance_um = min(
             self._allowance_um + self._slew * elapsed_s, max(self._slew * STEP_MAX_S, view.scale_um)
         )
         if view.counts != self.counts:
-            # Not linked yet, or by another writer. Whoever links this pin must find the value that is there: the
+            # Not linked yet, or linked to another writer. The pin must have the present value when it is linked: a
             # difference would be a jump of any size.
             self.counts, self._expected = view.counts, None
             self._pause_until = now_s + PAUSE_S
@@ -123,7 +123,7 @@ class Reconciler:
         return self.counts
 
     def _waits(self, now_s: float, view: AxisView) -> bool:
-        """Whether the last change has not arrived yet."""
+        """Return whether the last change has not arrived yet."""
         if self._expected is None:
             return False
         request_um, until_s = self._expected
@@ -147,7 +147,7 @@ class Reconciler:
         if self._misses >= MISSES_MAX:
             self.trouble = _UNHEARD
         if self.trouble in (_UNLINKED, _UNHEARD):
-            # Nothing of what is written arrives. It must not pile up, or it all comes at once: a count a second.
+            # No change arrives. They must not pile up and come all at once: one count a second.
             if now_s < self._pause_until:
                 return
             self._pause_until = now_s + PAUSE_S
@@ -156,17 +156,17 @@ class Reconciler:
 
     def _change(self, now_s: float, delta: int, view: AxisView) -> None:
         if abs(self.counts + delta) > _COUNTS_MAX:
-            self.trouble = "axis.L.eoffset-counts is used up: start LinuxCNC anew"
+            self.trouble = "axis.L.eoffset-counts is exhausted: restart LinuxCNC"
             return
         self.counts += delta
         self._allowance_um = max(0.0, self._allowance_um - abs(delta) * view.scale_um)
         self._expected = (view.request_um + delta * view.scale_um, now_s + ANSWER_S)
 
     def _watch(self, now_s: float, view: AxisView) -> None:
-        """Notice an offset that stays where it should move.
+        """Detect an offset that should move and does not.
 
         LinuxCNC forgets the rest of a move that was interrupted in coordinated mode until the counts change again,
-        and without `OFFSET_AV_RATIO` it never moves at all; both without a word.
+        and without `OFFSET_AV_RATIO` it never moves; it reports neither.
         """
         moved = abs(view.eoffset_um - self._eoffset_um) > 0.1 * view.scale_um
         self._eoffset_um = view.eoffset_um

@@ -22,7 +22,7 @@ import hal
 import linuxcnc
 from reconcile import AxisView, Reconciler
 
-from compensator.receiver import Applied, Reason, Receiver, ReceiverError, load_settings
+from compensator.receiver import Applied, Receiver, ReceiverError, load_settings
 from compensator.receiver.settings import read_table
 from compensator.receiver.subscriber import monotonic_s
 
@@ -34,7 +34,7 @@ UNITS_UM = {"mm": 1000.0, "metric": 1000.0, "in": 25400.0, "inch": 25400.0, "imp
 
 @dataclass(frozen=True)
 class AxisSettings:
-    """`[axis]`: which axis, and how fast a lost offset is brought back."""
+    """`[axis]`: which axis, and how fast a lost offset is restored."""
 
     letter: str
     unit_um: float
@@ -57,14 +57,14 @@ def main() -> int:
         _check_ini(axis_settings)
         component = hal.component(arguments.name)  # pins can be read from here on
     except (ReceiverError, hal.error) as error:
-        say(f"{error}")
+        report(f"{error}")
         return 1
     try:
         axis = Axis(axis_settings)
         receiver = Receiver(settings, applied_um=axis.found_um())
         make_pins(component)
         reconciler = Reconciler(axis.view().counts, axis_settings.slew_um_per_s)
-        component["counts"] = reconciler.counts  # before anybody can link it
+        component["counts"] = reconciler.counts  # before it can be linked
         component.ready()
         with receiver:
             try:
@@ -73,14 +73,14 @@ def main() -> int:
                 # Before Zenoh is left: closing that takes a moment in which HAL would miss the component.
                 component.exit()
     except (ReceiverError, RuntimeError, hal.error) as error:  # RuntimeError: a pin that is not there
-        say(f"{error}")
+        report(f"{error}")
         component.exit()
         return 1
     return 0
 
 
 def make_pins(component: Any) -> None:
-    """Make the pins; what each means stands in README.md."""
+    """Make the pins; README.md says what each means."""
     for name in ("enable", "fade"):
         component.newpin(name, hal.HAL_BIT, hal.HAL_IN)
     component.newpin("counts", hal.HAL_S32, hal.HAL_OUT)
@@ -93,36 +93,29 @@ def make_pins(component: Any) -> None:
 
 
 def run(component: Any, receiver: Receiver, reconciler: Reconciler, axis: Axis, ended: Callable[[], bool]) -> None:
-    """Loop: what the receiver says, what the axis has, what the counts must be."""
-    said = ""
+    """Loop: poll the receiver, read the axis, set the counts."""
+    reported = ""
     while not ended():
-        _obey(component, receiver, axis.settings.fade_um_per_min)
+        _set_mode(component, receiver, axis.settings.fade_um_per_min)
         applied = receiver.poll()
         view = axis.view()
         component["counts"] = reconciler.step(monotonic_s(), applied.offset_um, view)
         _show(component, receiver, applied, view, reconciler)
-        words = " ".join(filter(None, (reconciler.trouble.replace("axis.L", axis.name), *_words(applied))))
+        words = " ".join(filter(None, (reconciler.trouble.replace("axis.L", axis.name), applied.steady_reasons)))
         news = f"{applied.state}{': ' if words else ''}{words}"
-        if news != said:
-            said = news
-            say(news)
+        if news != reported:
+            reported = news
+            report(news)
         time.sleep(PERIOD_S)
 
 
-def _obey(component: Any, receiver: Receiver, fade_um_per_min: float) -> None:
+def _set_mode(component: Any, receiver: Receiver, fade_um_per_min: float) -> None:
     if component["fade"]:
         receiver.follower.fade(fade_um_per_min)
     elif component["enable"]:
         receiver.follower.follow()
     else:
         receiver.follower.hold()
-
-
-def _words(applied: Applied) -> list[str]:
-    """Return the reasons that are news; the way to go and the age change all the time."""
-    return [reason.marked for reason in applied.reasons if reason.code not in ("catching_up", "expired")] + [
-        Reason(reason.code).marked for reason in applied.reasons if reason.code in ("catching_up", "expired")
-    ]
 
 
 def _show(component: Any, receiver: Receiver, applied: Applied, view: AxisView, reconciler: Reconciler) -> None:
@@ -142,7 +135,7 @@ def _show(component: Any, receiver: Receiver, applied: Applied, view: AxisView, 
 
 
 class Axis:
-    """The pins of LinuxCNC, read by their own names: a wire that somebody forgot would read 0 and never be noticed.
+    """The pins of LinuxCNC, read by their own names: a missing wire would read 0 without notice.
 
     Parameters
     ----------
@@ -158,7 +151,7 @@ class Axis:
         """Read the axis."""
         pin, unit = self.name, self.settings.unit_um
         moves = hal.get_value("motion.teleop-mode") or hal.get_value("motion.coord-mode")
-        # In joint mode a change is taken, and moves the axis at its own speed when the mode is left.
+        # In joint mode a change is accepted, and moves the axis at its own speed when the mode is left.
         ready = bool(
             hal.get_value("motion.motion-enabled")
             and hal.get_value("motion.is-all-homed")
@@ -176,7 +169,7 @@ class Axis:
         )
 
     def found_um(self) -> float:
-        """Return the offset that the axis has already; while the machine is off its pins show an old one."""
+        """Return the offset that the axis has already; 0 while the machine is off, when its pins show an old one."""
         view = self.view()
         return view.request_um if view.ready else 0.0
 
@@ -193,7 +186,7 @@ def _axis_settings(tables: dict[str, Any], source: str) -> AxisSettings:
     if settings.unit_um not in (1000.0, 25400.0):
         raise ReceiverError(f"{source}: axis.unit_um = {settings.unit_um:g}: expected 1000 (mm) or 25400 (inch)")
     if not 0.0 < settings.slew_um_per_s <= 100.0:
-        # A change of mode in the middle of an offset's move makes it jump by two servo periods' worth.
+        # A change of mode while the offset moves makes it jump by the motion of two servo periods.
         raise ReceiverError(f"{source}: axis.slew_um_per_s = {settings.slew_um_per_s:g}: expected above 0, at most 100")
     if not settings.fade_um_per_min > 0.0:
         raise ReceiverError(f"{source}: axis.fade_um_per_min = {settings.fade_um_per_min:g}: expected above 0")
@@ -201,7 +194,7 @@ def _axis_settings(tables: dict[str, Any], source: str) -> AxisSettings:
 
 
 def _check_ini(settings: AxisSettings) -> None:
-    """Refuse what LinuxCNC takes without a word and never moves with."""
+    """Refuse settings that LinuxCNC accepts silently and that never let it move."""
     path = os.environ.get("INI_FILE_NAME")
     if not path:
         return
@@ -221,7 +214,7 @@ def _check_ini(settings: AxisSettings) -> None:
         )
 
 
-def say(text: str) -> None:
+def report(text: str) -> None:
     """Write a line to LinuxCNC's terminal."""
     sys.stderr.write(f"thermal-offset: {text}\n")
     sys.stderr.flush()

@@ -13,7 +13,7 @@ def apply(offset_um: float, why: str) -> None:
 
 try:
     settings, _ = load_settings(sys.argv[1] if len(sys.argv) > 1 else "receiver.toml")
-    with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: what your control applies already
+    with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: the offset at your control now
         while True:
             applied = receiver.poll()
             apply(applied.offset_um, f"{applied.state} {' '.join(reason.marked for reason in applied.reasons)}")
@@ -21,4 +21,4 @@ try:
 except ReceiverError as error:
     sys.exit(f"follow.py: {error}")
 except KeyboardInterrupt:
-    pass  # what is applied stands
+    pass  # the applied offset stays

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Makes the router's configuration, access list included, of a list of who is there.
+"""Make the router's configuration, access list included, from a list of participants.
 
-Zenoh's rules go by the common name of a certificate, in both directions; what no rule allows is denied. A hand-written
-list that forgets one direction is silent, and one that allows too much is silent as well, so it is made here.
+Zenoh's rules go by the common name of a certificate, in both directions; what no rule allows is denied. Errors in a
+hand-written list, a missing direction or one right too many, show nowhere; so it is generated.
 
 example: access_list.py shop.toml > /etc/compensator/zenoh/router.json5
 """
@@ -25,12 +25,12 @@ KEYS = {
     "receiver": {"name", "machines"},
     "operator": {"name", "machines"},
 }
-#: What a receiver may ask for; anything else below a prefix comes by itself or is a command.
+#: What a receiver may query; anything else below a prefix is published or is a command.
 ANSWERED = ("thermal/y/offset", "thermal/status", "thermal/sample", "thermal/estimate")
 
 HEADER = """\
 // Configuration of the Zenoh router: compensator router --config router.json5, or zenohd --config router.json5.
-// Made by access_list.py of shop.toml: change that and make this anew.
+// Made by access_list.py from shop.toml: change that file and run the program again.
 """
 
 
@@ -40,34 +40,34 @@ def rule(name: str, flow: str, messages: list[str], keys: list[str]) -> dict[str
 
 
 def machine_rules(machine: dict[str, Any]) -> list[dict[str, Any]]:
-    """Let a service publish, answer and be alive below its own prefix, and hear whatever others may ask."""
+    """Let a service publish, answer and be alive below its own prefix, and receive subscriptions and queries."""
     name, own = machine["name"], [f"{machine['prefix']}/thermal/**"]
     return [
         rule(f"{name} publishes", "ingress", ["put", "reply", "declare_queryable", "liveliness_token"], own),
-        # It asks whether the machine has its service already.
-        rule(f"{name} asks", "ingress", ["liveliness_query"], own),
-        rule(f"{name} is told", "egress", ["liveliness_token"], own),
-        rule(f"{name} hears", "egress", ["declare_subscriber", "query"], ["**"]),
+        # It queries whether the machine has a service already.
+        rule(f"{name} queries", "ingress", ["liveliness_query"], own),
+        rule(f"{name} sees liveliness", "egress", ["liveliness_token"], own),
+        rule(f"{name} receives", "egress", ["declare_subscriber", "query"], ["**"]),
     ]
 
 
 def reading_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
-    """Let a receiver subscribe, ask for the latest and for who is alive, and say nothing."""
+    """Let a receiver subscribe, and query the latest and who is alive; it may send nothing else."""
     below = [prefix if prefix == "**" else f"{prefix}/**" for prefix in prefixes]
     asked = [f"{prefix}/{key}" for prefix in prefixes for key in ANSWERED]
     subscribes = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
     return [
         rule(f"{name} subscribes", "ingress", subscribes, below),
-        rule(f"{name} asks", "ingress", ["query"], asked),
+        rule(f"{name} queries", "ingress", ["query"], asked),
         rule(f"{name} reads", "egress", ["put", "reply", "liveliness_token"], below),
     ]
 
 
 def operator_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
-    """Let an operator read, and send commands in no name but the own.
+    """Let an operator read, and send commands in its own name only.
 
-    Commands without a name get through as well: the service answers in words that it takes none, unless
-    `zenoh.unproven_commands` is set there.
+    Commands without a name pass as well: the service refuses them in words, unless `zenoh.unproven_commands` is set
+    there.
     """
     own = [f"{prefix}/thermal/command/*{end}" for prefix in prefixes for end in (f"/{name}", "")]
     return [*reading_rules(name, prefixes), rule(f"{name} commands", "ingress", ["query"], own)]
@@ -79,7 +79,7 @@ def access_control(shop: dict[str, Any]) -> dict[str, Any]:
     rules: dict[str, list[dict[str, Any]]] = {name: machine_rules(machine) for name, machine in machines.items()}
     for role, make in (("receiver", reading_rules), ("operator", operator_rules)):
         for client in shop.get(role, []):
-            # Zenoh lets a subscription or a question through that one rule includes as a whole.
+            # Zenoh passes a subscription or query only where one rule includes all of it.
             prefixes = [machines[name]["prefix"] for name in client["machines"]] if "machines" in client else ["**"]
             rules[client["name"]] = make(client["name"], prefixes)
     return {
@@ -98,18 +98,18 @@ def router(shop: dict[str, Any]) -> dict[str, Any]:
         "mode": "router",
         "listen": {"endpoints": own["listen"]},
         "connect": {"endpoints": []},
-        # Who belongs here is configured; nobody is looked for, and nobody is told of anybody.
+        # Participants are configured: no scouting, no gossip.
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "adminspace": {"enabled": False},
         "transport": {
-            # A second link under the name of a client that is there is refused. After a power cut all come at once.
+            # A second link under the name of a connected client is refused. After a power cut all connect at once.
             "unicast": {"max_links": 1, "accept_pending": 1000},
-            # Else what is long would pass by the links, through memory that others on this computer can open.
+            # Else long messages would bypass the links, through memory that others on this computer can open.
             "shared_memory": {"enabled": False},
             "link": {
-                # Services whose clocks agree publish at one instant: a client's queue holds what a whole shop says.
+                # Services whose clocks agree publish at one instant: a client's queue holds a whole shop's messages.
                 "tx": {"queue": {"size": {"interactive_high": 16, "data": 16}}},
-                # Nobody needs more than a model file takes.
+                # A model file is the largest message.
                 "rx": {"max_message_size": 4 * 1024 * 1024},
                 "protocols": sorted({endpoint.split("/", 1)[0] for endpoint in own["listen"]}),
                 "tls": {
@@ -126,7 +126,7 @@ def router(shop: dict[str, Any]) -> dict[str, Any]:
 
 
 def checked(shop: dict[str, Any], source: Path) -> dict[str, Any]:
-    """Refuse what would give somebody other rights than were meant."""
+    """Refuse a list that would grant other rights than intended."""
 
     def refuse(text: str) -> None:
         sys.exit(f"{source}: {text}")
@@ -145,20 +145,22 @@ def checked(shop: dict[str, Any], source: Path) -> dict[str, Any]:
             if kind == "router":
                 continue
             if not NAME.fullmatch(table["name"]) or table["name"] in names:
-                refuse(f"{kind}: name {table['name']!r}, expected letters, digits, . _ - and no name twice in any role")
+                refuse(
+                    f"{kind}: name {table['name']!r}, expected letters, digits, . _ - and each name once, in one role"
+                )
             names.append(table["name"])
             if kind == "machine" and not PREFIX.fullmatch(table["prefix"]):
                 refuse(f"machine {table['name']!r}: prefix {table['prefix']!r}, expected words between single slashes")
             for machine in table.get("machines", []):
                 if machine not in [known["name"] for known in shop["machine"]]:
-                    refuse(f"{kind} {table['name']!r}: machine {machine!r} does not stand here")
+                    refuse(f"{kind} {table['name']!r}: machine {machine!r}: no such [[machine]]")
     prefixes = [machine["prefix"] for machine in shop["machine"]]
     for one in prefixes:
         if sum(other == one or other.startswith(f"{one}/thermal/") for other in prefixes) > 1:
-            refuse(f"machine: prefix {one!r} stands twice, or another lies below it")
+            refuse(f"machine: prefix {one!r} is used twice, or another is below it")
     for endpoint in shop["router"]["listen"]:
         if not endpoint.startswith(("tls/", "quic/")):
-            refuse(f"router: listen {endpoint!r}, expected tls/HOST:PORT: elsewhere nobody proves who he is")
+            refuse(f"router: listen {endpoint!r}, expected tls/HOST:PORT: only TLS proves who connects")
     return shop
 
 
@@ -166,7 +168,7 @@ def main() -> int:
     """Write the configuration to stdout."""
     text, _, example = (__doc__ or "").rpartition("\n\n")
     parser = argparse.ArgumentParser(description=text, epilog=example)
-    parser.add_argument("shop", type=Path, metavar="FILE", help="who is there, TOML")
+    parser.add_argument("shop", type=Path, metavar="FILE", help="the participants, TOML")
     path = parser.parse_args().shop
     try:
         shop = tomllib.loads(path.read_text(encoding="utf-8"))

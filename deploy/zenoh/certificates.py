@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Makes a small certificate authority and the certificates of router, machines, receivers and operators.
+"""Make a small certificate authority and the certificates of router, machines, receivers and operators.
 
-The common name of each certificate is what the router's access list goes by. Keys are written with mode 0600. Running
-it again keeps what is there and good, and makes only what is missing; `--renew` makes certificates with less than
-`--renew-below` days left anew. Needs the package cryptography (`pip install quill-compensator[tls]`).
+The router's access list goes by the common name of each certificate. Keys are written with mode 0600. Running it again
+keeps what is there and valid, and makes only what is missing; `--renew` replaces certificates with less than
+`--renew-below` days left. Needs the package cryptography (`pip install quill-compensator[tls]`).
 
 example: certificates.py keys --router localhost --machine vmc-07 --receiver cnc-07 --operator anna
 """
@@ -37,7 +37,7 @@ def now() -> datetime.datetime:
 
 
 def write(path: Path, data: bytes, mode: int) -> None:
-    """Write a file that never stands there with more rights or half its content."""
+    """Write a file that never exists with wider permissions or half its content."""
     part = path.with_name(f".{path.name}.part")
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
@@ -48,7 +48,7 @@ def write(path: Path, data: bytes, mode: int) -> None:
 
 
 def new_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    """Make a key, on disk before anything is signed with it."""
+    """Make a key, on disk before it signs anything."""
     key = ec.generate_private_key(ec.SECP256R1())
     form = serialization.PrivateFormat.PKCS8
     write(path, key.private_bytes(serialization.Encoding.PEM, form, serialization.NoEncryption()), 0o600)
@@ -56,7 +56,7 @@ def new_key(path: Path) -> ec.EllipticCurvePrivateKey:
 
 
 def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    """Read a key of ours; one that others can read is refused."""
+    """Read a key; refuse one that others can read."""
     if path.stat().st_mode & 0o077:
         sys.exit(f"{path}: mode {path.stat().st_mode & 0o777:04o}, expected 0600: chmod 600 {path}")
     key = serialization.load_pem_private_key(path.read_bytes(), None)
@@ -80,11 +80,11 @@ def authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.EllipticCur
     path, key_path = folder / "ca.pem", folder / "ca.key"
     if path.exists() != key_path.exists():
         missing = key_path if path.exists() else path
-        sys.exit(f"{missing}: missing beside the other half of the authority; nothing is overwritten")
+        sys.exit(f"{missing}: missing, but the other half of the authority exists; nothing is overwritten")
     if path.exists():
         return x509.load_pem_x509_certificate(path.read_bytes()), read_key(key_path)
     key = new_key(key_path)
-    # Two authorities of one name would look like one in a log.
+    # A log could not tell two authorities of one name apart.
     name = name_of(f"compensator CA {os.urandom(4).hex()}")
     certificate = (
         x509.CertificateBuilder()
@@ -104,7 +104,7 @@ def authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.EllipticCur
 
 
 def key_usage(*, sign: bool) -> x509.KeyUsage:
-    """Return what a key may do: sign certificates, or prove who one is."""
+    """Return the usage of a key: signing certificates, or authentication."""
     return x509.KeyUsage(
         digital_signature=not sign,
         content_commitment=False,
@@ -119,7 +119,7 @@ def key_usage(*, sign: bool) -> x509.KeyUsage:
 
 
 def alternative(host: str) -> x509.GeneralName:
-    """Return a host as it stands in a certificate: an address or a name."""
+    """Return a host as a certificate has it: an address or a name."""
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
@@ -158,8 +158,8 @@ def issue(
     write(folder / f"{stem}.pem", certificate.public_bytes(serialization.Encoding.PEM), 0o644)
 
 
-def stands(folder: Path, stem: str, name: str, ca: x509.Certificate, renew_below_days: float) -> bool:
-    """Tell whether a certificate is there, of this authority, with its key, and lasts long enough."""
+def is_valid(folder: Path, stem: str, name: str, ca: x509.Certificate, renew_below_days: float) -> bool:
+    """Return whether a certificate of this authority exists with its key and lasts long enough."""
     path, key_path = folder / f"{stem}.pem", folder / f"{stem}.key"
     if not path.exists() or not key_path.exists():
         return False
@@ -174,7 +174,7 @@ def stands(folder: Path, stem: str, name: str, ca: x509.Certificate, renew_below
 
 
 def main() -> int:
-    """Make what is missing and say what is there."""
+    """Make what is missing and list what is there."""
     made, arguments = [], parse()
     folder: Path = arguments.folder
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -184,7 +184,7 @@ def main() -> int:
         for name in getattr(arguments, role):
             for other in {*ROLES} - {role}:
                 if name in getattr(arguments, other) or (folder / f"{other}-{name}.pem").exists():
-                    sys.exit(f"{name}: both {role} and {other}; the access list goes by the name, expected two names")
+                    sys.exit(f"{name}: both {role} and {other}; the access list goes by the name, expected one role")
     wanted = [(f"{role}-{name}", name, []) for role in ROLES for name in getattr(arguments, role)]
     if arguments.router:
         wanted.insert(0, ("router", "router", arguments.router))
@@ -192,7 +192,7 @@ def main() -> int:
     if arguments.days < 0:  # an expired one, for tests
         begins = ends - datetime.timedelta(days=1)
     for stem, name, hosts in wanted:
-        if not stands(folder, stem, name, ca[0], arguments.renew_below if arguments.renew else -1e6):
+        if not is_valid(folder, stem, name, ca[0], arguments.renew_below if arguments.renew else -1e6):
             issue(folder, stem, name, hosts, ca, begins=begins, ends=ends)
             made.append(stem)
     for path in sorted(folder.glob("*.pem")):
@@ -206,13 +206,15 @@ def parse() -> argparse.Namespace:
     """Read the command line."""
     text, _, example = (__doc__ or "").rpartition("\n\n")
     parser = argparse.ArgumentParser(description=text, epilog=example)
-    parser.add_argument("folder", type=Path, metavar="DIR", help="where everything goes; no place in a repository")
+    parser.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder of keys and certificates; keep it out of repositories"
+    )
     parser.add_argument("--router", action="append", default=[], metavar="HOST", help="name or address of the router")
     for role in ROLES:
         parser.add_argument(f"--{role}", action="append", default=[], metavar="NAME", help="may be repeated")
     parser.add_argument("--days", type=int, default=825, help="how long certificates last (825)")
     parser.add_argument("--ca-days", type=int, default=3650, help="how long the authority lasts (3650)")
-    parser.add_argument("--renew", action="store_true", help="make those that end soon anew")
+    parser.add_argument("--renew", action="store_true", help="replace those that end soon")
     parser.add_argument("--renew-below", type=float, default=60.0, metavar="DAYS", help="what soon means (60)")
     arguments = parser.parse_args()
     for role in ROLES:

@@ -1,11 +1,11 @@
-"""What the families share: the settings of a module, and the poll of a Modbus module."""
+"""Shared by the families: settings of a module, its verification, and the poll of a Modbus module."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Generic, TypeVar
 
 import msgspec
 
@@ -13,16 +13,19 @@ from drivers.errors import DeviceRefused
 from drivers.lines.capancdt_link import CapancdtLink
 from drivers.lines.dcon_line import DconLine
 from drivers.lines.modbus_line import Member, ModbusLine, ModbusRefused
+from drivers.lines.shared_line import Place
 from drivers.protocols.modbus import READ_COILS, Request, fence_for
 from drivers.reading import Device, Reading
 from drivers.settings import Name, Where
 
 LOG = logging.getLogger(__name__)
 
+CheckT = TypeVar("CheckT")
+
 MODBUS = ("modbus-tcp", "modbus-rtu", "modbus-rtu-over-tcp")
 MODBUS_TCP = ("modbus-tcp",)
 
-# Exceptions by which a device says that it does not have what it was asked for.
+# Exceptions by which a device reports that it does not have the register.
 _NOT_THERE = {1, 2, 3}
 
 
@@ -34,7 +37,7 @@ class DeviceSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     name, line, model : str
         Name of the device, name of its line, and its model.
     inputs : list of dict
-        One table for each input that is read.
+        One table for each input read.
     """
 
     name: Name
@@ -65,7 +68,7 @@ class Family:
     Parameters
     ----------
     protocols : tuple of str
-        Of the lines it can hang on.
+        Of the lines that it can be on.
     kind : type
         Class of its settings.
     make : callable
@@ -82,7 +85,7 @@ Line = ModbusLine | DconLine | CapancdtLink
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """Something a module says of itself that must agree with the configuration.
+    """A setting of a module that must agree with the configuration.
 
     Parameters
     ----------
@@ -91,11 +94,11 @@ class Check:
     expected : Mapping
         Expected value by place in the answer.
     what : str
-        What the register holds, in words.
+        Content of the register, in words.
     mask : int
-        Bits of the register that count.
+        Bits of the register that are compared.
     words : callable
-        Puts a value in words.
+        Returns a value in words.
     """
 
     request: Request
@@ -105,40 +108,28 @@ class Check:
     words: Callable[[int], str] = "0x{:02X}".format
 
 
-class ModbusDevice:
-    """A Modbus module that is polled with a fixed set of requests.
+class Module(Generic[CheckT]):
+    """A module on a shared line: read and verified with the line to itself.
 
     Parameters
     ----------
-    about : ModbusSettings
-        Its settings.
-    line : ModbusLine
-        The line it hangs on.
+    name : str
+        Of the device, in the configuration.
     units : Mapping
-        Unit of each input.
-    polls : sequence of Request
-        What is read each time; the first one also serves to tell late answers apart.
-    checks : sequence of Check
-        What is compared after connecting.
+        Unit of each configured input.
+    place : Place
+        Its place on the line.
+    checks : sequence
+        Settings of the module that are verified after connecting.
     """
 
-    def __init__(
-        self,
-        about: ModbusSettings,
-        line: ModbusLine,
-        *,
-        units: Mapping[int, str],
-        polls: Sequence[Request],
-        checks: Sequence[Check] = (),
-    ) -> None:
-        self._name = about.name
+    def __init__(self, name: str, units: Mapping[int, str], place: Place, checks: Sequence[CheckT]) -> None:
+        self._name = name
         self._units = dict(units)
-        self._polls = tuple(polls)
-        self._checks = tuple(checks) if about.verify else ()
-        self._to_check: list[Check] = []
+        self._place = place
+        self._checks = tuple(checks)
+        self._to_check: list[CheckT] = []
         self._checked: tuple[int, int] | None = None
-        everything = (*self._polls, *(check.request for check in self._checks))
-        self._member: Member = line.join(about.name, about.address, fence_for(everything))
 
     @property
     def name(self) -> str:
@@ -158,42 +149,83 @@ class ModbusDevice:
         DriverError
             Naming the device, within about twice the line's `timeout_s` from when the device gets the line.
         """
-        return await self._member.serve(self._poll)
+        return await self._place.serve(self._verify_and_poll)
 
     async def close(self) -> None:
         """Leave the line; the last device on it closes it."""
-        await self._member.close()
+        await self._place.close()
+
+    async def _verify_and_poll(self) -> dict[int, Reading]:
+        """Verify once after each connecting or timeout, continuing where the last call ran out of time; then poll."""
+        if self._checked != self._place.generation:
+            self._to_check = list(self._checks)
+            self._checked = self._place.generation
+        while self._to_check:
+            more = await self._check(self._to_check[0])
+            self._to_check.pop(0)
+            self._to_check.extend(more)
+        return await self._poll()
+
+    async def _check(self, check: CheckT) -> Sequence[CheckT]:
+        """Compare one setting of the module with the configuration; return the checks that follow from it."""
+        raise NotImplementedError
+
+    async def _poll(self) -> dict[int, Reading]:
+        raise NotImplementedError
+
+
+class ModbusDevice(Module[Check]):
+    """A Modbus module that is polled with a fixed set of requests.
+
+    Parameters
+    ----------
+    config : ModbusSettings
+        Its settings.
+    line : ModbusLine
+        Its line.
+    units : Mapping
+        Unit of each input.
+    polls : sequence of Request
+        Read each time; the first one also serves to recognise late answers.
+    checks : sequence of Check
+        Compared after connecting.
+    """
+
+    def __init__(
+        self,
+        config: ModbusSettings,
+        line: ModbusLine,
+        *,
+        units: Mapping[int, str],
+        polls: Sequence[Request],
+        checks: Sequence[Check] = (),
+    ) -> None:
+        checks = checks if config.verify else ()
+        self._polls = tuple(polls)
+        fence = fence_for((*self._polls, *(check.request for check in checks)))
+        self._member: Member = line.join(config.name, config.address, fence)
+        super().__init__(config.name, units, self._member, checks)
 
     def readings(self, answers: Sequence[Sequence[int]]) -> dict[int, Reading]:
         """Turn the answers to the polls into readings."""
         raise NotImplementedError
 
     async def _poll(self) -> dict[int, Reading]:
-        await self._verify()
-        return self.readings([await self._take(request) for request in self._polls])
+        return self.readings([await self._request(request) for request in self._polls])
 
-    async def _take(self, request: Request) -> list[int]:
+    async def _request(self, request: Request) -> list[int]:
         if request.function == READ_COILS:
             return [int(bit) for bit in await self._member.bits(request)]
         return await self._member.registers(request)
 
-    async def _verify(self) -> None:
-        """Compare what the module says with the configuration, once after each connecting or silence."""
-        if self._checked != self._member.generation:
-            self._to_check = list(self._checks)
-            self._checked = self._member.generation
-        while self._to_check:
-            check = self._to_check[0]
-            try:
-                self._compare(check, await self._take(check.request))
-            except ModbusRefused as error:
-                if error.exception_code not in _NOT_THERE:
-                    raise
-                LOG.info("%s: %s cannot be verified: %s", self._name, check.what, error.message)
-            self._to_check.pop(0)
-
-    def _compare(self, check: Check, answer: Sequence[int]) -> None:
-        """Raise where the module is set otherwise than configured."""
+    async def _check(self, check: Check) -> Sequence[Check]:
+        try:
+            answer = await self._request(check.request)
+        except ModbusRefused as error:
+            if error.exception_code not in _NOT_THERE:
+                raise
+            LOG.info("%s: %s cannot be verified: %s", self._name, check.what, error.message)
+            return ()
         for place, expected in check.expected.items():
             found = answer[place] & check.mask
             if found != expected:
@@ -203,3 +235,4 @@ class ModbusDevice:
                     f"{check.what} in {kind} {check.request.address + place} is {check.words(found)}, "
                     f"the configuration expects {check.words(expected)}",
                 )
+        return ()

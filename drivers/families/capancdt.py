@@ -1,6 +1,6 @@
 """Micro-Epsilon capaNCDT 6200: capacitive displacement over Ethernet, as a stream.
 
-A reading is the mean of everything that came since the last one, with extremes and count. Input 0 is the
+A reading is the mean of all values since the last one, with extremes and count. Input 0 is the
 controller's channel 1. The converter stops at its ends: a single value there makes the reading under or over
 range, as a mean with clipped values in it is wrong by an unknown amount.
 
@@ -30,7 +30,7 @@ class CapancdtSettings(DeviceSettings, frozen=True, kw_only=True, forbid_unknown
     Parameters
     ----------
     window_s : float
-        Measurements older than this are left out of a mean, s: after a pause a reading is of now.
+        Measurements older than this are left out of a mean, s, so that a reading after a pause is current.
     """
 
     window_s: Annotated[float, msgspec.Meta(ge=0.05, le=600.0)] = 10.0
@@ -51,21 +51,21 @@ class CapancdtInput(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 class Capancdt:
     """A capaNCDT 6200 controller."""
 
-    def __init__(self, about: CapancdtSettings, link: CapancdtLink, where: Where) -> None:
+    def __init__(self, config: CapancdtSettings, link: CapancdtLink, where: Where) -> None:
         channels: dict[int, None] = {}
-        for table, spot in input_tables(about, where):
+        for table, spot in input_tables(config, where):
             given = settings(table, CapancdtInput, spot)
-            check_input(given.input, channels, MOST_CHANNELS, about.model, spot)
+            check_input(given.input, channels, MOST_CHANNELS, config.model, spot)
             channels[given.input] = None
-        self._about = about
+        self._config = config
         self._units = dict.fromkeys(channels, "um")
         self._link = link
-        link.join(about.name, tuple(channels))
+        link.join(config.name, tuple(channels))
 
     @property
     def name(self) -> str:
         """Name of the device in the configuration."""
-        return self._about.name
+        return self._config.name
 
     @property
     def units(self) -> Mapping[int, str]:
@@ -74,7 +74,7 @@ class Capancdt:
 
     @property
     def lost_frames(self) -> int:
-        """Frames that the controller's counter says are missing, since the start."""
+        """Frames missing since the start, by the controller's counter."""
         return self._link.lost_frames
 
     async def read(self) -> Mapping[int, Reading]:
@@ -85,9 +85,9 @@ class Capancdt:
         DriverError
             Naming the device, when nothing new came within `timeout_s` (twice as long at the first call).
         """
-        taken = await self._link.take()
-        oldest_s = asyncio.get_running_loop().time() - self._about.window_s
-        return {number: _reading(channel, parts, oldest_s) for number, (channel, parts) in taken.items()}
+        collected = await self._link.collect()
+        oldest_s = asyncio.get_running_loop().time() - self._config.window_s
+        return {number: _reading(channel, parts, oldest_s) for number, (channel, parts) in collected.items()}
 
     async def close(self) -> None:
         """Close both connections and end the background task."""
@@ -95,20 +95,20 @@ class Capancdt:
 
 
 def _reading(channel: Channel, parts: Sequence[Sums], oldest_s: float) -> Reading:
-    """Put the parts that are young enough together."""
-    young = [part for part in parts if part.time_s >= oldest_s] or [parts[-1]]
-    count = sum(part.count for part in young)
-    over = sum(part.over for part in young)
-    under = sum(part.under for part in young)
+    """Combine the parts within the window."""
+    recent = [part for part in parts if part.time_s >= oldest_s] or [parts[-1]]
+    count = sum(part.count for part in recent)
+    over = sum(part.over for part in recent)
+    under = sum(part.under for part in recent)
     if over:
         return Reading.bad(Quality.OVER, f"{over} of {count} values at the top of {channel.range_um:g} µm")
     if under:
         return Reading.bad(Quality.UNDER, f"{under} of {count} values at 0 of {channel.range_um:g} µm")
     return Reading(
-        value=micrometres(sum(part.total for part in young) / count, channel.range_um),
+        value=micrometres(sum(part.total for part in recent) / count, channel.range_um),
         quality=Quality.GOOD,
-        minimum=micrometres(min(part.minimum for part in young), channel.range_um),
-        maximum=micrometres(max(part.maximum for part in young), channel.range_um),
+        minimum=micrometres(min(part.minimum for part in recent), channel.range_um),
+        maximum=micrometres(max(part.maximum for part in recent), channel.range_um),
         count=count,
     )
 

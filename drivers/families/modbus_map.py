@@ -31,8 +31,8 @@ class MapSettings(ModbusSettings, frozen=True, kw_only=True, forbid_unknown_fiel
     Parameters
     ----------
     max_gap : int
-        Registers between two inputs that may be read along to save a request. 0 reads nothing that is not
-        configured: many devices refuse a block with a hole in it.
+        Unused registers between two inputs that may be read to save a request. 0: none, because many devices refuse
+        a block with undefined registers.
     """
 
     max_gap: Annotated[int, msgspec.Meta(ge=0, le=32)] = 0
@@ -44,7 +44,7 @@ class MapInput(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     Parameters
     ----------
     input : int
-        Number by which the input is known.
+        Number of the input.
     unit : str
         Of the value, such as `rpm` or `degc`.
     function : int
@@ -79,9 +79,9 @@ class MapInput(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Spot:
-    """An input, its fault numbers, and where its words stand: which poll, which word of it."""
+    """An input, its fault numbers, and the place of its words: poll, and first word in it."""
 
-    about: MapInput
+    config: MapInput
     bad: Mapping[float, Quality]
     poll: int
     start: int
@@ -90,26 +90,26 @@ class _Spot:
 class ModbusMap(ModbusDevice):
     """A device read by the registers in its configuration."""
 
-    def __init__(self, about: MapSettings, line: ModbusLine, where: Where) -> None:
+    def __init__(self, config: MapSettings, line: ModbusLine, where: Where) -> None:
         inputs: dict[int, MapInput] = {}
         bad: dict[int, dict[float, Quality]] = {}
-        for table, spot in input_tables(about, where):
+        for table, spot in input_tables(config, where):
             given = settings(table, MapInput, spot)
-            check_input(given.input, inputs, MOST_INPUTS, about.model, spot)
+            check_input(given.input, inputs, MOST_INPUTS, config.model, spot)
             _check(given, spot)
             inputs[given.input] = given
             bad[given.input] = _bad_values(given, spot)
-        polls = group(list(inputs.values()), about.max_gap)
+        polls = group(list(inputs.values()), config.max_gap)
         self._spots = {
-            number: _Spot(about=given, bad=bad[number], poll=poll, start=given.address - polls[poll].address)
+            number: _Spot(config=given, bad=bad[number], poll=poll, start=given.address - polls[poll].address)
             for number, given in inputs.items()
             for poll in [_poll_of(given, polls)]
         }
         units = {number: given.unit for number, given in inputs.items()}
-        super().__init__(about, line, units=units, polls=polls)
+        super().__init__(config, line, units=units, polls=polls)
 
     def readings(self, answers: Sequence[Sequence[int]]) -> dict[int, Reading]:
-        """Decode, judge and scale every input."""
+        """Decode, check and scale every input."""
         return {number: _reading(spot, answers[spot.poll]) for number, spot in self._spots.items()}
 
 
@@ -121,7 +121,7 @@ def group(inputs: Sequence[MapInput], max_gap: int) -> list[Request]:
     inputs : sequence of MapInput
         In any order; they may overlap.
     max_gap : int
-        Unused registers that may be read along.
+        Unused registers that may be read to save a request.
     """
     requests: list[Request] = []
     for given in sorted(inputs, key=lambda one: (one.function, one.address)):
@@ -149,7 +149,7 @@ def _poll_of(given: MapInput, polls: Sequence[Request]) -> int:
 
 
 def _check(given: MapInput, where: Where) -> None:
-    """Raise where keys that are each right do not go together."""
+    """Raise where keys contradict each other."""
     if given.address + words_of(given.type) > 65536:
         raise where.wrong("address", given.address, f"room for {given.type} below 65536")
     for key in ("scale", "offset", "minimum", "maximum"):
@@ -179,18 +179,18 @@ def _bad_values(given: MapInput, where: Where) -> dict[float, Quality]:
 
 
 def _reading(spot: _Spot, words: Sequence[int]) -> Reading:
-    """Decode, judge and scale one input."""
-    given = spot.about
+    """Decode, check and scale one input."""
+    given = spot.config
     number = decode(words[spot.start : spot.start + words_of(given.type)], given.type, given.word_order)
     if number in spot.bad:
         return Reading.bad(spot.bad[number], f"the device reports {number:g}")
     value = number * given.scale + given.offset
     if not math.isfinite(value):
-        return Reading.bad(Quality.INVALID, f"not a number ({value})")
+        return Reading.bad(Quality.INVALID, f"not a finite number ({value})")
     if given.maximum is not None and value > given.maximum:
-        return Reading.bad(Quality.OVER, f"{value:g} {given.unit}, plausible up to {given.maximum:g}")
+        return Reading.bad(Quality.OVER, f"{value:g} {given.unit}, plausible up to {given.maximum:g} {given.unit}")
     if given.minimum is not None and value < given.minimum:
-        return Reading.bad(Quality.UNDER, f"{value:g} {given.unit}, plausible from {given.minimum:g}")
+        return Reading.bad(Quality.UNDER, f"{value:g} {given.unit}, plausible from {given.minimum:g} {given.unit}")
     return Reading.good(value)
 
 

@@ -1,1 +1,1 @@
-"""Transport: the lines that devices hang on."""
+"""Transport: lines shared by devices."""

@@ -1,8 +1,8 @@
 """The two TCP ports of a capaNCDT controller, kept open by a background task.
 
-The task asks the ranges at the command port, then reads the stream of the data port, and begins again after
-any loss. Who reads waits for new blocks, for a bounded time. Only sums are kept of what came, so memory
-does not grow when nobody reads.
+The task queries the ranges at the command port, then reads the stream of the data port, and starts again after any
+loss. A read waits for new blocks, for a bounded time. Only sums of the values are kept, so memory does not grow between
+reads.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from drivers.lines.settings import CapancdtLine
 from drivers.protocols.capancdt import BadReplyError, Block, Blocks, Channel, channel_info
 from drivers.protocols.capancdt_sums import Sums, sums
 
-# Between tries to connect, s: soon at first, as after a cable came loose.
+# Between attempts to connect, s: short at first, as after a loose cable.
 RETRY_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
-# A stream silent for so many time limits, and so many seconds, is connected anew: the other end may be long gone.
+# A stream silent for so many time limits, and so many seconds, is reconnected: the other end may be long gone.
 SILENT_TIMEOUTS = 10.0
 SILENT_S = 2.0
 _MOST_BLOCKS = 2048
@@ -31,20 +31,20 @@ class CapancdtLink:
 
     Parameters
     ----------
-    about : CapancdtLine
-        Settings; nothing is opened before the first `take`.
+    config : CapancdtLine
+        Settings; nothing is opened before the first `collect`.
     """
 
-    def __init__(self, about: CapancdtLine) -> None:
-        self.about = about
-        self.timeout_s = about.timeout_s
+    def __init__(self, config: CapancdtLine) -> None:
+        self.config = config
+        self.timeout_s = config.timeout_s
         self.lost_frames = 0
         self._channels: tuple[int, ...] = ()
-        self._name = about.name
+        self._name = config.name
         self._infos: dict[int, Channel] = {}
         self._kept: dict[int, deque[Sums]] = {}
         self._next_counter: int | None = None
-        self._standing = 0
+        self._repeated = 0
         self._heard = False
         self._blocks = Blocks()
         self._skipped = 0
@@ -59,13 +59,13 @@ class CapancdtLink:
         self._channels = tuple(channels)
         self._kept = {channel: deque(maxlen=_MOST_BLOCKS) for channel in channels}
 
-    async def take(self) -> Mapping[int, tuple[Channel, list[Sums]]]:
-        """Take what came since the last call; wait for new blocks if there are none.
+    async def collect(self) -> Mapping[int, tuple[Channel, list[Sums]]]:
+        """Return the sums since the last call; wait for new blocks if there are none.
 
         Raises
         ------
         DriverError
-            Nothing new within the time limit, and why.
+            Nothing new within the time limit, with the reason.
         """
         if self._closed:
             raise DeviceDisconnected(self._name, "is closed")
@@ -81,9 +81,9 @@ class CapancdtLink:
                     await self._changed.wait()
         if not self._complete():
             raise self._why_nothing(wait_s)
-        taken = {channel: (self._infos[channel], list(kept)) for channel, kept in self._kept.items()}
-        self._forget()
-        return taken
+        collected = {channel: (self._infos[channel], list(kept)) for channel, kept in self._kept.items()}
+        self._clear()
+        return collected
 
     async def close(self) -> None:
         """Close both ports and end the task."""
@@ -97,22 +97,22 @@ class CapancdtLink:
                 await task
 
     def _complete(self) -> bool:
-        """Tell whether every channel has something new."""
+        """Return whether every channel has new values."""
         return all(self._kept[channel] and channel in self._infos for channel in self._channels)
 
-    def _forget(self) -> None:
+    def _clear(self) -> None:
         for kept in self._kept.values():
             kept.clear()
-        self._standing = 0
+        self._repeated = 0
         self._skipped = self._blocks.skipped
 
     def _why_nothing(self, wait_s: float) -> DriverError:
-        """Say why there is nothing new. A new error each time, as a raised one grows a traceback."""
+        """Return why there is nothing new: a new error each time, as a raised one grows a traceback."""
         if self._failure is not None:
             return type(self._failure)(self._name, self._failure.message)
-        if self._standing:
-            text = f"{self._standing} blocks with the counter standing still at {self._next_counter}"
-            self._standing = 0
+        if self._repeated:
+            text = f"{self._repeated} blocks with the counter unchanged at {self._next_counter}"
+            self._repeated = 0
             return DeviceGarbled(self._name, text)
         if (skipped := self._blocks.skipped - self._skipped) > 0:
             self._skipped = self._blocks.skipped
@@ -122,8 +122,8 @@ class CapancdtLink:
             numbers = ", ".join(str(channel + 1) for channel in missing)
             return DeviceRefused(self._name, f"channel {numbers} is not in the stream of the data port")
         if not self._infos:
-            return DeviceTimeout(self._name, f"no connection to {self.about.host} within {wait_s} s")
-        where = f"{self.about.host}:{self.about.data_port}"
+            return DeviceTimeout(self._name, f"no connection to {self.config.host} within {wait_s} s")
+        where = f"{self.config.host}:{self.config.data_port}"
         return DeviceTimeout(
             self._name,
             f"no new measurement from {where} within {wait_s} s (is another client connected to the data port?)",
@@ -139,24 +139,24 @@ class CapancdtLink:
             except DriverError as error:
                 self._failure = error
             except TimeoutError:
-                host = self.about.host
+                host = self.config.host
                 self._failure = DeviceTimeout(self._name, f"no connection to {host} within {self.timeout_s} s")
             except (OSError, ValueError) as error:  # ValueError: a host that is no name
-                self._failure = DeviceDisconnected(self._name, f"{self.about.host}: {error}")
-            # A controller that accepts connections but sends nothing is not to be pestered.
+                self._failure = DeviceDisconnected(self._name, f"{self.config.host}: {error}")
+            # A controller that accepts connections but sends nothing is left longer and longer pauses.
             tries = 0 if self._heard else tries
             self._heard = False
             self._infos = {}
-            self._forget()
+            self._clear()
             self._changed.set()
             await asyncio.sleep(RETRY_S[min(tries, len(RETRY_S) - 1)])
             tries += 1
 
     async def _ask_channels(self) -> dict[int, Channel]:
-        """Ask range and unit of each channel at the command port."""
-        about = self.about
+        """Query range and unit of each channel at the command port."""
+        config = self.config
         async with asyncio.timeout(self.timeout_s):
-            reader, writer = await asyncio.open_connection(about.host, about.command_port)
+            reader, writer = await asyncio.open_connection(config.host, config.command_port)
         try:
             infos = {}
             for channel in self._channels:
@@ -166,7 +166,7 @@ class CapancdtLink:
             await _shut(writer)
 
     async def _ask_channel(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, channel: int) -> Channel:
-        """Ask one channel; the controller counts from 1, echoes the command, and greets with a banner."""
+        """Query one channel; the controller counts from 1, echoes the command, and sends a banner first."""
         command = f"$CHI{channel + 1}"
         writer.write(f"{command}\r".encode("ascii"))
         heard = ""
@@ -188,40 +188,39 @@ class CapancdtLink:
 
     async def _receive(self) -> None:
         """Read the stream until it ends."""
-        about = self.about
+        config = self.config
         async with asyncio.timeout(self.timeout_s):
-            reader, writer = await asyncio.open_connection(about.host, about.data_port)
+            reader, writer = await asyncio.open_connection(config.host, config.data_port)
         self._failure, self._next_counter, self._blocks, self._skipped = None, None, Blocks(), 0
         loop = asyncio.get_running_loop()
         try:
             while data := await self._more(reader):
                 for block in self._blocks.feed(data):
-                    self._sort(block, loop.time())
+                    self._keep_block(block, loop.time())
                 self._changed.set()
         finally:
             await _shut(writer)
-        raise DeviceDisconnected(self._name, f"{about.host}:{about.data_port} closed the connection")
+        raise DeviceDisconnected(self._name, f"{config.host}:{config.data_port} closed the connection")
 
     async def _more(self, reader: asyncio.StreamReader) -> bytes:
-        """Wait for bytes of the stream, not forever."""
+        """Wait for bytes of the stream, for a limited time."""
         silent_s = max(SILENT_S, SILENT_TIMEOUTS * self.timeout_s)
         try:
             async with asyncio.timeout(silent_s):
                 return await reader.read(_READ_BYTES)
         except TimeoutError:
-            where = f"{self.about.host}:{self.about.data_port}"
-            raise DeviceTimeout(self._name, f"nothing from {where} for {silent_s:g} s, connecting anew") from None
+            where = f"{self.config.host}:{self.config.data_port}"
+            raise DeviceTimeout(self._name, f"nothing from {where} for {silent_s:g} s, reconnecting") from None
 
-    def _sort(self, block: Block, time_s: float) -> None:
-        """Keep a block, unless its counter says that it brings nothing new."""
+    def _keep_block(self, block: Block, time_s: float) -> None:
+        """Keep a block, unless its counter shows that it is not new."""
         if self._next_counter is not None and block.counter != self._next_counter:
             gap = (block.counter - self._next_counter) & 0xFFFFFFFF
             behind = 0x100000000 - gap
             if behind <= block.frames:
-                self._standing += 1
+                self._repeated += 1
                 return
-            # A counter that runs backwards is a controller that was restarted: how many are lost is not
-            # known.
+            # A counter that runs backwards is a restarted controller: how many frames were lost is unknown.
             self.lost_frames += gap if gap < 0x80000000 else 0
         self._heard = True
         self._next_counter = (block.counter + block.frames) & 0xFFFFFFFF
@@ -231,7 +230,7 @@ class CapancdtLink:
 
 
 async def _shut(writer: asyncio.StreamWriter) -> None:
-    """Close a connection at once; whatever is unsent is not wanted."""
+    """Close a connection at once; unsent data is dropped."""
     writer.transport.abort()
     with contextlib.suppress(OSError):
         await writer.wait_closed()

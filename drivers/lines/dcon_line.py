@@ -1,14 +1,14 @@
 """A DCON line: one serial port, shared by its modules, one command at a time.
 
-Data replies carry no address, so a late one could pass for another module's. What keeps them apart:
+Data replies carry no address, so a late one could pass for another module's. They are kept apart as follows:
 
-- Before each command everything received is dropped, and only one command is under way.
+- Before each command everything received is dropped, and only one command is sent at a time.
 - After a missing or broken data reply the module is *unsettled*. The line first waits until it is quiet,
-  and the module is asked its name (`$AAM`) until it answers: names carry the address, and a module answers
-  in order, so after its name no data reply of it is left.
-- For `LOOSE_S` after a missing data reply the *other* modules' data are confirmed: each is asked its name
-  right after its data. Had the late reply slipped in, there would be two data replies before the name; then
-  both are thrown away.
+  and the module is asked for its name (`$AAM`) until it answers: names carry the address, and a module
+  answers in order, so after its name no data reply of it is left.
+- For `LOOSE_S` after a missing data reply the *other* modules' data are confirmed: each is asked for
+  its name right after its data. With the late reply there would be two data replies before the name; then
+  both are dropped.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class DconMember(Place):
     Parameters
     ----------
     line : DconLine
-        The line it hangs on.
+        Its line.
     name : str
         Of the device, for messages.
     address : int
@@ -60,15 +60,15 @@ class DconLine(SharedLine[DconMember]):
 
     Parameters
     ----------
-    about : SerialLine
+    config : SerialLine
         Settings; nothing is opened before the first command.
     """
 
-    def __init__(self, about: SerialLine) -> None:
-        super().__init__(about.timeout_s)
-        self.about = about
+    def __init__(self, config: SerialLine) -> None:
+        super().__init__(config.timeout_s)
+        self.config = config
         self._port: SerialPort | None = None
-        # When a data reply that is still missing may come no more, by address.
+        # Until when a missing data reply may still come, by address.
         self._loose_until_s: dict[int, float] = {}
 
     def join(self, name: str, address: int, *, with_checksum: bool) -> DconMember:
@@ -92,9 +92,9 @@ class DconLine(SharedLine[DconMember]):
         if self._port is not None and not self._port.lost:
             return
         try:
-            self._port = SerialPort(self.about)
+            self._port = SerialPort(self.config)
         except PortLostError as error:
-            raise DeviceDisconnected(member.name, f"cannot open {self.about.port}: {error}") from None
+            raise DeviceDisconnected(member.name, f"cannot open {self.config.port}: {error}") from None
         self.generation += 1
 
     async def _settle(self, member: DconMember) -> None:
@@ -105,7 +105,7 @@ class DconLine(SharedLine[DconMember]):
         self._loose_until_s.pop(member.address, None)
 
     async def data(self, member: DconMember, text: str) -> str:
-        """Ask for data, and confirm whose they are while another module's may still come."""
+        """Ask for data, and confirm their sender while another module's may still come."""
         now_s = asyncio.get_running_loop().time()
         member.unsettled = True
         try:
@@ -126,7 +126,7 @@ class DconLine(SharedLine[DconMember]):
     async def ask(self, member: DconMember, text: str, lead: str, *, nothing_before: bool = False) -> str:
         """Send one command and wait for the reply that answers it.
 
-        Replies that answer something else are passed over, or are an error with `nothing_before`.
+        Replies to other commands are skipped, or are an error with `nothing_before`.
         """
         port = self._port
         if port is None:
@@ -134,7 +134,7 @@ class DconLine(SharedLine[DconMember]):
         heard: list[bytes] = []
         try:
             if not nothing_before:
-                port.forget()
+                port.discard_input()
             port.write(command(text, with_checksum=member.with_checksum))
             async with asyncio.timeout(self.timeout_s):
                 while True:
@@ -143,22 +143,22 @@ class DconLine(SharedLine[DconMember]):
                     if found is not None:
                         return found
                     if nothing_before:
-                        raise DeviceGarbled(member.name, "thrown away: more than one data reply on the line")
+                        raise DeviceGarbled(member.name, "dropped: more than one data reply on the line")
         except PortLostError as error:
-            raise DeviceDisconnected(member.name, f"{self.about.port}: {error}") from None
+            raise DeviceDisconnected(member.name, f"{self.config.port}: {error}") from None
         except TimeoutError:
             if heard or port.rest:
                 what = b" ".join((*heard, port.rest))[:60]
                 raise DeviceGarbled(member.name, f"no valid reply to {text!r} in {what!r}") from None
-            where = f"address {member.address:02X} on {self.about.port}"
+            where = f"address {member.address:02X} on {self.config.port}"
             raise DeviceTimeout(member.name, f"no reply to {text!r} from {where} within {self.timeout_s} s") from None
 
     def _answer(self, member: DconMember, line: bytes, lead: str) -> str | None:
-        """Return the body when a line answers the command, None when it answers something else."""
+        """Return the body where a line answers the command, None where it answers another one."""
         try:
             found: Reply = reply(line, with_checksum=member.with_checksum)
         except BadTextError as error:
-            if lead == "!":  # may be the torn end of something late; the reply itself cannot be mistaken
+            if lead == "!":  # may be the rest of a late reply; the reply itself is unmistakable
                 return None
             raise DeviceGarbled(member.name, str(error)) from None
         if found.lead == "?" and found.address() == member.address:

@@ -1,15 +1,15 @@
 """A Modbus line: one connection, shared by its devices, one request at a time.
 
-What can go wrong here, and what is done:
+Faults, and how they are handled:
 
 - *Late answer (RTU).* An RTU frame does not say which request it answers. After a missing, broken or
   refused answer the unit is *unsettled*: before its next request the line first waits until it is quiet,
-  then asks a fence (`drivers.protocols.modbus.fence_for`), whose answer no other of the unit's answers
-  resembles. A device answers in order, so after the fence's answer nothing late is left. Answers of other
+  then sends a fence (`drivers.protocols.modbus.fence_for`), whose answer differs from all other answers of
+  the unit. A device answers in order, so after the fence's answer nothing late is left. Answers of other
   units differ by their unit id.
-- *Late answer (TCP).* The transaction number tells. Bytes out of step cost the connection.
-- *Dead device.* Its tries are spaced out (`drivers.lines.patience`); the others go on.
-- *Dead host.* A connection that does not come about in time is not tried again by every device in turn.
+- *Late answer (TCP).* Recognised by the transaction number. A stream out of step is disconnected.
+- *Dead device.* Its attempts are spaced out (`drivers.lines.backoff`); the others continue.
+- *Dead host.* A connection that times out is not attempted again by each waiting device.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import contextlib
 from pymodbus.pdu import ModbusPDU
 
 from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout
+from drivers.lines.backoff import Backoff
 from drivers.lines.modbus_wire import LostError, ModbusWire, RefusalError
-from drivers.lines.patience import Patience
 from drivers.lines.settings import SerialLine, TcpLine
 from drivers.lines.shared_line import Place, SharedLine
 from drivers.protocols.modbus import Request, WrongAnswerError, exception_text
 
-# A TCP connection that brings nothing this many times in a row is made anew: its other end may be long gone.
-MOST_SILENCES = 2
+# A TCP connection with so many timeouts in a row is made again: its other end may be long gone.
+MOST_TIMEOUTS = 2
 
 
 class ModbusRefused(DeviceRefused):
@@ -44,13 +44,13 @@ class Member(Place):
     Parameters
     ----------
     line : ModbusLine
-        The line it hangs on.
+        Its line.
     name : str
         Of the device, for messages.
     address : int
         Unit id, 1..247.
     fence : Request
-        Request whose answer can be taken for no other of this device.
+        Request whose answer is unlike any other of this device.
     """
 
     line: ModbusLine
@@ -64,14 +64,14 @@ class Member(Place):
         answer = await self.line.ask(self, request)
         words = list(answer.registers)
         if len(words) != request.count:
-            raise DeviceGarbled(self.name, f"asked {request}, got {len(words)} registers")
+            raise DeviceGarbled(self.name, f"asked for {request}, got {len(words)} registers")
         return words
 
     async def bits(self, request: Request) -> list[bool]:
         """Read coils or discrete inputs. Only within `serve`."""
         answer = await self.line.ask(self, request)
         if len(answer.bits) < request.count:
-            raise DeviceGarbled(self.name, f"asked {request}, got {len(answer.bits)} bits")
+            raise DeviceGarbled(self.name, f"asked for {request}, got {len(answer.bits)} bits")
         return list(answer.bits[: request.count])
 
 
@@ -80,19 +80,19 @@ class ModbusLine(SharedLine[Member]):
 
     Parameters
     ----------
-    about : SerialLine or TcpLine
+    config : SerialLine or TcpLine
         Settings; nothing is opened before the first request.
     """
 
-    def __init__(self, about: SerialLine | TcpLine) -> None:
-        super().__init__(about.timeout_s)
-        self.about = about
-        self._where = about.port if isinstance(about, SerialLine) else f"{about.host}:{about.tcp_port}"
-        self._numbered = about.protocol == "modbus-tcp"
+    def __init__(self, config: SerialLine | TcpLine) -> None:
+        super().__init__(config.timeout_s)
+        self.config = config
+        self._where = config.port if isinstance(config, SerialLine) else f"{config.host}:{config.tcp_port}"
+        self._numbered = config.protocol == "modbus-tcp"
         self._wire: ModbusWire | None = None
-        self._patience = Patience(about.timeout_s)
+        self._backoff = Backoff(config.timeout_s)
         self._no_host_since_s = 0.0
-        self._silences = 0
+        self._timeouts = 0
 
     def join(self, name: str, address: int, fence: Request) -> Member:
         """Give a device its place."""
@@ -106,8 +106,8 @@ class ModbusLine(SharedLine[Member]):
             self._wire.close()
             self._wire = None
 
-    def _patiences(self, member: Member) -> list[Patience]:
-        return [member.patience, self._patience]
+    def _backoffs(self, member: Member) -> list[Backoff]:
+        return [member.backoff, self._backoff]
 
     def _check_turn(self, member: Member, asked_at_s: float) -> None:
         if self._no_host_since_s > asked_at_s:
@@ -122,7 +122,7 @@ class ModbusLine(SharedLine[Member]):
         if self._wire is not None and self._wire.connected:
             return
         self.close()
-        wire = self._wire = ModbusWire(self.about)
+        wire = self._wire = ModbusWire(self.config)
         loop = asyncio.get_running_loop()
         try:
             await wire.connect()
@@ -130,27 +130,27 @@ class ModbusLine(SharedLine[Member]):
             raise DeviceDisconnected(member.name, f"cannot open {self._where}: {error}") from None
         except TimeoutError:
             self._no_host_since_s = loop.time()
-            self._patience.failed(loop.time())
+            self._backoff.failed(loop.time())
             raise DeviceTimeout(member.name, f"no connection to {self._where} within {self.timeout_s} s") from None
         if self._wire is not wire:  # closed meanwhile
             wire.close()
             raise DeviceDisconnected(member.name, "is closed")
-        self._patience.succeeded()
-        self._silences = 0
+        self._backoff.succeeded()
+        self._timeouts = 0
         self.generation += 1
 
     async def _settle(self, member: Member) -> None:
         if self._numbered:
             return
         await self._be_quiet()
-        # A refusal is an answer as well. If it is the late one, the fence's data still come, and fit nothing.
+        # A refusal is an answer as well. If it is the late one, the fence's data still come, and match no request.
         with contextlib.suppress(DeviceRefused):
             await self.ask(member, member.fence)
         member.unsettled = False
         member.settlings += 1
 
     async def ask(self, member: Member, request: Request) -> ModbusPDU:
-        """Ask one request and turn what goes wrong into the errors of the drivers."""
+        """Send one request and turn its failures into driver errors."""
         wire = self._wire
         if wire is None:
             raise DeviceDisconnected(member.name, "is closed")
@@ -158,7 +158,7 @@ class ModbusLine(SharedLine[Member]):
         try:
             answer = await wire.ask(member.address, request)
         except RefusalError as error:
-            self._silences = 0
+            self._timeouts = 0
             text = f"{request} of unit {member.address} refused with {exception_text(error.code)}"
             raise ModbusRefused(member.name, text, error.code) from None
         except WrongAnswerError as error:
@@ -169,15 +169,15 @@ class ModbusLine(SharedLine[Member]):
             self.close()
             raise DeviceDisconnected(member.name, f"{self._where}: {error}") from None
         except TimeoutError:
-            self._silences += 1
-            if self._silences >= MOST_SILENCES and self._where_is_tcp:
+            self._timeouts += 1
+            if self._timeouts >= MOST_TIMEOUTS and self._where_is_tcp:
                 self.close()
             text = f"no answer from unit {member.address} on {self._where} within {self.timeout_s} s"
             raise DeviceTimeout(member.name, text) from None
-        self._silences = 0
+        self._timeouts = 0
         member.unsettled = settled
         return answer
 
     @property
     def _where_is_tcp(self) -> bool:
-        return isinstance(self.about, TcpLine)
+        return isinstance(self.config, TcpLine)

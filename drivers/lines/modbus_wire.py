@@ -25,12 +25,12 @@ from drivers.protocols.modbus import (
     find_tcp,
 )
 
-# pymodbus reports every missed answer itself, as an error with a dump of frames; here each becomes one
-# DriverError. A level that somebody set on purpose stays.
+# pymodbus logs every missed answer as an error with a dump of frames; here each becomes one DriverError. A level set
+# on purpose stays.
 if logging.getLogger("pymodbus").level == logging.NOTSET:
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
-# Far more than any frame with late ones before it, and little enough to search at every arrival.
+# Far more than any frame with late ones before it, and small enough to search at every arrival.
 _MOST_BUFFERED = 8192
 _MOST_HEARD = 1024
 
@@ -52,12 +52,12 @@ class ModbusWire:
 
     Parameters
     ----------
-    about : SerialLine or TcpLine
+    config : SerialLine or TcpLine
         Settings of the line.
     """
 
-    def __init__(self, about: SerialLine | TcpLine) -> None:
-        self._numbered = about.protocol == "modbus-tcp"
+    def __init__(self, config: SerialLine | TcpLine) -> None:
+        self._numbered = config.protocol == "modbus-tcp"
         self._request: Request | None = None
         self._unit = 0
         self._transaction = 0
@@ -65,10 +65,10 @@ class ModbusWire:
         self._heard = bytearray()
         self.heard_at_s = 0.0
         self._why = ""
-        self._client = self._make(about)
+        self._client = self._make(config)
         create = self._client.ctx.call_create
 
-        # pymodbus swallows why a connection failed, and lets some of pyserial's errors through.
+        # pymodbus hides why a connection failed, and lets some of pyserial's errors through.
         async def explained() -> object:
             try:
                 return await create()
@@ -77,31 +77,31 @@ class ModbusWire:
                 raise OSError(self._why) from error
 
         self._client.ctx.call_create = explained
-        # Beyond its own limit pymodbus drops what it has before anybody saw it, and garbage looks like silence.
+        # Beyond its own limit pymodbus drops its buffer unseen, and garbage looks like a timeout.
         self._client.ctx.max_buffer_size = _MOST_BUFFERED
-        # Whether a silent device costs the connection is decided by the line.
+        # The line decides whether a timeout ends the connection.
         self._client.set_max_no_responses(1 << 30)
 
-    def _make(self, about: SerialLine | TcpLine) -> ModbusBaseClient:
-        """Make the client that fits the line; it never retries or reconnects of its own accord."""
-        if isinstance(about, SerialLine):
+    def _make(self, config: SerialLine | TcpLine) -> ModbusBaseClient:
+        """Make the client that fits the line; it never retries or reconnects by itself."""
+        if isinstance(config, SerialLine):
             return AsyncModbusSerialClient(
-                about.port,
+                config.port,
                 framer=FramerType.RTU,
-                baudrate=about.baudrate,
-                parity=about.parity,
-                stopbits=about.stopbits,
-                timeout=about.timeout_s,
+                baudrate=config.baudrate,
+                parity=config.parity,
+                stopbits=config.stopbits,
+                timeout=config.timeout_s,
                 retries=0,
                 reconnect_delay=0,
                 trace_packet=self._trace_packet,
                 trace_connect=self._trace_connect,
             )
         return AsyncModbusTcpClient(
-            about.host,
-            port=about.tcp_port,
+            config.host,
+            port=config.tcp_port,
             framer=FramerType.SOCKET if self._numbered else FramerType.RTU,
-            timeout=about.timeout_s,
+            timeout=config.timeout_s,
             retries=0,
             reconnect_delay=0,
             trace_packet=self._trace_packet,
@@ -110,7 +110,7 @@ class ModbusWire:
 
     @property
     def connected(self) -> bool:
-        """Whether the connection stands, as far as is known."""
+        """Whether the connection is open, as far as is known."""
         return self._client.connected
 
     async def connect(self) -> None:
@@ -144,7 +144,7 @@ class ModbusWire:
         RefusalError
             The device sent an exception reply.
         WrongAnswerError
-            Something came, and it is not the answer.
+            What came is not the answer.
         TimeoutError
             Nothing came.
         LostError
@@ -157,7 +157,7 @@ class ModbusWire:
         except ConnectionException as error:
             raise LostError(self._why or "connection lost") from error
         except ModbusException as error:
-            raise self._silence(unit, request) from error
+            raise self._why_no_answer(unit, request) from error
         finally:
             self._request = None
         if answer.isError():
@@ -175,10 +175,10 @@ class ModbusWire:
             return await client.read_coils(address, count=count, device_id=unit)
         if request.function == READ_DISCRETE:
             return await client.read_discrete_inputs(address, count=count, device_id=unit)
-        raise ValueError(f"function {request.function} does not read")
+        raise ValueError(f"function {request.function} is no read function")
 
-    def _silence(self, unit: int, request: Request) -> WrongAnswerError | TimeoutError:
-        """Tell a silent device from one whose answer was useless."""
+    def _why_no_answer(self, unit: int, request: Request) -> WrongAnswerError | TimeoutError:
+        """Distinguish a silent device from one with a wrong answer."""
         if self._wrong is not None:
             return self._wrong
         if not self._numbered and (why := describe_rtu(bytes(self._heard), unit, request)):
@@ -186,7 +186,7 @@ class ModbusWire:
         return TimeoutError()
 
     def _trace_packet(self, sending: bool, data: bytes) -> bytes:
-        """Choose what pymodbus gets to decode: the one frame that answers the request, or nothing yet."""
+        """Select what pymodbus decodes: the one frame that answers the request, or nothing yet."""
         if sending:
             self._transaction = int.from_bytes(data[:2], "big")
             return data
@@ -200,17 +200,17 @@ class ModbusWire:
                 self._wrong = error
                 self._fail(ModbusException(str(error)))
                 return b""
-        # pymodbus hands over all it has since the request, unless it has given up on it.
+        # pymodbus passes everything since the request, unless it has given up on it.
         self._heard[:] = data[-_MOST_HEARD:]
         return find_rtu(data, self._unit, self._request) or b""
 
     def _trace_connect(self, connected: bool) -> None:
-        """Fail the waiting request when the connection breaks; pymodbus alone would wait its time out."""
+        """Fail the waiting request when the connection breaks; pymodbus alone would wait for the timeout."""
         if not connected:
             self._fail(ConnectionException("connection lost"))
 
     def _fail(self, error: ModbusException) -> None:
-        """End the wait of the request under way, if there is one."""
+        """Fail the pending request, if there is one."""
         waiting = self._client.ctx.response_future
         if self._request is not None and not waiting.done():
             waiting.set_exception(error)

@@ -1,4 +1,4 @@
-"""A serial port for text lines, read by the event loop itself: no thread to leak."""
+"""A serial port for text lines, read by the event loop itself, without a thread."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import serial
 from drivers.lines.settings import SerialLine
 from drivers.protocols.dcon import CR
 
-# Far more than any reply; a port that babbles without a CR must not eat the memory.
+# Far more than any reply: a stream without a CR must not fill the memory.
 _MOST_BYTES = 4096
 
 
@@ -25,23 +25,23 @@ class SerialPort:
 
     Parameters
     ----------
-    about : SerialLine
+    config : SerialLine
         Settings of the line.
 
     Raises
     ------
     PortLostError
-        It is not there, taken by somebody else, or refuses the settings.
+        It is missing, in use by another program, or refuses the settings.
     """
 
-    def __init__(self, about: SerialLine) -> None:
+    def __init__(self, config: SerialLine) -> None:
         self._loop = asyncio.get_running_loop()
         try:
             self._serial = serial.Serial(
-                about.port,
-                baudrate=about.baudrate,
-                parity=about.parity,
-                stopbits=about.stopbits,
+                config.port,
+                baudrate=config.baudrate,
+                parity=config.parity,
+                stopbits=config.stopbits,
                 timeout=0,
                 write_timeout=0,
                 exclusive=True,
@@ -74,9 +74,9 @@ class SerialPort:
             self._lose(str(error))
             sent = 0
         if sent != len(data):
-            raise PortLostError(self._lost or "the port takes no data")
+            raise PortLostError(self._lost or "the port accepts no data")
 
-    def forget(self) -> None:
+    def discard_input(self) -> None:
         """Drop everything received so far."""
         self._readable()
         self._lines.clear()
@@ -99,15 +99,15 @@ class SerialPort:
 
     @property
     def rest(self) -> bytes:
-        """What came without a CR so far."""
+        """Bytes received since the last CR."""
         return bytes(self._rest)
 
     def close(self) -> None:
-        """Close the port; who waits for a line fails at once."""
+        """Close the port; a pending wait for a line fails at once."""
         self._lose("closed")
 
     def _readable(self) -> None:
-        """Take what has come."""
+        """Read the bytes received."""
         if self._lost:
             return
         try:
@@ -124,7 +124,7 @@ class SerialPort:
         self._changed.set()
 
     def _lose(self, why: str) -> None:
-        """Give the port up once."""
+        """Close the port, once."""
         if self._lost:
             return
         self._lost = why or "port lost"

@@ -15,7 +15,7 @@ TcpPort = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 
 
 class SerialLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A serial port that one or many modules hang on.
+    """A serial port with one or several modules.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class SerialLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     port : str
         Device file, such as `/dev/ttyUSB0`.
     baudrate : int
-        Bit/s; 9600 as the modules are delivered.
+        Bit/s; modules are delivered with 9600.
     parity : str
         N, E or O.
     stopbits : int
@@ -41,8 +41,8 @@ class SerialLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     stopbits: Literal[1, 2] = 1
     timeout_s: TimeoutS = 0.3
 
-    def ends(self) -> tuple[str, ...]:
-        """Name what the line occupies, so that no two lines share it."""
+    def endpoints(self) -> tuple[str, ...]:
+        """Name the port or addresses of the line, so that no two lines share one."""
         return (str(Path(self.port).resolve()),)
 
 
@@ -67,8 +67,8 @@ class TcpLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     tcp_port: TcpPort = 502
     timeout_s: TimeoutS = 0.3
 
-    def ends(self) -> tuple[str, ...]:
-        """Name what the line occupies, so that no two lines share it."""
+    def endpoints(self) -> tuple[str, ...]:
+        """Name the port or addresses of the line, so that no two lines share one."""
         return (f"{self.host.lower()}:{self.tcp_port}",)
 
 
@@ -94,8 +94,8 @@ class CapancdtLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     command_port: TcpPort = 23
     timeout_s: TimeoutS = 0.3
 
-    def ends(self) -> tuple[str, ...]:
-        """Name what the line occupies, so that no two lines share it."""
+    def endpoints(self) -> tuple[str, ...]:
+        """Name the port or addresses of the line, so that no two lines share one."""
         host = self.host.lower()
         return (f"{host}:{self.data_port}", f"{host}:{self.command_port}")
 

@@ -1,4 +1,4 @@
-"""What lines with several devices have in common: one job at a time, time limits, spaced tries, late answers."""
+"""Shared by lines with several devices: one job at a time, time limits, spaced attempts, late answers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Generic, TypeVar
 
 from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceTimeout, DriverError
-from drivers.lines.patience import Patience
+from drivers.lines.backoff import Backoff
 
 ResultT = TypeVar("ResultT")
 PlaceT = TypeVar("PlaceT", bound="Place")
@@ -23,7 +23,7 @@ class Place:
     Parameters
     ----------
     line : SharedLine
-        The line it hangs on.
+        Its line.
     name : str
         Of the device, for messages.
     address : int
@@ -34,8 +34,8 @@ class Place:
         self.line = line
         self.name = name
         self.address = address
-        self.patience = Patience(line.timeout_s)
-        #: Whether an answer of this device may still be under way; how often that was cleared up.
+        self.backoff = Backoff(line.timeout_s)
+        #: Whether an answer of this device may still come; how often the line was cleared of such answers.
         self.unsettled = False
         self.settlings = 0
         self.closed = False
@@ -46,7 +46,7 @@ class Place:
 
     @property
     def generation(self) -> tuple[int, int]:
-        """Connections and settlings so far; after others the device may be another one."""
+        """Connections and settlings so far; after a new one the device may have been exchanged."""
         return self.line.generation, self.settlings
 
     async def close(self) -> None:
@@ -72,13 +72,13 @@ class SharedLine(ABC, Generic[PlaceT]):
         self._lock = asyncio.Lock()
 
     def left(self) -> None:
-        """Close the line when nobody is left."""
+        """Close the line when no device is left."""
         if all(place.closed for place in self._places):
             self.close()
 
     @abstractmethod
     def close(self) -> None:
-        """Close the line; what waits for an answer fails at once."""
+        """Close the line; a pending request fails at once."""
 
     async def serve(self, place: PlaceT, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
         """Run a job of one device, with the line to itself.
@@ -91,7 +91,7 @@ class SharedLine(ABC, Generic[PlaceT]):
             Naming the device.
         """
         loop = asyncio.get_running_loop()
-        self._check_patience(place, loop.time())
+        self._check_backoff(place, loop.time())
         asked_at_s = loop.time()
         async with self._lock:
             self._check_turn(place, asked_at_s)
@@ -103,35 +103,35 @@ class SharedLine(ABC, Generic[PlaceT]):
                         await self._settle(place)
                     result = await job()
             except TimeoutError:
-                place.patience.failed(loop.time())
-                raise DeviceTimeout(place.name, f"not done within {2.0 * self.timeout_s} s") from None
+                place.backoff.failed(loop.time())
+                raise DeviceTimeout(place.name, f"not finished within {2.0 * self.timeout_s} s") from None
             except (DeviceTimeout, DeviceGarbled):
-                place.patience.failed(loop.time())
+                place.backoff.failed(loop.time())
                 raise
             except DriverError:
-                # A gateway may take its time to say that a device is not there.
+                # A gateway may be slow to report that a device is missing.
                 if loop.time() - began_s > self.timeout_s / 2.0:
-                    place.patience.failed(loop.time())
+                    place.backoff.failed(loop.time())
                 else:
-                    place.patience.succeeded()
+                    place.backoff.succeeded()
                 raise
-        place.patience.succeeded()
+        place.backoff.succeeded()
         return result
 
-    def _check_patience(self, place: PlaceT, now_s: float) -> None:
-        """Refuse quickly while no try is due."""
+    def _check_backoff(self, place: PlaceT, now_s: float) -> None:
+        """Refuse at once while no attempt is due."""
         if place.closed:
             raise DeviceDisconnected(place.name, "is closed")
-        hold_s, failures = max((patience.hold_s(now_s), patience.failures) for patience in self._patiences(place))
-        if hold_s > 0.0:
-            raise DeviceTimeout(place.name, f"silent {failures} times, next try in {hold_s:.1f} s")
+        wait_s, failures = max((backoff.wait_s(now_s), backoff.failures) for backoff in self._backoffs(place))
+        if wait_s > 0.0:
+            raise DeviceTimeout(place.name, f"no answer {failures} times, next attempt in {wait_s:.1f} s")
 
-    def _patiences(self, place: PlaceT) -> list[Patience]:
-        """Return what a try has to wait for."""
-        return [place.patience]
+    def _backoffs(self, place: PlaceT) -> list[Backoff]:
+        """Return the back-offs that an attempt has to wait for."""
+        return [place.backoff]
 
     def _check_turn(self, place: PlaceT, asked_at_s: float) -> None:
-        """Refuse a device whose turn it is, where a try of another has shown meanwhile that it is in vain."""
+        """Refuse a device in its turn, where another one has found meanwhile that the host is not reachable."""
 
     @abstractmethod
     async def _open(self, place: PlaceT) -> None:
@@ -143,10 +143,10 @@ class SharedLine(ABC, Generic[PlaceT]):
 
     @abstractmethod
     def _heard_at_s(self) -> float | None:
-        """Return when something came last, s of the loop's clock; None where the line is not open."""
+        """Return the time of the last bytes received, s of the loop's clock; None where the line is not open."""
 
     async def _be_quiet(self) -> None:
-        """Wait until nothing comes any more, half a time limit at most."""
+        """Wait until the line is quiet, for at most half a time limit."""
         loop = asyncio.get_running_loop()
         give_up_s = loop.time() + self.timeout_s / 2.0
         while (heard_at_s := self._heard_at_s()) is not None and loop.time() < give_up_s:

@@ -5,13 +5,11 @@ Displacement of an amplifier with a linear output:
 `displacement_um = standoff_um + polarity × um_per_v × U`
 
 `um_per_v` is the probe's sensitivity (> 0) from its calibration sheet. `polarity` is +1 where the voltage
-rises with the gap and −1 where it falls. `standoff_um` is what is reported at 0 V: the stand-off at which
-the probe was calibrated to give 0 V if the reading is to be the gap itself, or 0 if it is to be the change
-from there.
+rises with the gap and −1 where it falls. `standoff_um` is the reading at 0 V: the stand-off at which the
+probe was calibrated to 0 V where the reading is the gap itself, or 0 where it is the change from there.
 
-An amplifier off its range, or a probe that touches, drives the output to its stop. Such a voltage is sound
-as a voltage, so the limits within which the output means anything are given with the probe: `volt_min`,
-`volt_max`.
+An amplifier off its range, or a probe that touches, drives the output to its limit. Such a voltage is valid as
+a voltage, so the limits of the linear output are given with the probe: `volt_min`, `volt_max`.
 
 Sources: ICP DAS ET-7000/PET-7000 register table, appendix A; Advantech ADAM-4000 manual (voltage ranges
 report the clamped value out of range).
@@ -23,13 +21,13 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from drivers.protocols.couples import OPEN_WORD, UNDER_WORD
+from drivers.protocols.thermocouples import OPEN_WORD, UNDER_WORD
 from drivers.reading import Quality, Reading
 from drivers.settings import Where, settings
 
 Volt = Annotated[float, msgspec.Meta(ge=-100.0, le=100.0)]
 
-# Ranges by full scale in V, with the type code that both makers give them.
+# Ranges by full scale in V, with their type code, the same for both makers.
 RANGE_CODES = {10.0: 0x08, 5.0: 0x09, 1.0: 0x0A, 0.5: 0x0B, 0.15: 0x0C}
 
 
@@ -43,7 +41,7 @@ class Probe(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     polarity : int
         +1: the voltage rises with the gap; −1: it falls.
     standoff_um : float
-        Reported at 0 V, µm.
+        Reading at 0 V, µm.
     volt_min, volt_max : float
         Limits of the output between which it is linear, V. Beyond them a reading is under or over range.
     """
@@ -76,7 +74,7 @@ def probe_settings(table: dict[str, object] | None, where: Where) -> Probe | Non
     Raises
     ------
     DriverConfigError
-        A key is wrong, or the limits are the wrong way round.
+        A key is wrong, or the limits are reversed.
     """
     if table is None:
         return None

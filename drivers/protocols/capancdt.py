@@ -24,7 +24,7 @@ from dataclasses import dataclass
 PREAMBLE = b"MEAS"
 FULL_SCALE = 0xFFFFFF
 MOST_CHANNELS = 32
-# A block never holds this many frames; a length beyond it is taken for a preamble found in measurements.
+# A block never holds this many frames; a greater length means a preamble found in measurements.
 MOST_FRAMES = 4096
 _HEADER = struct.Struct("<4siiQIHHI")
 # Order number, serial number and channels: the same in every block of a controller.
@@ -67,12 +67,12 @@ class Block:
 
 
 class Blocks:
-    """Cut a stream of bytes into blocks; they may come split, joined, or in the midst of something else.
+    """Cut a stream of bytes into blocks, which may come split, joined, or between other bytes.
 
     Attributes
     ----------
     skipped : int
-        Bytes passed over because they belong to no block.
+        Bytes skipped because they belong to no block.
     """
 
     def __init__(self) -> None:
@@ -80,7 +80,7 @@ class Blocks:
         self.skipped = 0
 
     def feed(self, data: bytes) -> list[Block]:
-        """Take received bytes; return the blocks that are now complete."""
+        """Add received bytes; return the blocks that are now complete."""
         self._rest += data
         blocks: list[Block] = []
         while True:
@@ -99,7 +99,7 @@ class Blocks:
                 self._skip(len(PREAMBLE))
                 continue
             size = _HEADER.size + frames * width
-            # Another block begins where this one should still last: it was torn, go on there.
+            # Another block begins within this one: it was truncated, continue there.
             inner, certain = self._inner_header(size)
             if inner and certain:
                 self._skip(inner)
@@ -116,9 +116,9 @@ class Blocks:
         Returns
         -------
         int
-            Where it begins; 0 when there is none.
+            Its start; 0 where there is none.
         bool
-            False while so little of it has come that it might be measurements.
+            False while too little of it has come to exclude measurements.
         """
         sender = bytes(self._rest[_SENDER])
         reach = size + len(PREAMBLE) - 1
@@ -141,7 +141,7 @@ class Blocks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Channel:
-    """What the controller says of a channel.
+    """A channel, as the controller describes it.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def channel_info(reply: str) -> Channel:
     Raises
     ------
     BadReplyError
-        It carries no range, or a unit that is no length.
+        It has no range, or a unit that is not a length.
 
     Examples
     --------
@@ -174,7 +174,7 @@ def channel_info(reply: str) -> Channel:
     fields = dict(re.findall(r"(ANO|NAM|SNO|OFS|RNG|UNT)([^,\r\n]*)", reply.strip().removesuffix("OK")))
     unit = fields.get("UNT", "").strip()
     if unit not in _UNITS_UM:
-        raise BadReplyError(f"unit {unit!r} of {reply.strip()!r} is no length")
+        raise BadReplyError(f"unit {unit!r} of {reply.strip()!r} is not a length")
     try:
         range_um = float(fields["RNG"]) * _UNITS_UM[unit]
     except (KeyError, ValueError):

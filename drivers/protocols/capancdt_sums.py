@@ -1,4 +1,4 @@
-"""What is kept of a channel's values in one block: enough for mean, extremes and quality, whatever the block's size."""
+"""Sums of a channel's values in one block: enough for mean, extremes and quality, whatever the block's size."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from drivers.protocols.capancdt import FULL_SCALE
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sums:
-    """What is kept of one channel in one block.
+    """Sums of one channel in one block.
 
     Parameters
     ----------
     time_s : float
-        When the block came, on the loop's clock.
+        Arrival of the block, on the loop's clock.
     count, total, minimum, maximum : int
         Of the values as sent.
     under, over : int

@@ -12,11 +12,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from drivers.protocols.couples import Span
+from drivers.protocols.thermocouples import Span
 from drivers.reading import Quality, Reading
 
 CR = b"\r"
-# What a value may look like: 7 characters with a point, 5 without one when out of range, 7 blanks when off.
+# Forms of a value: 7 characters with a point, 5 without one when out of range, 7 blanks when off.
 _VALUE = re.compile(r"[+-]\d*\.?\d*| {7}")
 _HEX = re.compile(r"[0-9A-F]{4}")
 
@@ -34,7 +34,7 @@ class Reply:
     lead : str
         `!`, `?` or `>`.
     body : str
-        What follows, with the address where the lead has one.
+        The rest, with the address where the lead has one.
     """
 
     lead: str
@@ -70,7 +70,7 @@ def command(text: str, *, with_checksum: bool) -> bytes:
 
 
 def reply(line: bytes, *, with_checksum: bool) -> Reply:
-    """Take a reply apart.
+    """Split a reply.
 
     Parameters
     ----------
@@ -96,14 +96,14 @@ def reply(line: bytes, *, with_checksum: bool) -> Reply:
         if sent.upper() != due:
             raise BadTextError(f"checksum {sent!r} of {text!r}, expected {due!r}")
     if not text or text[0] not in "!?>":
-        raise BadTextError(f"{text!r} begins with none of ! ? >")
+        raise BadTextError(f"{text!r} does not begin with ! ? or >")
     return Reply(lead=text[0], body=text[1:])
 
 
 def split_values(body: str, count: int, form: str) -> list[str]:
     """Split the values of a `#AA` reply.
 
-    Out-of-range texts are shorter than values, so the signs part them, not the widths.
+    Out-of-range texts are shorter than values, so values are separated by their signs, not by widths.
 
     Raises
     ------
@@ -135,12 +135,12 @@ def thermocouple(text: str, form: str, span: Span, vendor: str | None) -> Readin
     Parameters
     ----------
     text : str
-        As `split_values` gives it.
+        As `split_values` returns it.
     form : str
         `engineering` (°C), `percent` (of the top of the range) or `hex` (two's complement, 7FFF = top of
         the range).
     span : Span
-        Range of the couple in this maker's modules.
+        Range of the thermocouple type in this maker's modules.
     vendor : str or None
         `icpdas` or `advantech`: hexadecimal marks of out-of-range differ.
 
@@ -156,14 +156,14 @@ def thermocouple(text: str, form: str, span: Span, vendor: str | None) -> Readin
     if text == "-0000":
         return Reading.bad(Quality.UNDER, "below the range (-0000)")
     if text == "+9999":
-        return Reading.bad(Quality.OPEN, "open couple or above the range (+9999)")
+        return Reading.bad(Quality.OPEN, "open thermocouple or above the range (+9999)")
     if "." not in text:
         raise BadTextError(f"{text!r} is neither a value nor +9999 or -0000")
     value = float(text)
     if abs(value) >= 9999.0:
         quality = Quality.OPEN if value > 0 else Quality.UNDER
-        return Reading.bad(quality, f"open couple or out of range ({text})")
-    return span.judged(value / 100.0 * span.high_degc if form == "percent" else value)
+        return Reading.bad(quality, f"open thermocouple or out of range ({text})")
+    return span.reading(value / 100.0 * span.high_degc if form == "percent" else value)
 
 
 def _hexadecimal(text: str, span: Span, vendor: str | None) -> Reading:
@@ -171,8 +171,8 @@ def _hexadecimal(text: str, span: Span, vendor: str | None) -> Reading:
     raw = int(text, 16)
     if vendor == "advantech":
         if raw == 0xFFFF:
-            return Reading.bad(Quality.OPEN, "open couple or above the range (FFFF)")
+            return Reading.bad(Quality.OPEN, "open thermocouple or above the range (FFFF)")
         if raw == 0:
             return Reading.bad(Quality.UNDER, "below the range (0000)")
-        return span.judged((raw - (raw >> 15 << 16)) / 32768.0 * span.full_degc)
+        return span.reading((raw - (raw >> 15 << 16)) / 32768.0 * span.full_degc)
     return span.icp_hex(raw)

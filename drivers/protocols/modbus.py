@@ -1,7 +1,7 @@
-"""Modbus frames: what answer is expected, and where in a stream of bytes it stands.
+"""Modbus frames: the expected answer, and its place in a stream of bytes.
 
-pymodbus decodes the answers. What passes to it is chosen here first, because an RTU frame carries no number
-of the request it answers: only unit, function and length tell an answer from a late or foreign one.
+pymodbus decodes the answers. The frame is selected here first, because an RTU frame does not carry the number of its
+request: only unit, function and length distinguish an answer from a late or foreign one.
 
 Sources: Modbus Application Protocol V1.1b3; Modbus over Serial Line V1.02; Modbus Messaging on TCP/IP V1.0b.
 """
@@ -57,25 +57,25 @@ class Request:
 
 
 class WrongAnswerError(ValueError):
-    """An answer that cannot be the one asked for; the text says why."""
+    """An answer that does not belong to the request; the text says why."""
 
 
 def exception_text(code: int) -> str:
-    """Put the code of an exception reply in words."""
+    """Return the code of an exception reply in words."""
     return f"exception {code} ({EXCEPTIONS.get(code, 'code not in the standard')})"
 
 
 def fence_for(requests: tuple[Request, ...]) -> Request:
-    """Choose a request whose answer cannot be taken for that of any of a device's requests.
+    """Choose a request whose answer cannot be confused with that of any of a device's requests.
 
-    After a missing answer this is asked first. A device answers in order, so once the fence's own answer is
-    there every earlier one has come, or will never come. The fence reads the start of the first block, in a
-    length that is none of the device's own.
+    After a missing answer it is sent first. A device answers in order, so once the fence's own answer is there every
+    earlier one has come, or will never come. The fence reads the start of the first block, with a length that no other
+    request has.
 
     Parameters
     ----------
     requests : tuple of Request
-        Everything the device is ever asked; the first is the block it is polled for.
+        All requests to the device; the first is the block that is polled.
 
     Examples
     --------
@@ -108,9 +108,9 @@ def crc16(data: bytes) -> int:
 
 
 def find_rtu(data: bytes, unit: int, request: Request) -> bytes | None:
-    """Find the answer to a request in what a serial line brought.
+    """Find the answer to a request in the bytes of a serial line.
 
-    Noise before it and answers of other length, function or unit are passed over.
+    Noise before it and answers of other length, function or unit are skipped.
 
     Returns
     -------
@@ -131,12 +131,12 @@ def find_rtu(data: bytes, unit: int, request: Request) -> bytes | None:
 
 
 def describe_rtu(data: bytes, unit: int, request: Request) -> str | None:
-    """Say why what a line brought is no answer.
+    """Return why the bytes of a line are no answer.
 
     Returns
     -------
     str or None
-        None when it holds nothing but sound frames of other units, or nothing at all: then the device was
+        None where they are valid frames of other units only, or where there are none: then the device was
         silent.
     """
     rest = data
@@ -146,24 +146,24 @@ def describe_rtu(data: bytes, unit: int, request: Request) -> str | None:
         if len(frame) < size or crc16(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
             return f"no valid frame in {len(data)} bytes, CRC or length wrong: {data[:40].hex(' ')}"
         if frame[0] == unit:
-            asked = f"asked {request}, {request.data_bytes} bytes"
+            asked = f"asked for {request}, {request.data_bytes} bytes"
             return f"{asked}, the answer is function {frame[1]}, {size - 5} bytes"
         rest = rest[size:]
     return f"{len(rest)} stray bytes: {rest.hex(' ')}" if rest else None
 
 
 def find_tcp(data: bytes, transaction: int, unit: int, request: Request) -> bytes | None:
-    """Find the answer to a request in what a TCP connection brought.
+    """Find the answer to a request in the bytes of a TCP connection.
 
     Returns
     -------
     bytes or None
-        The frame with its header; None while it is not there. Late answers are passed over by their number.
+        The frame with its header; None while it is not there. Late answers are skipped by their number.
 
     Raises
     ------
     WrongAnswerError
-        The stream is out of step, or the answer to this very request is not what was asked.
+        The stream is out of step, or the answer to this request is a different one.
     """
     rest = data
     while len(rest) >= 8:
@@ -180,7 +180,7 @@ def find_tcp(data: bytes, transaction: int, unit: int, request: Request) -> byte
 
 
 def _checked_tcp(frame: bytes, size: int, answering: int, unit: int, request: Request) -> bytes | None:
-    """Return the frame when it is complete and what was asked."""
+    """Return the frame where it is complete and answers the request."""
     if answering != unit:
         raise WrongAnswerError(f"asked unit {unit}, unit {answering} answers")
     function = frame[7]
@@ -188,5 +188,5 @@ def _checked_tcp(frame: bytes, size: int, answering: int, unit: int, request: Re
         raise WrongAnswerError(f"asked function {request.function}, the answer is function {function}")
     due = 9 if function & 0x80 else 9 + request.data_bytes
     if size != due or (not function & 0x80 and len(frame) > 8 and frame[8] != request.data_bytes):
-        raise WrongAnswerError(f"asked {request}, {request.data_bytes} bytes, the answer has {max(0, size - 9)}")
+        raise WrongAnswerError(f"asked for {request}, {request.data_bytes} bytes, the answer has {max(0, size - 9)}")
     return frame if len(frame) == size else None

@@ -117,12 +117,12 @@ class QuillMachine:
         }
 
     def settle(self, inputs: Inputs) -> None:
-        """Go to the steady state of these inputs at once, time standing still."""
+        """Set the steady state of these inputs, without advancing time."""
         self._inputs = inputs
         self._at_degc = inputs.ambient_degc
         linear = self.film.linear_w_per_k * inputs.ambient_degc
         self.degc = np.full(len(self.degc), inputs.ambient_degc)
-        # Half of the way at each pass: an effect's films may be stronger than the linear part.
+        # Half of the change at each pass: an effect's films may be stronger than the linear part.
         for _ in range(400):
             target = self.conduction.steady(linear + self._heat_w(inputs))
             moved = target - self.degc
@@ -136,13 +136,13 @@ class QuillMachine:
         return float(self.conduction.capacity_j_per_k @ (self.degc - REST_DEGC))
 
     def to_air_w(self) -> float:
-        """Return the heat that all surfaces give to the air now, W."""
+        """Return the heat flow from all surfaces to the air now, W."""
         air_degc = self._inputs.ambient_degc
         h = self.film.coefficient(self.degc, air_degc, self._forced_factor(self._inputs))
         return float((h * self.film.area_m2) @ (self.degc - air_degc))
 
     def _flush(self) -> None:
-        """Step over the time that has been collected."""
+        """Step over the accumulated time."""
         dt_s, self._pending_s = self._pending_s, 0.0
         count = math.ceil(dt_s / self._longest_s - 1e-9)
         h_s = dt_s / count
@@ -171,7 +171,7 @@ class QuillMachine:
         return factor
 
     def _observe(self) -> None:
-        """Turn temperatures into what the probe and the thermocouple meet."""
+        """Turn temperatures into the signals at the probe and the thermocouple."""
         rise_k = self.degc - REST_DEGC
         growth_um = float(self.layout.growth_um_per_k @ rise_k)
         for action in self._joints:

@@ -24,7 +24,7 @@ class QuillDesign:
     expansion_per_k: float = 11.7e-6
     growth_factor: float = 1.0
 
-    # The heater plate on it, and the thermocouple T_Q beside the plate.
+    # The heater plate on it, and the thermocouple T_Q next to the plate.
     plate_centre: float = 0.443
     plate_length_m: float = 0.255
     plate_j_per_k: float = 415.0
@@ -61,7 +61,7 @@ class QuillDesign:
     base_j_per_k: float = 400e3
     base_area_m2: float = 1.5
 
-    # A further mass on the housing that the calibration never saw; 0 J/K: not there.
+    # A further mass on the housing that the calibration never saw; 0 J/K: none.
     second_j_per_k: float = 0.0
     second_link_w_per_k: float = 0.0
     second_lever_m: float = 0.0

@@ -1,4 +1,4 @@
-"""What a machine is made to do: inputs over time, by seed, on a grid of 10 s."""
+"""Duties of a machine: inputs over time, by seed, on a grid of 10 s."""
 
 from __future__ import annotations
 

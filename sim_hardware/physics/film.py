@@ -45,7 +45,7 @@ class Film:
         self._forced = forced_w_per_m2k
         self._natural3 = (1.42 / height_m**0.25) ** 3
         self._radiant = emissivity * STEFAN_BOLTZMANN_W_PER_M2K4
-        # The linear part is the film without any difference of temperature; what is left over is then small.
+        # The linear part is the film without any difference of temperature; the remainder is then small.
         linear = forced_w_per_m2k + 4.0 * self._radiant * (reference_degc + KELVIN) ** 3
         self.linear_w_per_k: Array = linear * area_m2
         self._linear = linear
@@ -60,6 +60,6 @@ class Film:
         return np.asarray(mixed + radiation, dtype=np.float64)
 
     def excess_w(self, surface_degc: Array, air_degc: float, forced_factor: float = 1.0) -> Array:
-        """Return the heat into each mass beyond what the linear part carries, W."""
+        """Return the heat into each mass beyond the linear part, W."""
         extra = self.coefficient(surface_degc, air_degc, forced_factor) - self._linear
         return np.asarray(extra * self.area_m2 * (air_degc - surface_degc), dtype=np.float64)

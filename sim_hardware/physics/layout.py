@@ -69,7 +69,7 @@ class Layout:
         network.link(self.quill[-1], self.nose, d.nose_link_w_per_k)
         for node, share in self._under_plate():
             network.link(self.plate, node, d.plate_contact_w_per_k * share)
-        for node, share in self._beside_sensor():
+        for node, share in self._around_sensor():
             network.link(self.sensor, node, d.sensor_contact_w_per_k * share)
         for node in self.guided:
             network.link(node, self.housing, d.guide_w_per_mk * self._dx_m)
@@ -95,7 +95,7 @@ class Layout:
         total = sum(length for _, length in covered if length > 0.0)
         return [(self.quill[i], length / total) for i, length in covered if length > 0.0]
 
-    def _beside_sensor(self) -> list[tuple[int, float]]:
+    def _around_sensor(self) -> list[tuple[int, float]]:
         """Return the two nodes between whose centres the thermocouple sits."""
         d = self._design
         position = min(max(d.sensor_place * d.quill_nodes - 0.5, 0.0), d.quill_nodes - 1.001)

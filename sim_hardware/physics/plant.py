@@ -1,4 +1,4 @@
-"""What every simulated machine takes and gives: inputs in, true signals out."""
+"""The interface of every simulated machine: inputs in, true signals out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_FAN_RPM = 3000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inputs:
-    """What acts on the machine during one step.
+    """Inputs of the machine during one step.
 
     Parameters
     ----------

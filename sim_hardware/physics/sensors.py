@@ -1,4 +1,4 @@
-"""Sensors between the true value and the wire: bias, noise, quantisation, lag, wild readings, dropouts."""
+"""Sensors between the true value and the wire: bias, noise, quantisation, lag, outliers, dropouts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BLOCK = 1024
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorSpec:
-    """What is wrong with a sensor; all in the unit of its channel unless said otherwise.
+    """Errors of a sensor, in the unit of its channel unless stated otherwise.
 
     Parameters
     ----------

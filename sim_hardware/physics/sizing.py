@@ -104,7 +104,7 @@ def fit(start: QuillDesign, evaluations: int = 40) -> QuillDesign:
 
 
 def main() -> None:
-    """Print how near the dimensions come; search before, if asked to."""
+    """Print how near the responses come; with an option, search first."""
     parser = argparse.ArgumentParser(description="fit the simulated quill to the published responses")
     parser.add_argument("--fit", action="store_true", help="search for new dimensions first")
     parser.add_argument("--evaluations", type=int, default=40, help="bound for the search")

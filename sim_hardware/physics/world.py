@@ -1,4 +1,4 @@
-"""A machine at work, seen through its sensors; time is handed in, and readers may live in other threads."""
+"""A machine at work, seen through its sensors; time is passed in, and readers may be in other threads."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class World:
                 self._step(min(t_s, grid))
 
     def source(self, name: str) -> Callable[[], float]:
-        """Return a function that takes a reading of a channel now; each call draws its own noise.
+        """Return a function that reads a channel now; each call draws its own noise.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class World:
             return {"t_s": np.array(self._times), **columns}
 
     def record(self, period_s: float = 60.0, until_s: float | None = None) -> dict[str, Array]:
-        """Run on to the duty's end, or to `until_s`, and return what a logger would have written.
+        """Run on to the duty's end, or to `until_s`, and return the table of a logger.
 
         Each row is the mean of one reading a second over ``(t_s, t_s + period_s]``. The readings draw from
         streams of their own, so that a recording is the same whatever has been read before.
@@ -128,7 +128,7 @@ class World:
         count = int((past["t_s"][-1] - start_s) / period_s + 1e-9)
         each = max(1, round(period_s / READING_S))
         when = start_s + (np.arange(count * each) + 1.0) * (period_s / each)
-        # The truth holds from one step's end back to its start: that is what a held input did.
+        # The true value holds from a step's end back to its start, as the inputs are held.
         index = np.minimum(np.searchsorted(past["t_s"], when - 1e-6), len(past["t_s"]) - 1)
         table: dict[str, Array] = {"t_s": np.arange(count, dtype=np.float64) * period_s}
         for name, spec in self._specs.items():

@@ -7,11 +7,11 @@ Advantech's published .NET library: ``value = low + raw / 65535 * (high - low)``
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from sim_hardware.wire.module import ILLEGAL_VALUE, Cell, MeasuringModule, RefusalError, Sample, Source, State
-from sim_hardware.wire.ranges import ADAM_4118_VOLTS, ADAM_COUPLES, ADAM_VOLTS, Range, choose, find
+from sim_hardware.wire.module import ILLEGAL_VALUE, Cell, RefusalError, Sample, Source, State
+from sim_hardware.wire.ranges import ADAM_4118_VOLTS, ADAM_THERMOCOUPLES, ADAM_VOLTS, Range, RangedModule, Wanted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,37 +24,39 @@ class _Model:
 
 
 _MODELS = {
-    "adam-4018+": _Model(offered=ADAM_COUPLES, default="K", burn_out=0, name="4018P", name_words=(0x4018, 0x5000)),
+    "adam-4018+": _Model(
+        offered=ADAM_THERMOCOUPLES, default="K", burn_out=0, name="4018P", name_words=(0x4018, 0x5000)
+    ),
     "adam-4118": _Model(
-        offered=ADAM_4118_VOLTS + ADAM_COUPLES,
+        offered=ADAM_4118_VOLTS + ADAM_THERMOCOUPLES,
         default="K",
         burn_out=0,
         name="4118",
         name_words=(0x4118, 0x0000),
     ),
-    "adam-6018": _Model(offered=ADAM_COUPLES, default="K", burn_out=0, name="6018", name_words=(0x6018, 0x0000)),
+    "adam-6018": _Model(offered=ADAM_THERMOCOUPLES, default="K", burn_out=0, name="6018", name_words=(0x6018, 0x0000)),
     "adam-4117": _Model(offered=ADAM_VOLTS, default="10V", burn_out=None, name="4117", name_words=(0x4117, 0x0000)),
     "adam-6017": _Model(offered=ADAM_VOLTS, default="10V", burn_out=None, name="6017", name_words=(0x6017, 0x0000)),
 }
 
 
-class Adam(MeasuringModule):
+class Adam(RangedModule):
     """Simulate an Advantech ADAM analogue input module with eight channels.
 
     Parameters
     ----------
     model : str
         `adam-4018+`, `adam-4118`, `adam-6018`, `adam-4117` or `adam-6017`.
-    couples, ranges : str, int, sequence or mapping, optional
-        Range of the channels by name ("K", "10V") or type code; one of the two. Default type K, or ±10 V.
+    ranges : str, int, sequence or mapping, optional
+        Range of the channels by name ("K", "10V") or type code. Default type K, or ±10 V.
     sources : Mapping[int, Source]
         Source of each wired input: °C, V or mA.
     burn_out_coil : int, optional
         Address of the burn-out flag of channel 0. The manuals consulted print 0 for the serial modules;
-        for the 6018 the number was not to be had, so it may be set.
+        for the 6018 no number was found, so it may be set.
     hundredths : bool
         Whether words count 0.01 in two's complement instead of 1/65535 of the range: modules configured
-        for engineering units are met in the field.
+        for engineering units exist in the field.
     cjc_degc : float
         Temperature of the terminals, °C.
 
@@ -69,8 +71,7 @@ class Adam(MeasuringModule):
         model: str,
         *,
         sources: Mapping[int, Source],
-        couples: str | int | Sequence[str | int] | Mapping[int, str | int] | None = None,
-        ranges: str | int | Sequence[str | int] | Mapping[int, str | int] | None = None,
+        ranges: Wanted = None,
         burn_out_coil: int | None = None,
         hundredths: bool = False,
         cjc_degc: float = 25.0,
@@ -78,28 +79,19 @@ class Adam(MeasuringModule):
         self.model = model.lower()
         if self.model not in _MODELS:
             raise ValueError(f"no ADAM model {model!r}: {', '.join(_MODELS)}")
-        if couples is not None and ranges is not None:
-            raise ValueError("give couples or ranges, not both")
-        about = _MODELS[self.model]
-        super().__init__(sources, 8, 0.0 if about.burn_out is None else float("nan"))
-        self.offered = about.offered
-        default = find(about.default, self.offered)
-        self.ranges = choose(couples if ranges is None else ranges, self.offered, self.channels, default)
-        self.name = about.name
+        spec = _MODELS[self.model]
+        unwired = 0.0 if spec.burn_out is None else float("nan")
+        super().__init__(sources, 8, unwired, offered=spec.offered, ranges=ranges, default=spec.default)
+        self.name = spec.name
         self.firmware = "A1.06"
         self.type_per_channel = True
         self.enabled = 0xFF
         self.cjc_degc = cjc_degc
         self._hundredths = hundredths
-        self._build(about, about.burn_out if burn_out_coil is None else burn_out_coil)
-
-    def limits(self, channel: int) -> tuple[float, float]:
-        """Return the range of an input, in °C, V or mA."""
-        span = self.ranges[channel]
-        return span.low / span.per_source_unit, span.high / span.per_source_unit
+        self._build(spec, spec.burn_out if burn_out_coil is None else burn_out_coil)
 
     def bad(self, channel: int) -> bool:
-        """Tell whether the module sees a couple outside its range or open."""
+        """Return whether the module sees a thermocouple outside its range or open."""
         return self.ranges[channel].thermocouple and self.sample(channel).state is not State.GOOD
 
     def displayed(self, channel: int) -> Sample:
@@ -127,21 +119,6 @@ class Adam(MeasuringModule):
             return 0x0000 if sample.state is State.UNDER else 0xFFFF
         scale = 32767.0 if sample.value >= 0.0 else 32768.0
         return round(sample.value / span.full_scale * scale) & 0xFFFF
-
-    def set_type(self, code: int, channel: int | None = None) -> None:
-        """Set the range of one channel, or of all.
-
-        Raises
-        ------
-        RefusalError
-            Code 3 if the module does not have such a type code.
-        """
-        try:
-            span = find(code, self.offered)
-        except ValueError:
-            raise RefusalError(ILLEGAL_VALUE) from None
-        for i in range(self.channels) if channel is None else (channel,):
-            self.ranges[i] = span
 
     def _word(self, channel: int) -> int:
         if not self.enabled >> channel & 1:

@@ -139,7 +139,7 @@ class CapaNcdt(Server):
 
     def execute(self, command: str) -> str:
         """Answer a command of the Telnet port; what follows the echo."""
-        if self._layers.take("exception") is not None:
+        if self._layers.use("exception") is not None:
             return WRONG
         answer = self.controller.answer(command)
         if self.controller.single_requests:
@@ -180,17 +180,17 @@ class CapaNcdt(Server):
 
     def _send(self, n_frames: int) -> None:
         frames = [[self._measure(channel) for channel in self._channels] for _ in range(n_frames)]
-        lost = self._layers.take("gap")
+        lost = self._layers.use("gap")
         if lost is not None:
             self.counter += int(number(lost, "frames", n_frames))
         data = block(self._channels, frames, self.counter)
-        if self._layers.take("stale_counter") is None:
+        if self._layers.use("stale_counter") is None:
             self.counter += n_frames
         client = next(iter(self._data.connections), None)
         if not isinstance(client, DataConnection):
             return
-        if self._layers.take("wrong_length") is not None:
-            # The header promises one value more than follows.
+        if self._layers.use("wrong_length") is not None:
+            # The header announces one value more than follows.
             data = data[:-4]
         client.outlet.send(data, self._layers)
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 SAMPLE_TIMES_US = (256, 480, 960, 1920, 9600, 16000, 19200, 32000, 48000, 96000, 192000, 400000)
-"""Sample times, µs. The ends and 960 are documented; those between are usual of the family."""
+"""Sample times, µs. The ends and 960 are documented; those between are usual in the family."""
 UNKNOWN = "$UNKNOWN COMMAND"
 WRONG = "$WRONG PARAMETER"
 _LIMITS = {"AVT": (0, 4), "AVN": (2, 8), "TRG": (0, 3)}
@@ -42,7 +42,7 @@ class Controller:
         return self.settings["TRG"] == 0
 
     def answer(self, command: str) -> str:
-        """Return what follows the echo of a command, without CR LF.
+        """Return the answer that follows the echo of a command, without CR LF.
 
         Parameters
         ----------

@@ -27,20 +27,20 @@ class DataConnection(Connection):
         self.transport.set_write_buffer_limits(0)
 
     def closed(self) -> None:
-        """Stop what is still under way."""
+        """Stop pending sends."""
         self.outlet.close()
         self._writable.set()
 
     def pause_writing(self) -> None:
-        """Take note that the socket is full."""
+        """Note that the socket is full."""
         self._writable.clear()
 
     def resume_writing(self) -> None:
-        """Take note that the socket has emptied."""
+        """Note that the socket is empty again."""
         self._writable.set()
 
     async def drained(self) -> None:
-        """Wait until the socket has taken everything."""
+        """Wait until the socket has accepted everything."""
         await self._writable.wait()
 
 
@@ -67,11 +67,11 @@ class CommandConnection(Connection):
         self.write(BANNER)
 
     def closed(self) -> None:
-        """Stop what is still under way."""
+        """Stop pending sends."""
         self._stop_timer()
 
     def data_received(self, data: bytes) -> None:
-        """Take characters as they come."""
+        """Process received characters."""
         if self._mute():
             return
         self._stop_timer()

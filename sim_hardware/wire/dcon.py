@@ -26,7 +26,7 @@ _SPEAKS = ("i-", "m-", "adam-41", "adam-40")
 class DconLine(Server):
     """Serve modules by DCON on a serial line.
 
-    There is no reply at all to a wrong syntax, a wrong checksum or an address that nobody has; `?AA` says
+    There is no reply at all to a wrong syntax, a wrong checksum or an address without a module; `?AA` says
     that a command was understood but is not allowed.
 
     Parameters
@@ -123,13 +123,13 @@ class DconLine(Server):
 
     def _send(self, reply: str, address: int, layers: Layers, *, summed: bool) -> None:
         assert self._outlet is not None
-        if layers.take("exception") is not None:
+        if layers.use("exception") is not None:
             reply = f"?{address:02X}"
-        if layers.take("wrong_length") is not None:
+        if layers.use("wrong_length") is not None:
             reply = reply[:-1]
         if summed:
             digits = checksum(reply)
-            if layers.take("bad_crc") is not None:
+            if layers.use("bad_crc") is not None:
                 digits = f"{int(digits, 16) ^ 0xFF:02X}"
             reply += digits
         self._outlet.send(reply.encode("latin-1") + b"\r", layers)

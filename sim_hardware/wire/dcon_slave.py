@@ -1,4 +1,4 @@
-"""What one module answers to DCON (ADAM ASCII) commands.
+"""Answers of one module to DCON (ADAM ASCII) commands.
 
 Sources: ICP DAS I-7018 and Advantech ADAM-4000 user's manuals.
 """
@@ -55,7 +55,7 @@ class DconSettings:
 
 
 class DconSlave:
-    """Answer commands for one module; knows no address but the one it was called by.
+    """Answer commands for one module; its address is that of the call.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ class DconModule(Protocol):
         """Return the two's complement word."""
 
     def bad(self, channel: int) -> bool:
-        """Tell whether an input is out of range or open."""
+        """Return whether an input is out of range or open."""
 
     def set_type(self, code: int, channel: int | None = None) -> None:
         """Set the range of a channel, or of all."""
@@ -65,7 +65,7 @@ def value_text(module: DconModule, channel: int, data_format: DataFormat) -> str
         return f"{module.hex_word(channel):04X}"
     sample = module.quantised(channel)
     if sample.state is not State.GOOD:
-        # Five characters where a value has seven: who cuts the reply by position goes wrong here.
+        # Five characters where a value has seven: splitting the reply by position fails here.
         return UNDER_TEXT if sample.state is State.UNDER else OVER_TEXT
     span = module.ranges[channel]
     if data_format == "percent":

@@ -46,7 +46,7 @@ class Faults:
     >>> faults.set("silence", times=1)
     >>> faults.of_input(2)
     {'open': mappingproxy({})}
-    >>> faults.take("silence") is not None, faults.take("silence") is not None
+    >>> faults.use("silence") is not None, faults.use("silence") is not None
     (True, False)
     """
 
@@ -117,10 +117,10 @@ class Faults:
         return bool(self._device)
 
     def active(self, fault: str) -> bool:
-        """Tell whether a fault of the whole device is on, without using up its `times`."""
+        """Return whether a fault of the whole device is on, without counting a reply of its `times`."""
         return fault in self._device
 
-    def take(self, fault: str) -> Parameters | None:
+    def use(self, fault: str) -> Parameters | None:
         """Return the parameters of a fault of the device if it is on, and count one reply of its `times`."""
         parameters = self._device.get(fault)
         if parameters is None or "times" not in parameters:
@@ -136,7 +136,7 @@ class Faults:
         return self._inputs.get(number, {})
 
     def restrict(self, supported: frozenset[str]) -> None:
-        """Accept only the given faults of the device from now on (the line says which exist on it).
+        """Accept only the given faults of the device from now on (those that exist on its line).
 
         Raises
         ------
@@ -149,7 +149,7 @@ class Faults:
         self._supported = supported | INPUT_FAULTS
 
     def listen(self, listener: Callable[[], None]) -> None:
-        """Have `listener` called after each change, in the thread that made it."""
+        """Call `listener` after each change, in the thread that made it."""
         self._listeners.append(listener)
 
     def _tell(self) -> None:
@@ -158,7 +158,7 @@ class Faults:
 
 
 class Layers:
-    """See the faults of a line and of a device on it as one.
+    """The faults of a line and of a device on it as one.
 
     Parameters
     ----------
@@ -176,10 +176,10 @@ class Layers:
         """Whether no fault of a device is on."""
         return not any(each.any_of_device for each in self._faults)
 
-    def take(self, fault: str) -> Parameters | None:
-        """Return the parameters of a fault that is on, else None; see `Faults.take`."""
+    def use(self, fault: str) -> Parameters | None:
+        """Return the parameters of a fault that is on, else None; see `Faults.use`."""
         for each in self._faults:
-            parameters = each.take(fault)
+            parameters = each.use(fault)
             if parameters is not None:
                 return parameters
         return None

@@ -1,25 +1,25 @@
 """ICP DAS modules: M-7018/7018R/7019R, tM-TH8, M-7017 (RTU) and ET-7017/7018Z (TCP).
 
 Register maps from the Modbus tables of the I-7018/M-7018 and tM-TH8 manuals and of the "ET-7000/PET-7000
-Register Table" 1.0.3. Where those are silent the choice is named in the README.
+Register Table" 1.0.3. Assumptions where they are silent are in the README.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from sim_hardware.wire.module import ILLEGAL_VALUE, Cell, MeasuringModule, RefusalError, Sample, Source, State
+from sim_hardware.wire.module import ILLEGAL_VALUE, Cell, RefusalError, Sample, Source, State
 from sim_hardware.wire.ranges import (
-    ICP_COUPLES,
     ICP_HIGH_VOLTS,
     ICP_LOW_VOLTS,
-    choose,
+    ICP_THERMOCOUPLES,
+    RangedModule,
+    Wanted,
     decode_hex,
     encode_hex,
-    find,
 )
 
 OPEN_WORD = 0x7FFF
@@ -31,7 +31,7 @@ READ_SETTINGS = 0x46
 class _Model:
     channels: int
     name_bytes: bytes
-    couples: bool
+    thermocouples: bool
     map: Literal["m-7000", "et-7000"]
     detects_open: bool = True
     type_per_channel: bool = False
@@ -41,24 +41,26 @@ class _Model:
 _M18 = bytes.fromhex("00701800")
 _M19 = bytes.fromhex("00701900")
 _MODELS = {
-    "m-7018": _Model(channels=8, name_bytes=_M18, couples=True, map="m-7000", detects_open=False),
-    "m-7018r": _Model(channels=8, name_bytes=_M18, couples=True, map="m-7000"),
-    "m-7019r": _Model(channels=8, name_bytes=_M19, couples=True, map="m-7000", type_per_channel=True, status_bits=True),
+    "m-7018": _Model(channels=8, name_bytes=_M18, thermocouples=True, map="m-7000", detects_open=False),
+    "m-7018r": _Model(channels=8, name_bytes=_M18, thermocouples=True, map="m-7000"),
+    "m-7019r": _Model(
+        channels=8, name_bytes=_M19, thermocouples=True, map="m-7000", type_per_channel=True, status_bits=True
+    ),
     "tm-th8": _Model(
         channels=8,
         name_bytes=bytes.fromhex("07550000"),
-        couples=True,
+        thermocouples=True,
         map="m-7000",
         type_per_channel=True,
         status_bits=True,
     ),
-    "m-7017": _Model(channels=8, name_bytes=bytes.fromhex("00701700"), couples=False, map="m-7000"),
-    "et-7018z": _Model(channels=10, name_bytes=_M18, couples=True, map="et-7000"),
-    "et-7017": _Model(channels=8, name_bytes=bytes.fromhex("00701700"), couples=False, map="et-7000"),
+    "m-7017": _Model(channels=8, name_bytes=bytes.fromhex("00701700"), thermocouples=False, map="m-7000"),
+    "et-7018z": _Model(channels=10, name_bytes=_M18, thermocouples=True, map="et-7000"),
+    "et-7017": _Model(channels=8, name_bytes=bytes.fromhex("00701700"), thermocouples=False, map="et-7000"),
 }
 
 
-class IcpDas(MeasuringModule):
+class IcpDas(RangedModule):
     """Simulate an ICP DAS analogue input module.
 
     In hexadecimal format a word is ``value / full_scale * 32767`` for positive and ``* 32768`` for negative
@@ -69,8 +71,8 @@ class IcpDas(MeasuringModule):
     model : str
         `m-7018`, `m-7018r`, `m-7019r`, `tm-th8`, `m-7017`, `et-7018z` or `et-7017`; an `i-` for the `m-` is
         the same module.
-    couples, ranges : str, int, sequence or mapping, optional
-        Range of the channels by name ("K", "10V") or type code; one of the two. The factory setting is
+    ranges : str, int, sequence or mapping, optional
+        Range of the channels by name ("K", "10V") or type code. The factory setting is
         ±2.5 V for thermocouple modules and ±10 V for analogue ones.
     sources : Mapping[int, Source]
         Source of each wired input: °C, V or mA.
@@ -90,8 +92,7 @@ class IcpDas(MeasuringModule):
         model: str,
         *,
         sources: Mapping[int, Source],
-        couples: str | int | Sequence[str | int] | Mapping[int, str | int] | None = None,
-        ranges: str | int | Sequence[str | int] | Mapping[int, str | int] | None = None,
+        ranges: Wanted = None,
         data_format: Literal["hex", "engineering"] = "hex",
         cjc_degc: float = 25.0,
     ) -> None:
@@ -99,15 +100,17 @@ class IcpDas(MeasuringModule):
         key = self.model.replace("i-", "m-", 1) if self.model.startswith("i-") else self.model
         if key not in _MODELS:
             raise ValueError(f"no ICP DAS model {model!r}: {', '.join(_MODELS)}")
-        if couples is not None and ranges is not None:
-            raise ValueError("give couples or ranges, not both")
-        self._about = _MODELS[key]
-        super().__init__(sources, self._about.channels, float("nan") if self._about.couples else 0.0)
+        spec = self._spec = _MODELS[key]
+        super().__init__(
+            sources,
+            spec.channels,
+            float("nan") if spec.thermocouples else 0.0,
+            offered=ICP_LOW_VOLTS + ICP_THERMOCOUPLES if spec.thermocouples else ICP_HIGH_VOLTS,
+            ranges=ranges,
+            default=0x05 if spec.thermocouples else 0x08,
+        )
         if data_format not in {"hex", "engineering"}:
             raise ValueError(f"data_format must be hex or engineering, not {data_format!r}")
-        self.offered = ICP_LOW_VOLTS + ICP_COUPLES if self._about.couples else ICP_HIGH_VOLTS
-        default = find(0x05 if self._about.couples else 0x08, self.offered)
-        self.ranges = choose(couples if ranges is None else ranges, self.offered, self.channels, default)
         self.data_format = data_format
         self.cjc_degc = cjc_degc
         self.enabled = (1 << self.channels) - 1
@@ -116,7 +119,7 @@ class IcpDas(MeasuringModule):
         self.name = f"{self.model[2:] if key[1] == '-' else self.model}".upper()
         self.firmware = "A2.0"
         self._cjc_offsets = [0] * self.channels
-        if self._about.map == "m-7000":
+        if self._spec.map == "m-7000":
             self._build_m7000()
         else:
             self._build_et7000()
@@ -124,29 +127,24 @@ class IcpDas(MeasuringModule):
     @property
     def type_per_channel(self) -> bool:
         """Whether each channel has its own type code."""
-        return self._about.type_per_channel
-
-    def limits(self, channel: int) -> tuple[float, float]:
-        """Return the range of an input, in °C, V or mA."""
-        span = self.ranges[channel]
-        return span.low / span.per_source_unit, span.high / span.per_source_unit
+        return self._spec.type_per_channel
 
     def bad(self, channel: int) -> bool:
         """Tell whether the module sees an input outside its range or open."""
         state = self.sample(channel).state
         if state is State.OPEN:
-            return self._about.detects_open and self.ranges[channel].thermocouple
+            return self._spec.detects_open and self.ranges[channel].thermocouple
         return state is not State.GOOD
 
     def displayed(self, channel: int) -> Sample:
         """Return a conversion in the displayed unit, as far as the module can tell what it sees.
 
-        A module without wire detection takes an open couple for one at the temperature of its terminals.
+        A module without wire detection reads an open thermocouple as the temperature of its terminals.
         Voltage and current inputs have no out-of-range state: they stop at their limits.
         """
         span, sample = self.ranges[channel], self.sample(channel)
         state, value = sample.state, sample.value * span.per_source_unit
-        if state is State.OPEN and not (span.thermocouple and self._about.detects_open):
+        if state is State.OPEN and not (span.thermocouple and self._spec.detects_open):
             value, state = (self.cjc_degc if span.thermocouple else 0.0), State.GOOD
         if not span.thermocouple:
             value = span.high if state is State.OVER else span.low if state is State.UNDER else value
@@ -169,27 +167,12 @@ class IcpDas(MeasuringModule):
 
     def private(self, pdu: bytes) -> bytes | None:
         """Answer function 0x46: sub-function 00 reads the module name, others are refused."""
-        if pdu[0] != READ_SETTINGS or self._about.map != "m-7000":
+        if pdu[0] != READ_SETTINGS or self._spec.map != "m-7000":
             return None
         if pdu[1:] == b"\x00":
-            return bytes((READ_SETTINGS, 0)) + self._about.name_bytes
+            return bytes((READ_SETTINGS, 0)) + self._spec.name_bytes
         # The manuals give 02 for a sub-function that the module does not have.
         return bytes((READ_SETTINGS | 0x80, 2))
-
-    def set_type(self, code: int, channel: int | None = None) -> None:
-        """Set the range of one channel, or of all.
-
-        Raises
-        ------
-        RefusalError
-            Code 3 if the module does not have such a type code.
-        """
-        try:
-            span = find(code, self.offered)
-        except ValueError:
-            raise RefusalError(ILLEGAL_VALUE) from None
-        for i in range(self.channels) if channel is None else (channel,):
-            self.ranges[i] = span
 
     def _word(self, channel: int) -> int:
         if not self.enabled >> channel & 1:
@@ -207,18 +190,18 @@ class IcpDas(MeasuringModule):
         for i in range(self.channels):
             both[i] = Cell(functools.partial(self._word, i))
             both[352 + i] = self._cjc_offset(i)
-            if self._about.type_per_channel:
+            if self._spec.type_per_channel:
                 both[256 + i] = self._type(i)
-            if self._about.status_bits:
+            if self._spec.status_bits:
                 bits[128 + i] = Cell(functools.partial(self._flag, i))
-        if self._about.couples:
+        if self._spec.thermocouples:
             both[128] = Cell(lambda: round(self.cjc_degc * 100.0) & 0xFFFF)
             bits[267] = self._attribute("cjc_enabled")
         both[480], both[481] = Cell(lambda: 0x0200), Cell(lambda: 0x000A)
-        name = self._about.name_bytes
+        name = self._spec.name_bytes
         both[482] = Cell(lambda: int.from_bytes(name[2:], "big"))
         both[483] = Cell(lambda: int.from_bytes(name[:2], "big"))
-        if not self._about.type_per_channel:
+        if not self._spec.type_per_channel:
             both[486] = Cell(lambda: self.ranges[0].code, self.set_type)
         both[489] = self._attribute("enabled", (1 << self.channels) - 1)
         bits[256] = Cell(lambda: 1)
@@ -237,7 +220,7 @@ class IcpDas(MeasuringModule):
         self.inputs[320] = Cell(lambda: self.channels)
         self.inputs[351] = Cell(lambda: 0x0123)
         self.holding[271] = Cell(lambda: 1)
-        self.holding[559] = Cell(lambda: int.from_bytes(self._about.name_bytes[1:3], "big"))
+        self.holding[559] = Cell(lambda: int.from_bytes(self._spec.name_bytes[1:3], "big"))
         self.coils[627] = self._attribute("cjc_enabled")
         self.coils[629] = self._attribute("filter_50hz")
         self.coils[631] = Cell(lambda: int(self.data_format == "engineering"), self._set_format)

@@ -48,11 +48,11 @@ def crc16(data: bytes) -> bytes:
 def answer(module: Module, pdu: bytes, layers: Layers) -> bytes:
     """Return the reply PDU to a request PDU.
 
-    Faults that change what the reply says ("exception", "wrong_length") act here; those that change how
+    Faults that change the content of the reply ("exception", "wrong_length") are applied here; those that change how
     it travels act in `sim_hardware.wire.outlet`.
     """
     if not layers.quiet:
-        fault = layers.take("exception")
+        fault = layers.use("exception")
         if fault is not None:
             return bytes((pdu[0] | 0x80, int(number(fault, "code", 4)) & 0xFF))
     module.begin()
@@ -62,7 +62,7 @@ def answer(module: Module, pdu: bytes, layers: Layers) -> bytes:
         return bytes((pdu[0] | 0x80, refusal.code))
     except struct.error:
         return bytes((pdu[0] | 0x80, ILLEGAL_VALUE))
-    if not layers.quiet and layers.take("wrong_length") is not None:
+    if not layers.quiet and layers.use("wrong_length") is not None:
         return _one_register_short(reply)
     return reply
 
@@ -120,7 +120,7 @@ def _write_many(module: Module, pdu: bytes) -> bytes:
 
 
 def _one_register_short(reply: bytes) -> bytes:
-    """Return a reply that is sound in itself but does not hold as much as was asked for."""
+    """Return a valid reply that holds less than was requested."""
     if reply[0] not in {1, 2, 3, 4}:
         return reply[:-1]
     drop = 2 if reply[0] in {3, 4} else 1

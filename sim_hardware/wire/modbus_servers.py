@@ -22,7 +22,7 @@ LONGEST_PDU = 253
 
 
 class _ModbusServer(Server):
-    """What the three carriers share: modules by unit id, and their faults."""
+    """Shared by the three carriers: modules by unit id, and their faults."""
 
     def __init__(self, modules: Mapping[int, Module], supported: frozenset[str]) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class _ModbusServer(Server):
         """Return the reply to an RTU request whose CRC is right; None if the line stays silent."""
         unit, pdu = frame[0], frame[1:-2]
         if unit == 0:
-            # Broadcast: everyone obeys, nobody answers.
+            # Broadcast: no module answers.
             for each in self.modules.values():
                 answer(each, pdu, Layers())
             return None
@@ -56,7 +56,7 @@ class _ModbusServer(Server):
         layers = self._layers[unit]
         reply = bytes((unit,)) + answer(module, pdu, layers)
         crc = crc16(reply)
-        if not layers.quiet and layers.take("bad_crc") is not None:
+        if not layers.quiet and layers.use("bad_crc") is not None:
             crc = bytes((crc[0] ^ 0xFF, crc[1]))
         return reply + crc, layers
 
@@ -153,7 +153,7 @@ class ModbusRtuTcpServer(_OneTcpPort):
 
 
 class ModbusRtuLine(_ModbusServer):
-    """Serve modules by Modbus RTU on a serial line; unit ids without a module are met with silence.
+    """Serve modules by Modbus RTU on a serial line; unit ids without a module get no reply.
 
     Parameters
     ----------

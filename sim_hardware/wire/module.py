@@ -1,4 +1,4 @@
-"""A Modbus slave's memory, and what all modules with measuring inputs share."""
+"""A Modbus slave's memory, and the inputs of all measuring modules."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RefusalError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One coil or register: how it is read and, where that is allowed, written."""
+    """One coil or register: how it is read and, where allowed, written."""
 
     read: Callable[[], int]
     write: Callable[[int], None] | None = None
@@ -43,7 +43,7 @@ Table = dict[int, Cell]
 
 
 class State(enum.Enum):
-    """What the module makes of an input."""
+    """State of an input, as the module sees it."""
 
     GOOD = enum.auto()
     OPEN = enum.auto()
@@ -125,7 +125,7 @@ class MeasuringModule(Module):
     channels : int
         Number of inputs, counted from 0.
     unwired : float
-        What an input without a source reads; NaN means an open circuit.
+        Reading of an input without a source; NaN means an open circuit.
     """
 
     def __init__(self, sources: Mapping[int, Source], channels: int, unwired: float) -> None:
@@ -169,7 +169,7 @@ class MeasuringModule(Module):
         return self._classify(channel, self._unwired if source is None else source())
 
     def _classify(self, channel: int, value: float) -> Sample:
-        if value != value:  # NaN: a source says that its wire is broken  # noqa: PLR0124
+        if value != value:  # NaN: the source has a broken wire  # noqa: PLR0124
             return Sample(value, State.OPEN)
         low, high = self.limits(channel)
         if value > high:

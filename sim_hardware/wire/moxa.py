@@ -15,7 +15,7 @@ from sim_hardware.wire.module import Cell, MeasuringModule, Source, State
 MULTIPLIED = 2048
 SCALED = 2064
 MODEL = 5000
-# Limits of a type K input; the data sheet gives a narrower range for other couples.
+# Limits of a type K input; the data sheet gives a narrower range for other types.
 LOW_DEGC, HIGH_DEGC = -200.0, 1300.0
 
 
@@ -30,7 +30,7 @@ class MoxaE1262(MeasuringModule):
         Which half of a 32-bit value comes first: the manual lists the high word first, software in the
         field reads the low word first.
     open_degc : float
-        What an open couple reads, °C. The manual does not say; the default is the top of the range.
+        Reading of an open thermocouple, °C. The manual does not say; the default is the top of the range.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The way out of a simulated device: what its faults do to the bytes of a reply."""
+"""The output of a simulated device: faults applied to the bytes of a reply."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ class Outlet:
         if layers.quiet and not self._held:
             self._write(frame)
             return
-        if layers.take("silence") is not None:
+        if layers.use("silence") is not None:
             return
-        if layers.take("garbage") is not None:
+        if layers.use("garbage") is not None:
             frame = self._random.randbytes(len(frame))
-        if layers.take("truncate") is not None:
+        if layers.use("truncate") is not None:
             frame = frame[: len(frame) // 2]
-        late = layers.take("late")
+        late = layers.use("late")
         if late is not None:
             self._later(number(late, "delay_s", 0.0), frame)
             return
-        if layers.take("join") is not None and not self._held:
+        if layers.use("join") is not None and not self._held:
             self._held = frame
             return
         frame, self._held = self._held + frame, b""
-        split = layers.take("split")
+        split = layers.use("split")
         if split is None:
             self._write(frame)
             return
@@ -58,7 +58,7 @@ class Outlet:
             self._later(i // size * pause_s, frame[i : i + size])
 
     def close(self) -> None:
-        """Forget what has not been sent."""
+        """Drop what has not been sent."""
         for timer in self._timers:
             timer.cancel()
         self._timers.clear()

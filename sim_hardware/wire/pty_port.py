@@ -79,13 +79,13 @@ class PtyPort:
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         link = Path(self.path)
-        beside = link.with_name("new")
-        beside.symlink_to(os.ttyname(self._slave))
-        beside.replace(link)
+        new = link.with_name("new")
+        new.symlink_to(os.ttyname(self._slave))
+        new.replace(link)
         asyncio.get_running_loop().add_reader(self._master, self._read)
 
     def unplug(self) -> None:
-        """Take the pseudo-terminal away: who has it open gets a hang-up, the path leads nowhere."""
+        """Remove the pseudo-terminal: programs that have it open get a hang-up, the path leads nowhere."""
         if self._master is None or self._slave is None:
             return
         asyncio.get_running_loop().remove_reader(self._master)
@@ -126,7 +126,7 @@ class PtyPort:
         try:
             os.write(self._master, data)
         except BlockingIOError:
-            # Nobody reads and the terminal's buffer is full: on a real line these characters are lost.
+            # No program reads and the terminal's buffer is full: on a real line these characters are lost.
             return
 
     def _read(self) -> None:

@@ -43,7 +43,7 @@ class Server(ABC):
         return self._rack
 
     def watch(self, *faults: Faults, supported: frozenset[str]) -> None:
-        """Apply `disconnect` when one of these sets of faults changes, and refuse what cannot be here."""
+        """Apply `disconnect` when one of these sets of faults changes; refuse faults that this carrier cannot have."""
         for each in faults:
             each.restrict(supported)
             each.listen(self._faults_changed)
@@ -78,7 +78,7 @@ class Rack:
     --------
     >>> from sim_hardware.wire import Adam, ModbusTcpServer
     >>> with Rack() as rack:
-    ...     tcp = rack.add(ModbusTcpServer({1: Adam("adam-6018", couples="K", sources={0: lambda: 21.5})}))
+    ...     tcp = rack.add(ModbusTcpServer({1: Adam("adam-6018", ranges="K", sources={0: lambda: 21.5})}))
     ...     tcp.module(1).faults.set("open", input=0)
     ...     tcp.host
     '127.0.0.1'

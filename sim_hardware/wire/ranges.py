@@ -9,6 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from sim_hardware.wire.module import ILLEGAL_VALUE, MeasuringModule, RefusalError, Source
+
+#: Ranges as a caller names them: one name or type code for all channels, a list, or those that differ; see `choose`.
+Wanted = str | int | Sequence[str | int] | Mapping[int, str | int] | None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Range:
@@ -50,7 +55,7 @@ class Range:
         return 5 - len(str(int(self.full_scale)))
 
 
-def _couple(code: int, name: str, low: float, high: float, per_unit: float = 10.0) -> Range:
+def _thermocouple(code: int, name: str, low: float, high: float, per_unit: float = 10.0) -> Range:
     return Range(code=code, name=name, low=low, high=high, engineering_per_unit=per_unit, thermocouple=True)
 
 
@@ -63,19 +68,19 @@ def _current(code: int, name: str, low: float) -> Range:
     return Range(code=code, name=name, low=low, high=20.0, engineering_per_unit=1000.0, unsigned=low >= 0.0)
 
 
-ICP_COUPLES = (
-    _couple(0x0E, "J", -210.0, 760.0),
-    _couple(0x0F, "K", -270.0, 1372.0),
-    _couple(0x10, "T", -270.0, 400.0),
-    _couple(0x11, "E", -270.0, 1000.0),
-    _couple(0x12, "R", 0.0, 1768.0),
-    _couple(0x13, "S", 0.0, 1768.0),
-    _couple(0x14, "B", 0.0, 1820.0),
-    _couple(0x15, "N", -270.0, 1300.0),
-    _couple(0x16, "C", 0.0, 2320.0),
-    _couple(0x17, "L", -200.0, 800.0),
-    _couple(0x18, "M", -200.0, 100.0, 100.0),
-    _couple(0x19, "L-DIN", -200.0, 900.0),
+ICP_THERMOCOUPLES = (
+    _thermocouple(0x0E, "J", -210.0, 760.0),
+    _thermocouple(0x0F, "K", -270.0, 1372.0),
+    _thermocouple(0x10, "T", -270.0, 400.0),
+    _thermocouple(0x11, "E", -270.0, 1000.0),
+    _thermocouple(0x12, "R", 0.0, 1768.0),
+    _thermocouple(0x13, "S", 0.0, 1768.0),
+    _thermocouple(0x14, "B", 0.0, 1820.0),
+    _thermocouple(0x15, "N", -270.0, 1300.0),
+    _thermocouple(0x16, "C", 0.0, 2320.0),
+    _thermocouple(0x17, "L", -200.0, 800.0),
+    _thermocouple(0x18, "M", -200.0, 100.0, 100.0),
+    _thermocouple(0x19, "L-DIN", -200.0, 900.0),
 )
 # The low codes and the 08..0D block name two hardware families; "1V" of the one is not "1V" of the other.
 ICP_LOW_VOLTS = (
@@ -97,21 +102,21 @@ ICP_HIGH_VOLTS = (
     _current(0x0D, "+-20mA", -20.0),
     _current(0x1A, "0-20mA", 0.0),
 )
-ADAM_COUPLES = (
-    _couple(0x0E, "J", 0.0, 760.0),
-    _couple(0x0F, "K", 0.0, 1370.0),
-    _couple(0x10, "T", -100.0, 400.0),
-    _couple(0x11, "E", 0.0, 1000.0),
-    _couple(0x12, "R", 500.0, 1750.0),
-    _couple(0x13, "S", 500.0, 1750.0),
-    _couple(0x14, "B", 500.0, 1800.0),
+ADAM_THERMOCOUPLES = (
+    _thermocouple(0x0E, "J", 0.0, 760.0),
+    _thermocouple(0x0F, "K", 0.0, 1370.0),
+    _thermocouple(0x10, "T", -100.0, 400.0),
+    _thermocouple(0x11, "E", 0.0, 1000.0),
+    _thermocouple(0x12, "R", 500.0, 1750.0),
+    _thermocouple(0x13, "S", 500.0, 1750.0),
+    _thermocouple(0x14, "B", 500.0, 1800.0),
 )
 ADAM_4118_VOLTS = ICP_LOW_VOLTS
 ADAM_VOLTS = (*(r for r in ICP_HIGH_VOLTS if r.code <= 0x0C), _current(0x0D, "0-20mA", 0.0))
 
 
 def choose(
-    wanted: str | int | Sequence[str | int] | Mapping[int, str | int] | None,
+    wanted: Wanted,
     offered: Sequence[Range],
     channels: int,
     default: Range,
@@ -161,7 +166,7 @@ def encode_hex(value: float, span: Range) -> int:
 
     Examples
     --------
-    >>> f"{encode_hex(-270.0, find('K', ICP_COUPLES)):04X}"
+    >>> f"{encode_hex(-270.0, find('K', ICP_THERMOCOUPLES)):04X}"
     'E6D0'
     """
     if span.unsigned:
@@ -177,3 +182,53 @@ def decode_hex(word: int, span: Range) -> float:
         return span.low + word / 0xFFFF * (span.high - span.low)
     signed = word - 0x10000 if word >= 0x8000 else word
     return signed / (32767.0 if signed >= 0 else 32768.0) * span.full_scale
+
+
+class RangedModule(MeasuringModule):
+    """A module whose inputs have ranges with type codes.
+
+    Parameters
+    ----------
+    sources, channels, unwired
+        As for `MeasuringModule`.
+    offered : sequence of Range
+        Ranges of the model.
+    ranges : str, int, sequence, mapping or None
+        See `choose`.
+    default : str or int
+        Name or type code of the factory setting.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[int, Source],
+        channels: int,
+        unwired: float,
+        *,
+        offered: Sequence[Range],
+        ranges: Wanted,
+        default: str | int,
+    ) -> None:
+        super().__init__(sources, channels, unwired)
+        self.offered = offered
+        self.ranges = choose(ranges, offered, channels, find(default, offered))
+
+    def limits(self, channel: int) -> tuple[float, float]:
+        """Return the range of an input, in °C, V or mA."""
+        span = self.ranges[channel]
+        return span.low / span.per_source_unit, span.high / span.per_source_unit
+
+    def set_type(self, code: int, channel: int | None = None) -> None:
+        """Set the range of one channel, or of all.
+
+        Raises
+        ------
+        RefusalError
+            Code 3 if the module does not have such a type code.
+        """
+        try:
+            span = find(code, self.offered)
+        except ValueError:
+            raise RefusalError(ILLEGAL_VALUE) from None
+        for i in range(self.channels) if channel is None else (channel,):
+            self.ranges[i] = span

@@ -1,4 +1,4 @@
-"""Cutting a byte stream into Modbus RTU requests, without the silence that separates them on a real line."""
+"""Split a byte stream into Modbus RTU requests, without the silence that separates them on a real line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ and sockets do not keep apart."""
 
 
 class RtuFrames:
-    """Cut a byte stream into RTU requests; what is garbled is dropped up to the next silence.
+    """Split a byte stream into RTU requests; garbled bytes are dropped up to the next silence.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class RtuFrames:
         self._timer: asyncio.TimerHandle | None = None
 
     def feed(self, data: bytes) -> None:
-        """Take bytes as they come."""
+        """Process received bytes."""
         self.close()
         self._buffer += data
         while self._buffer:

@@ -1,4 +1,4 @@
-"""A listening TCP port that can be taken away and brought back."""
+"""A listening TCP port that can be closed and reopened."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Connection(asyncio.Protocol):
         self.transport: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Enter the connection in the port's books, or drop it if the port is refusing."""
+        """Register the connection, or drop it if the port is refusing."""
         assert isinstance(transport, asyncio.Transport)
         self.transport = transport
         self._port.connections[self] = None
@@ -28,18 +28,18 @@ class Connection(asyncio.Protocol):
         self.opened()
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Strike the connection off the port's books."""
+        """Unregister the connection."""
         self._port.connections.pop(self, None)
         self.closed()
 
     def opened(self) -> None:
-        """Take note of a new connection."""
+        """Handle a new connection."""
 
     def closed(self) -> None:
-        """Take note of a lost connection."""
+        """Handle a lost connection."""
 
     def write(self, data: bytes) -> None:
-        """Put bytes on the wire, if the peer is still there."""
+        """Send bytes, if the peer is still there."""
         if self.transport is not None and data and not self.transport.is_closing():
             self.transport.write(data)
 
@@ -66,7 +66,7 @@ class TcpPort:
         self._placeholder: socket.socket | None = None
 
     def pending(self) -> bool:
-        """Tell whether a client has connected that has not been accepted yet."""
+        """Return whether a client has connected that has not been accepted yet."""
         sockets = () if self._server is None else self._server.sockets
         return bool(sockets) and bool(select.select(sockets, (), (), 0)[0])
 

@@ -2,9 +2,10 @@
 
     python -m tests.bench.picture [demo-out] [compensator/report/loop.svg]
 
-Above: the deformation that was measured, and the offset that was published. Below: what is left of it with the model of
-the calibration, and with the one that the diagnosis has extended and the running service adopts after an hour. Left is
-the measured mean of each minute and the offset that stood in it, its rate followed for half of it.
+Above: the measured deformation, the published offset and their sum, the remaining error. Below: the remaining error
+with the calibrated model, and with the model extended by the diagnosis, which the running service adopts after an hour.
+The remaining error is the measured mean of each minute plus the offset that was in force, its rate followed for half
+of the minute.
 """
 
 import json
@@ -25,7 +26,7 @@ UNIT = re.compile(r'width="([\d.]+)pt" height="([\d.]+)pt"')
 
 
 def day(folder):
-    """Return hours since the start, measured deformation, offset, and what was left in each minute, µm."""
+    """Return hours since the start; measured deformation, offset and remaining error of each minute, µm."""
     rows = {}
     for path in sorted(folder.glob("*.mcap"), key=lambda path: path.name):
         for record in read_messages(path, ("estimate", "offset")):
@@ -58,17 +59,21 @@ def figures(demo):
         Figure(
             title="A working day of the simulated conduction machine",
             y_label="Y, µm",
-            lines=(Line("deformation in Y, measured", hours, y), Line("offset of Y, published", hours, offset)),
+            lines=(
+                Line("thermal deformation, measured", hours, y),
+                Line("Y offset, published", hours, offset),
+                Line("remaining error", hours, extended),
+            ),
             height=2.9,
             **common,
         ),
         Figure(
-            title="What is left",
-            y_label="left, µm",
+            title="Remaining error",
+            y_label="error in Y, µm",
             height=2.9,
             lines=(
-                Line(f"model of the calibration ({rms['first']:.1f} µm rms)", hours_first, first),
-                Line(f"extended by diagnose, adopted after 1 h ({rms['extended']:.1f} µm rms)", hours, extended),
+                Line(f"calibrated model: {rms['first']:.1f} µm rms", hours_first, first),
+                Line(f"model extended by diagnose, adopted after 1 h: {rms['extended']:.1f} µm rms", hours, extended),
             ),
             **common,
         ),

@@ -143,7 +143,7 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                 check(again.values)
                 service.put(5, None, state="fault")
                 await until(lambda: _is(again.state, 2), "it holds")
-                await until(lambda: asyncio.sleep(0, "no offset to rely on" in said[-1]), "it is said")
+                await until(lambda: asyncio.sleep(0, "no reliable offset" in said[-1]), "it is said")
                 assert await _near(again, 10.0)
                 integer = {"/Plc/DB100.DBD0:REAL": "/Plc/DB100.DBW6"}
                 settings, opcua = load_bridge(written(tmp_path, plc.endpoint, zenoh, **integer))

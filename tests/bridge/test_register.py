@@ -24,38 +24,38 @@ def register(sign: int = 1, unit_um: float = 1000.0, *, single: bool = True) -> 
 @pytest.mark.parametrize(("sign", "unit_um", "expected"), [(1, 1000.0, -0.0123), (-1, 1000.0, 0.0123), (-1, 1.0, 12.3)])
 def test_sign_and_unit(sign: int, unit_um: float, expected: float) -> None:
     r = register(sign, unit_um)
-    assert r.seen(0.0, 0.0)
+    assert r.check(0.0, 0.0)
     value = r.value(-12.3)
     assert value == pytest.approx(expected, rel=1e-6)
     r.wrote(value)
-    assert r.value(-12.3) is None and r.seen(1.0, value) and not r.trouble
+    assert r.value(-12.3) is None and r.check(1.0, value) and not r.trouble
 
 
 def test_goes_on_from_what_the_plc_holds() -> None:
     r = register(-1)
-    assert r.seen(0.0, 0.007) and r._follower.applied_um == pytest.approx(-7.0)
+    assert r.check(0.0, 0.007) and r._follower.applied_um == pytest.approx(-7.0)
     r.lost("gone")
     assert r.trouble == "gone"
-    assert r.seen(1.0, -0.002) and r._follower.applied_um == pytest.approx(2.0) and not r.trouble
+    assert r.check(1.0, -0.002) and r._follower.applied_um == pytest.approx(2.0) and not r.trouble
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -0.0501, 1e30])
 def test_nothing_is_written_over_what_cannot_be(value: float) -> None:
     r = register()
-    assert not r.seen(0.0, value) and "[plc_beyond_limit]" in r.trouble
-    assert r.seen(1.0, 0.001) and not r.trouble
+    assert not r.check(0.0, value) and "[plc_beyond_limit]" in r.trouble
+    assert r.check(1.0, 0.001) and not r.trouble
 
 
 def test_somebody_elses_write_stops_it_until_that_stands() -> None:
     r = register()
-    assert r.seen(0.0, 0.0)
+    assert r.check(0.0, 0.0)
     r.wrote(0.004)
-    assert r.seen(1.0, 0.00405)  # within the tolerance
-    assert not r.seen(2.0, 0.010) and "+10.000 µm, written was +4.000 µm" in r.trouble
-    assert not r.seen(6.0, 0.020) and not r.seen(10.0, 0.020)  # still at it
-    assert r.seen(11.1, 0.020) and r._follower.applied_um == pytest.approx(20.0)
+    assert r.check(1.0, 0.00405)  # within the tolerance
+    assert not r.check(2.0, 0.010) and "+10.000 µm, written was +4.000 µm" in r.trouble
+    assert not r.check(6.0, 0.020) and not r.check(10.0, 0.020)  # still at it
+    assert r.check(11.1, 0.020) and r._follower.applied_um == pytest.approx(20.0)
     r.wrote(0.020)
-    assert not r.seen(12.0, math.nan) and not r.seen(30.0, math.nan) and "nan" in r.trouble
+    assert not r.check(12.0, math.nan) and not r.check(30.0, math.nan) and "nan" in r.trouble
 
 
 actions = st.one_of(
@@ -84,7 +84,7 @@ def test_no_write_is_further_from_what_the_plc_holds_than_the_rate_allows(
         elif what == "lost":
             r.lost("gone")
         refused = what == "refused"
-        may_move = r.seen(now, plc)
+        may_move = r.check(now, plc)
         r._follower.follow() if may_move else r._follower.hold()
         applied = r._follower.advance(now)
         value = r.value(applied.offset_um) if may_move else None

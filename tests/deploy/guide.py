@@ -1,4 +1,4 @@
-"""The commissioning guide: its table of states and reasons (`python -m tests.deploy.guide` renews it), its commands."""
+"""The pages of deploy that have commands; their table of codes (`python -m tests.deploy.guide` renews it)."""
 
 from __future__ import annotations
 
@@ -9,25 +9,31 @@ from compensator.reasons import WORDS
 from tests.deploy.conftest import ROOT
 
 GUIDE = ROOT / "deploy/README.md"
+OPERATING = ROOT / "deploy/OPERATING.md"
 _BEGIN = "<!-- states: made from compensator/reasons.py by `python -m tests.deploy.guide` -->\n"
 _END = "<!-- end of states -->"
 
 
+#: The last code of the service's messages; those after it belong to warnings and audits, which print them with words.
+LAST = "t_q_below_at"
+
+
 def table() -> str:
-    """Return the table of every code."""
-    rows = [f"| `{code}` | {means} | {do} |" for code, (means, do) in WORDS.items()]
+    """Return the table of the codes of the service's messages: states, reasons, qualities."""
+    codes = list(WORDS)[: list(WORDS).index(LAST) + 1]
+    rows = [f"| `{code}` | {WORDS[code][0]} | {WORDS[code][1]} |" for code in codes]
     return "\n".join(["| code | what it means | what to do |", "| --- | --- | --- |", *rows]) + "\n"
 
 
 def with_table(text: str) -> str:
-    """Return the guide with the table as it should be."""
+    """Return a page with the table as it should be."""
     before, _, rest = text.partition(_BEGIN)
     _, _, after = rest.partition(_END)
     return before + _BEGIN + table() + _END + after
 
 
 def commands(text: str) -> list[list[str]]:
-    """Return the command lines of the guide's blocks, without what only says who gives them."""
+    """Return the command lines of a page's blocks, without what only says who gives them."""
     blocks = re.findall(r"^```\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line.strip()]
     for words in lines:
@@ -37,4 +43,4 @@ def commands(text: str) -> list[list[str]]:
 
 
 if __name__ == "__main__":
-    GUIDE.write_text(with_table(GUIDE.read_text(encoding="utf-8")), encoding="utf-8")
+    OPERATING.write_text(with_table(OPERATING.read_text(encoding="utf-8")), encoding="utf-8")

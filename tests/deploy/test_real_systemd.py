@@ -47,7 +47,7 @@ def couples() -> Iterator[str]:
     world.advance_to(1200.0)
     sources = {0: world.source("t_q_degc"), 1: world.source("at_degc")}
     with Rack() as rack:
-        port = rack.add(ModbusRtuLine({1: IcpDas("m-7018r", couples="K", sources=sources)})).port
+        port = rack.add(ModbusRtuLine({1: IcpDas("m-7018r", ranges="K", sources=sources)})).port
         device = Path(port).resolve()  # the service sees no /tmp of others
         shutil.chown(device, "root", "dialout")
         device.chmod(0o660)
@@ -140,7 +140,7 @@ def test_installed_killed_stuck_stopped_and_removed(
 
     # A second time, as an upgrade: nothing is built anew, a running service is restarted and becomes ready.
     said = installer("install", "--wheel", str(wheel), "--no-deps")
-    assert "is there already" in said and f"restarted {UNIT}" in said
+    assert "installed already" in said and f"restarted {UNIT}" in said
     compensates()
 
     # The journal's fields.

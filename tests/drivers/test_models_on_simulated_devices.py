@@ -32,11 +32,11 @@ def sources(values: dict[int, float]) -> dict[int, Any]:
 
 
 def icp(model: str, **more: Any) -> IcpDas:
-    return IcpDas(model, sources=sources(TEMPERATURES), couples="K", **more)
+    return IcpDas(model, sources=sources(TEMPERATURES), ranges="K", **more)
 
 
 def adam(model: str) -> Adam:
-    return Adam(model, sources=sources(TEMPERATURES), couples="K")
+    return Adam(model, sources=sources(TEMPERATURES), ranges="K")
 
 
 COUPLES = {"inputs": [{"input": 0, "couple": "K"}, {"input": 3, "couple": "K"}]}
@@ -117,7 +117,7 @@ async def test_modbus_models_read_what_the_module_measures(
             readings = await fleet.devices["d"].read()
             assert {i: r.quality for i, r in readings.items()} == dict.fromkeys(values, Quality.GOOD)
             assert {i: r.value for i, r in readings.items()} == pytest.approx(values, abs=tolerance)
-            # What an E1262 gives for an open couple is not documented; there the service's range guard decides.
+            # What an E1262 gives for an open thermocouple is not documented; there the service's range guard decides.
             if values is TEMPERATURES and model != "moxa-e1262":
                 server.module(1).faults.set("open", input=3)
                 readings = await fleet.devices["d"].read()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import importlib
 import re
+import shlex
 import typing
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from compensator.cli import _parser
 from compensator.config import Config
 from compensator.identify.settings import Settings
 from compensator.model.effects import kinds
@@ -31,9 +33,9 @@ CLASSES = {"Settings": Settings(), "Drift": Drift, "Hypothesis": Hypothesis, "Un
 def constant(room: str, holder: str, name: str) -> Any:
     if holder in CLASSES:
         return getattr(CLASSES[holder], name)
-    for place in (f"compensator.{room}.{holder}", f"compensator.{room}.effects.{holder}", f"compensator.{holder}"):
+    for place in (room, f"{room}.effects", "data", "recording", ""):
         try:
-            return getattr(importlib.import_module(place), name)
+            return getattr(importlib.import_module(".".join(filter(None, ("compensator", place, holder)))), name)
         except ModuleNotFoundError:
             continue
     raise AssertionError(f"no module {holder}")
@@ -95,11 +97,12 @@ CODE = re.compile(r"```.*?```", flags=re.DOTALL)
 NAMES = re.compile(r"^(?:`[\w./@-]+`(?:, )?)+$")
 
 
-def test_every_folder_of_python_opens_with_a_page() -> None:
-    """Of tests alone a row in the table of `tests/README.md` is enough."""
+def test_every_folder_of_python_has_a_page_or_a_row_in_one() -> None:
+    """Below the rooms of the compensator a row in a table of a folder above it is enough."""
     folders = {p.parent for room in ROOMS for p in (TOP / room).rglob("*.py") if "node_modules" not in p.parts}
-    listed = {TOP / "tests" / name.rstrip("/") for name in named_files((TOP / "tests/README.md").read_text("utf-8"))}
-    without = [f.relative_to(TOP) for f in sorted(folders - listed) if not (f / "README.md").exists()]
+    listed = {page.parent / name for page in PAGES for name in named_files(page.read_text(encoding="utf-8"))}
+    rooms = {f for f in folders if f == TOP / "compensator" or f.parent == TOP / "compensator"}
+    without = [f.relative_to(TOP) for f in sorted(folders - (listed - rooms)) if not (f / "README.md").exists()]
     assert [str(f) for f in without] == []
 
 
@@ -148,6 +151,14 @@ def test_the_reader_of_tables_sees_what_is_there_and_what_is_not() -> None:
     text = "| file | what |\n| --- | --- |\n| `a.py`, `b` | x |\n\n| key | what |\n| --- | --- |\n| `c.py` | x |\n"
     assert named_files(text) == ["a.py", "b"]
     assert len(named_files((TOP / "compensator/README.md").read_text(encoding="utf-8"))) > 10
+
+
+def test_commands_of_the_top_page_parse() -> None:
+    blocks = "".join(CODE.findall((TOP / "README.md").read_text(encoding="utf-8")))
+    lines = re.findall(r"^\$ compensator (.*)$", blocks, flags=re.MULTILINE)
+    assert len(lines) >= 6
+    for line in lines:
+        _parser().parse_args(shlex.split(line, comments=True))
 
 
 # ---------------------------------------------------------------------------- the configuration

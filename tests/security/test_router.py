@@ -113,7 +113,7 @@ def test_the_shipped_router_is_made_of_the_shipped_list() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ('name = "cnc-07"', 'name = "anna"', "no name twice"),
+        ('name = "cnc-07"', 'name = "anna"', "each name once"),
         ('prefix = "shop/vmc-07"', 'prefix = "shop/**"', "prefix"),
         ('name = "anna"', 'name = "*"', "name '*'"),
         ('machines = ["vmc-07"]', 'machines = ["vmc-70"]', "vmc-70"),

@@ -39,8 +39,8 @@ class Wired:
         duty = Duty.working_day(1, hours=60)
         self.world = World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)
         source = self.world.source
-        self.rtu = rack.add(ModbusRtuLine({1: IcpDas("m-7018r", couples="K", sources={0: source("t_q_degc")})}))
-        self.tcp = rack.add(ModbusTcpServer({1: IcpDas("et-7018z", couples="T", sources={0: source("at_degc")})}))
+        self.rtu = rack.add(ModbusRtuLine({1: IcpDas("m-7018r", ranges="K", sources={0: source("t_q_degc")})}))
+        self.tcp = rack.add(ModbusTcpServer({1: IcpDas("et-7018z", ranges="T", sources={0: source("at_degc")})}))
         self.capa = rack.add(CapaNcdt({1: lambda: 250.0 + source("y_um")()}, 500.0))
         self.fleet = drivers.build(*self._tables(), source="test")
         self.config = config(device=[{"name": n} for n in ("couples", "cabinet", "probe")], channel=CHANNELS)

@@ -143,11 +143,11 @@ class WiredMachine:
         return lambda: self.sources[channel]()
 
     def _build(self, rack: Rack) -> None:
-        t_q = IcpDas("m-7018r", couples="K", sources={0: self.read("t_q_degc")})
+        t_q = IcpDas("m-7018r", ranges="K", sources={0: self.read("t_q_degc")})
         host = {"host": "127.0.0.1", "timeout_s": TIMEOUT_S}
         couple = {"inputs": [{"input": 0, "couple": "K"}]}
         if self.layout == "apart":
-            at = IcpDas("et-7018z", couples="T", sources={0: self.read("at_degc")})
+            at = IcpDas("et-7018z", ranges="T", sources={0: self.read("at_degc")})
             rtu, tcp = rack.add(ModbusRtuLine({1: t_q})), rack.add(ModbusTcpServer({1: at}))
             self.lines += [
                 {"name": "a", "protocol": "modbus-rtu", "port": str(rtu.port), "timeout_s": TIMEOUT_S},
@@ -165,7 +165,7 @@ class WiredMachine:
                 },
             ]
         elif self.layout == "one line":
-            at = IcpDas("m-7018r", couples="K", sources={0: self.read("at_degc")})
+            at = IcpDas("m-7018r", ranges="K", sources={0: self.read("at_degc")})
             line = rack.add(ModbusRtuLine({1: t_q, 2: at}))
             self.lines.append({"name": "a", "protocol": "modbus-rtu", "port": str(line.port), "timeout_s": TIMEOUT_S})
             self.devices += [
@@ -198,7 +198,7 @@ class WiredMachine:
             self._inputs["at_degc"] = "couples", 1
             self.faults = {"t_q_degc": (plc.faults, 0), "at_degc": (plc.faults, 2)}
         else:
-            at = IcpDas("m-7018r", couples="K", sources={0: self.read("at_degc")})
+            at = IcpDas("m-7018r", ranges="K", sources={0: self.read("at_degc")})
             settings = dict.fromkeys((1, 2), DconSettings(checksum=True))
             dcon = rack.add(DconLine({1: t_q, 2: at}, settings=settings))
             self.lines.append({"name": "a", "protocol": "dcon", "port": str(dcon.port), "timeout_s": TIMEOUT_S})

@@ -128,7 +128,7 @@ class Site:
         def t_q() -> float:
             return 26.0 + 2.0 * math.sin((time.monotonic() - began) / 30.0)
 
-        couples = IcpDas("et-7018z", couples="T", sources={0: t_q, 1: lambda: 21.0})
+        couples = IcpDas("et-7018z", ranges="T", sources={0: t_q, 1: lambda: 21.0})
         self._server = ModbusTcpServer({1: couples})
         self._period_s, self._polls, self._connect, self._recording, self._extra = (
             period_s,

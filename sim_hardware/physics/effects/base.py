@@ -1,4 +1,4 @@
-"""What an undeclared effect may do to a machine."""
+"""Hooks of an undeclared effect in a machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Places = Mapping[str, Sequence[int]]
 
 
 class Action:
-    """An effect at work in one machine; everything here does nothing."""
+    """An effect acting in one machine; the hooks of this base do nothing."""
 
     def forced_factor(self, inputs: Inputs) -> float:
         """Return the factor on the forced film coefficient."""
@@ -27,11 +27,11 @@ class Action:
         """Add heat in W to the nodes, given their temperatures and where they are."""
 
     def growth_um(self, growth_um: float) -> float:
-        """Return how much of the quill's growth arrives at its nose, µm; called once a step, in order."""
+        """Return the part of the quill's growth that arrives at its nose, µm; called once a step, in order."""
         return growth_um
 
     def probe_um(self, t_s: float, y_um: float) -> float:
-        """Return what lies in front of the displacement probe, µm."""
+        """Return the displacement added at the probe, µm."""
         return y_um
 
     def t_q_degc(self, t_s: float, t_q_degc: float) -> float:
@@ -48,19 +48,15 @@ class Effect(Action):
 
     kind: ClassVar[str] = ""
     path: ClassVar[str | None] = None
+    channel: ClassVar[str | None] = None
     thermal: ClassVar[bool] = False
 
-    @property
-    def channel(self) -> str | None:
-        """Measured channel that the effect follows."""
-        return None
-
     def alter(self, design: QuillDesign) -> QuillDesign:
-        """Return the design with what the effect changes for good."""
+        """Return the design with the permanent changes of the effect."""
         return design
 
     def begin(self) -> Action:
-        """Return the effect at work, in its starting state; itself where it has no state."""
+        """Return the acting effect in its initial state; itself where it has no state."""
         return self
 
     def reveal(self) -> Effect:
@@ -76,5 +72,5 @@ class Effect(Action):
 
 
 def overriding(actions: Sequence[Action], name: str) -> list[Action]:
-    """Return the actions that really do something at the hook of that name."""
+    """Return the actions that override the hook of that name."""
     return [a for a in actions if getattr(type(a), name) is not getattr(Action, name)]

@@ -30,7 +30,7 @@ HOUR_S = 3600.0
 
 
 class SealedEffect(Effect):
-    """An effect whose kind the caller does not see; only :meth:`reveal` gives it away.
+    """An effect whose kind is secret until :meth:`reveal`.
 
     Parameters
     ----------
@@ -45,11 +45,11 @@ class SealedEffect(Effect):
         return "SealedEffect(…)"
 
     def alter(self, design: QuillDesign) -> QuillDesign:
-        """Return the design with what the effect changes for good."""
+        """Return the design with the permanent changes of the effect."""
         return self.__effect.alter(design)
 
     def begin(self) -> Action:
-        """Return the effect at work."""
+        """Return the acting effect."""
         return self.__effect.begin()
 
     def reveal(self) -> Effect:
@@ -68,7 +68,7 @@ class SealedEffect(Effect):
 
 
 class _Draw:
-    """One draw: randomness, the wished size in µm and the length of the record in h."""
+    """One draw: random generator, size in µm and length of the record in h."""
 
     def __init__(self, random: np.random.Generator, size_um: float, hours: float) -> None:
         self.random = random
@@ -175,6 +175,6 @@ def draw_effect(seed: int, size: float = 5.0, hours: float = 24.0) -> SealedEffe
     """
     if not size > 0.0 or not hours > 0.0:
         raise ValueError(f"size {size} µm, hours {hours}: must be positive")
-    # Mixed so that neighbouring seeds do not walk through the list in order.
+    # Mixed so that neighbouring seeds do not draw neighbouring kinds.
     kind = _DRAWS[(seed * 5 + 2) % len(_DRAWS)]
     return SealedEffect(kind(_Draw(np.random.default_rng([abs(seed), 13]), size, hours)))

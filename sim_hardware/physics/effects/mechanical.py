@@ -1,4 +1,4 @@
-"""Undeclared effects behind the heat: lengths, joints, mounts, and what reaches the thermocouple late."""
+"""Undeclared effects after the heat: lengths, joints, mounts, and a late thermocouple."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class WrongStrength(Effect):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SizeDependent(Effect):
-    r"""A stop gives way as the quill pushes: the strength depends on the size, :math:`g (1 + b g)`.
+    r"""A stop yields as the quill pushes: the strength depends on the size, :math:`g (1 + b g)`.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class SizeDependent(Effect):
     per_100_um: float
 
     def growth_um(self, growth_um: float) -> float:
-        """Return how much of the quill's growth arrives at its nose, µm."""
+        """Return the part of the quill's growth that arrives at its nose, µm."""
         return growth_um * (1.0 + self.per_100_um * growth_um / 100.0)
 
 
@@ -57,7 +57,7 @@ class StickSlip(Effect):
     Parameters
     ----------
     play_um : float
-        Whole width of the play, µm; at the start the joint stands in its middle.
+        Whole width of the play, µm; the joint starts in its middle.
     """
 
     kind: ClassVar[str] = "hysteresis"
@@ -99,12 +99,12 @@ class LateSensor(Effect):
     lag_s: float = 0.0
 
     def begin(self) -> Action:
-        """Return the pad before any heat has come."""
+        """Return the pad in its initial state."""
         return _LatePad(self.delay_s, self.lag_s)
 
 
 class _LatePad(Action):
-    """What is on its way to the couple, and what the couple has taken up."""
+    """State of the late thermocouple: delayed temperatures, and its own temperature."""
 
     def __init__(self, delay_s: float, lag_s: float) -> None:
         self._delay_s, self._lag_s = delay_s, lag_s
@@ -145,7 +145,7 @@ class ProbeDrift(Effect):
     um_per_h: float
 
     def probe_um(self, t_s: float, y_um: float) -> float:
-        """Return what lies in front of the displacement probe, µm."""
+        """Return the displacement added at the probe, µm."""
         return y_um + self.um_per_h * t_s / 3600.0
 
 
@@ -166,7 +166,7 @@ class MountSlip(Effect):
     jump_um: float
 
     def probe_um(self, t_s: float, y_um: float) -> float:
-        """Return what lies in front of the displacement probe, µm."""
+        """Return the displacement added at the probe, µm."""
         return y_um + (self.jump_um if t_s >= self.at_s else 0.0)
 
 
@@ -190,5 +190,5 @@ class Cycle(Effect):
     phase_rad: float = 0.0
 
     def probe_um(self, t_s: float, y_um: float) -> float:
-        """Return what lies in front of the displacement probe, µm."""
+        """Return the displacement added at the probe, µm."""
         return y_um + self.amplitude_um * math.sin(2.0 * math.pi * t_s / self.period_s + self.phase_rad)

@@ -19,7 +19,7 @@ def _spread(heat_w: Array, nodes: tuple[int, ...] | list[int], watts: float) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoolantJacket(Effect):
-    """Coolant flows through a jacket and draws a place towards its own temperature, always.
+    """Coolant flows through a jacket and pulls a place towards its own temperature.
 
     Parameters
     ----------
@@ -30,14 +30,10 @@ class CoolantJacket(Effect):
     """
 
     kind: ClassVar[str] = "input"
+    channel: ClassVar[str | None] = "coolant_degc"
     thermal: ClassVar[bool] = True
     w_per_k: float
     place: str = "jacket"
-
-    @property
-    def channel(self) -> str:
-        """Measured channel that the effect follows."""
-        return "coolant_degc"
 
     def add_heat(self, heat_w: Array, t_s: float, inputs: Inputs, degc: Array, places: Places) -> None:
         """Add the coolant's heat, W."""
@@ -48,7 +44,7 @@ class CoolantJacket(Effect):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BearingFriction(Effect):
-    """The spindle's bearing heats the nose, where T_Q hardly feels it.
+    """The spindle's bearing heats the nose, far from T_Q.
 
     Parameters
     ----------
@@ -59,14 +55,10 @@ class BearingFriction(Effect):
     """
 
     kind: ClassVar[str] = "input"
+    channel: ClassVar[str | None] = "spindle_rpm"
     thermal: ClassVar[bool] = True
     full_speed_w: float
     exponent: float = 2.0
-
-    @property
-    def channel(self) -> str:
-        """Measured channel that the effect follows."""
-        return "spindle_rpm"
 
     def add_heat(self, heat_w: Array, t_s: float, inputs: Inputs, degc: Array, places: Places) -> None:
         """Add the friction's heat, W."""
@@ -87,13 +79,9 @@ class FanOnFilm(Effect):
 
     kind: ClassVar[str] = "scheduled"
     path: ClassVar[str] = "DTF"
+    channel: ClassVar[str | None] = "fan_rpm"
     thermal: ClassVar[bool] = True
     full_speed_factor: float
-
-    @property
-    def channel(self) -> str:
-        """Measured channel that the effect follows."""
-        return "fan_rpm"
 
     def forced_factor(self, inputs: Inputs) -> float:
         """Return the factor on the forced film coefficient."""
@@ -103,7 +91,7 @@ class FanOnFilm(Effect):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WetGuide(Effect):
-    """Coolant on wets the gap between quill and headstock and bridges it: the heat leaves another way.
+    """Flowing coolant wets the gap between quill and headstock and bridges it: the heat leaves by another path.
 
     Parameters
     ----------
@@ -115,14 +103,10 @@ class WetGuide(Effect):
 
     kind: ClassVar[str] = "scheduled"
     path: ClassVar[str] = "DTF"
+    channel: ClassVar[str | None] = "coolant_flow_lpm"
     thermal: ClassVar[bool] = True
     w_per_k: float
     threshold_lpm: float = 0.5
-
-    @property
-    def channel(self) -> str:
-        """Measured channel that the effect follows."""
-        return "coolant_flow_lpm"
 
     def add_heat(self, heat_w: Array, t_s: float, inputs: Inputs, degc: Array, places: Places) -> None:
         """Move heat from the guided nodes to the housing, W."""
@@ -137,7 +121,7 @@ class WetGuide(Effect):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SecondMass(Effect):
-    """A further mass hangs on the housing, warms slowly and moves the tool: a mode that the model misses.
+    """A further mass on the housing warms slowly and moves the tool: a mode that the model lacks.
 
     Parameters
     ----------
@@ -172,7 +156,7 @@ class HiddenSource(Effect):
     heat_w : float
         Heat while it is on, W.
     switch_s : tuple of float
-        Times at which it goes on, off, on …, s.
+        Times at which it is switched on, off, on …, s.
     place : str
         Where it sits: ``"nose"``, ``"housing"``, ``"front"``, ``"rear"``, ``"base"``.
     """

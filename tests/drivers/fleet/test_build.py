@@ -110,7 +110,7 @@ DEVICE_MISTAKES = [
         "inputs[0]: key 'input' is 8, expected 0..7 on adam",
     ),
     (device("icpdas-et7018z", "net", [{"input": 10, "couple": "K"}]), "expected 0..9 on icpdas-et7018z"),
-    (device("adam-4118", "bus", [*K0, *K0]), "inputs[1]: input 0 stands twice"),
+    (device("adam-4118", "bus", [*K0, *K0]), "inputs[1]: input 0 is given twice"),
     (device("adam-4118", "bus", []), "key 'inputs' is [], expected at least one input"),
     (
         device("adam-4118", "bus", [{"input": 0}]),
@@ -188,9 +188,9 @@ def test_mistakes_in_a_device(table: dict[str, Any], text: str) -> None:
 
 def test_two_at_one_place() -> None:
     one, two = {**device("adam-4118", "bus"), "name": "one"}, {**device("adam-4117", "bus"), "name": "two"}
-    assert "address 1 on line 'bus' is that of 'one' and of 'two'" in mistake(LINES, [one, two])
+    assert "address 1 on line 'bus' is used by 'one' and by 'two'" in mistake(LINES, [one, two])
     one = {**device("capancdt-6200", "cap", [{"input": 0}]), "name": "one"}
-    assert "'one' and of 'two'" in mistake(LINES, [one, {**one, "name": "two"}])
+    assert "'one' and by 'two'" in mistake(LINES, [one, {**one, "name": "two"}])
     assert "key 'name' is 'one'" in mistake(LINES, [one, one])
     assert "/dev/none is on line 'bus' and on line 'b2'" in mistake([BUS, {**BUS, "name": "b2"}], [])
     assert "10.0.0.5:502 is on line" in mistake([NET, {**NET, "name": "n2"}], [])

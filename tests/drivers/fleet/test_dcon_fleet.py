@@ -153,7 +153,7 @@ async def test_verification_takes_what_there_is(rig: Any) -> None:
         (lambda reply: reply[:-3] + b"\r", DeviceGarbled, "5 characters|expected"),
         (lambda reply: reply[:-8] + b"\r", DeviceGarbled, "7 values in .* expected 8"),
         (lambda reply: b"\x80\xff\x00\r", DeviceGarbled, "not ASCII"),
-        (lambda reply: b"hello\r", DeviceGarbled, "begins with none of"),
+        (lambda reply: b"hello\r", DeviceGarbled, "does not begin with"),
         (lambda reply: bytes(range(14, 250)) * 40, DeviceGarbled, "no valid reply"),
         (lambda reply: b"?01\r", DeviceRefused, "address 01 refuses the command"),
         (lambda reply: b"!02\r", DeviceGarbled, "no valid reply"),

@@ -300,7 +300,7 @@ async def test_dead_unit_does_not_starve_the_others(rig: Any, slave: Any) -> Non
         assert isinstance(result, DeviceTimeout)
         waits.append(time.monotonic() - began)
     assert sum(wait > 0.04 for wait in waits) == 3
-    assert "next try in" in str(result)
+    assert "next attempt in" in str(result)
     bus.units[9] = unit
     async with asyncio.timeout(1.0):
         while isinstance((await asyncio.gather(dead.read(), return_exceptions=True))[0], DeviceTimeout):

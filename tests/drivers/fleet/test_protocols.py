@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from drivers import Quality
 from drivers.protocols.analogue import Probe, advantech_volts, icpdas_volts, reading_of
 from drivers.protocols.capancdt import BadReplyError, Blocks, channel_info, micrometres
-from drivers.protocols.couples import ADVANTECH, ICPDAS, STANDARD
 from drivers.protocols.dcon import BadTextError, checksum, command, reply, split_values, thermocouple
 from drivers.protocols.modbus import (
     Request,
@@ -24,6 +23,7 @@ from drivers.protocols.modbus import (
     find_tcp,
 )
 from drivers.protocols.registers import decode
+from drivers.protocols.thermocouples import ADVANTECH, ICPDAS, STANDARD
 
 EIGHT = Request(function=4, address=0, count=8)
 
@@ -86,8 +86,8 @@ def test_advantech_ends_are_clamps(letter: str) -> None:
 
 
 def test_float_that_is_no_number_is_invalid() -> None:
-    assert STANDARD["K"].judged(math.nan).quality is Quality.INVALID
-    assert STANDARD["K"].judged(3.4e38).quality is Quality.OVER
+    assert STANDARD["K"].reading(math.nan).quality is Quality.INVALID
+    assert STANDARD["K"].reading(3.4e38).quality is Quality.OVER
 
 
 def test_voltages() -> None:

@@ -13,8 +13,8 @@ def line(rack, value):
     return rack.add(
         DconLine(
             {
-                1: IcpDas("i-7018r", couples="J", sources={i: value(20.0 + i) for i in range(8)}),
-                2: Adam("adam-4018+", couples="K", sources={i: value(305.5) for i in range(8)}),
+                1: IcpDas("i-7018r", ranges="J", sources={i: value(20.0 + i) for i in range(8)}),
+                2: Adam("adam-4018+", ranges="K", sources={i: value(305.5) for i in range(8)}),
                 10: IcpDas("i-7017", ranges="10V", sources={i: value(-2.356) for i in range(8)}),
             }
         )
@@ -73,13 +73,13 @@ def test_no_reply_to_wrong_syntax_or_address(wire, command):
     [("J", 760.0, "7FFF"), ("T", -100.0, "E000"), ("R", 500.0, "2492"), ("T", -101.0, "0000")],
 )
 def test_adam_two_s_complement(rack, wires, couple, degc, text):
-    module = Adam("adam-4018+", couples=couple, sources={0: lambda: degc})
+    module = Adam("adam-4018+", ranges=couple, sources={0: lambda: degc})
     line = rack.add(DconLine({1: module}, settings={1: DconSettings(data_format="hex")}))
     assert wires(line.port).line("#010\r") == f">{text}\r"
 
 
 def test_percent(rack, wires, value):
-    module = IcpDas("i-7018r", couples="K", sources={0: value(686.0), 1: value(-13.72)})
+    module = IcpDas("i-7018r", ranges="K", sources={0: value(686.0), 1: value(-13.72)})
     line = rack.add(DconLine({1: module}, settings={1: DconSettings(data_format="percent")}))
     wire = wires(line.port)
     assert (wire.line("#010\r"), wire.line("#011\r")) == (">+050.00\r", ">-001.00\r")
@@ -113,7 +113,7 @@ def test_configure_format_type_and_address(line, wire):
 
 @pytest.fixture
 def summed(rack, wires, value):
-    module = IcpDas("i-7018r", couples="J", sources={0: value(21.5)})
+    module = IcpDas("i-7018r", ranges="J", sources={0: value(21.5)})
     line = rack.add(DconLine({1: module}, settings={1: DconSettings(checksum=True)}))
     return line, wires(line.port)
 
@@ -135,7 +135,7 @@ def test_checksum_fault(summed):
 
 
 def test_checksum_can_be_switched_with_the_init_pin(rack, wires, value):
-    module = IcpDas("i-7018r", couples="J", sources={})
+    module = IcpDas("i-7018r", ranges="J", sources={})
     line = rack.add(DconLine({1: module}, settings={1: DconSettings(init_grounded=True)}))
     wire = wires(line.port)
     wire.line("%01010E0640\r")

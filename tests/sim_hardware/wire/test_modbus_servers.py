@@ -14,7 +14,7 @@ READ_ONE = "010300000001"
 
 
 def module(value=21.5):
-    return Adam("adam-6018", couples="K", sources={0: lambda: value})
+    return Adam("adam-6018", ranges="K", sources={0: lambda: value})
 
 
 def request(transaction, pdu="0300000001", unit=1):
@@ -154,7 +154,7 @@ def test_what_a_carrier_lacks_is_refused(tcp):
 
 def test_rtu_documented_frame(rack, wires):
     values = {i: (lambda: 100.0) for i in range(8)}
-    m7018 = IcpDas("m-7018r", couples="K", sources=values, data_format="engineering")
+    m7018 = IcpDas("m-7018r", ranges="K", sources=values, data_format="engineering")
     line = rack.add(ModbusRtuLine({1: m7018}))
     wire = wires(line.port)
     got = wire.ask("01 04 00 00 00 08 F1 CC", 21)

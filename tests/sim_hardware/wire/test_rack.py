@@ -63,7 +63,7 @@ def test_closing_twice_is_harmless():
 def test_times_and_clearing():
     faults = Faults()
     faults.set("late", times=2, delay_s=1.0)
-    assert [faults.take("late") is not None for _ in range(3)] == [True, True, False]
+    assert [faults.use("late") is not None for _ in range(3)] == [True, True, False]
     faults.set("silence")
     faults.set("open", input=3)
     faults.set("wild", input=3, value=1.0)

@@ -34,7 +34,7 @@ def word(module, address=0, function=3):
     ],
 )
 def test_icp_hex_is_the_makers_table(couple, degc, expected):
-    assert word(IcpDas("m-7018r", couples=couple, sources={0: lambda: degc})) == expected
+    assert word(IcpDas("m-7018r", ranges=couple, sources={0: lambda: degc})) == expected
 
 
 @pytest.mark.parametrize(
@@ -42,13 +42,13 @@ def test_icp_hex_is_the_makers_table(couple, degc, expected):
     [("K", 1372.0, 13720), ("K", -270.0, 65536 - 2700), ("M", 20.0, 2000), ("J", 21.5, 215)],
 )
 def test_icp_engineering_counts_tenths(couple, degc, expected):
-    module = IcpDas("et-7018z", couples=couple, sources={0: lambda: degc}, data_format="engineering")
+    module = IcpDas("et-7018z", ranges=couple, sources={0: lambda: degc}, data_format="engineering")
     assert word(module, function=4) == expected
 
 
 def test_icp_resolves_what_sixteen_bits_resolve(value):
     source = value(25.0)
-    module = IcpDas("m-7018r", couples="K", sources={0: source})
+    module = IcpDas("m-7018r", ranges="K", sources={0: source})
     first = word(module)
     source.value += 0.02
     assert word(module) == first
@@ -58,7 +58,7 @@ def test_icp_resolves_what_sixteen_bits_resolve(value):
 
 @pytest.mark.parametrize("data_format", ["hex", "engineering"])
 def test_icp_open_and_under(data_format, value):
-    module = IcpDas("m-7019r", couples="K", sources={0: value(20.0), 1: value(-271.0)}, data_format=data_format)
+    module = IcpDas("m-7019r", ranges="K", sources={0: value(20.0), 1: value(-271.0)}, data_format=data_format)
     module.faults.set("open", input=0)
     assert (word(module, 0), word(module, 1), word(module, 2)) == (0x7FFF, 0x8000, 0x7FFF)
     # Bits 0, 1 and the unwired rest; function 02 as well as 01.
@@ -68,13 +68,13 @@ def test_icp_open_and_under(data_format, value):
 
 
 def test_plain_7018_does_not_notice_a_broken_couple():
-    module = IcpDas("m-7018", couples="K", sources={0: lambda: 90.0}, data_format="engineering", cjc_degc=26.0)
+    module = IcpDas("m-7018", ranges="K", sources={0: lambda: 90.0}, data_format="engineering", cjc_degc=26.0)
     module.faults.set("open", input=0)
     assert word(module) == 260
 
 
 def test_icp_map(value):
-    module = IcpDas("m-7018r", couples="K", sources={0: value(20.0)}, cjc_degc=25.5)
+    module = IcpDas("m-7018r", ranges="K", sources={0: value(20.0)}, cjc_degc=25.5)
     assert word(module, 128, 4) == 2550
     assert word(module, 486) == 0x0F
     assert ask(module, "06 01e6 0010") == "0601e60010"
@@ -89,7 +89,7 @@ def test_icp_map(value):
 
 
 def test_et7018z_map(value):
-    module = IcpDas("et-7018z", couples={9: "J"}, sources={9: value(100.0)})
+    module = IcpDas("et-7018z", ranges={9: "J"}, sources={9: value(100.0)})
     assert ask(module, "04 0140 0001") == "0402000a"
     assert (word(module, 427), word(module, 436), word(module, 559)) == (0x05, 0x0E, 0x7018)
     assert ask(module, "05 0277 ff00") == "050277ff00"
@@ -115,12 +115,12 @@ def test_icp_volts_stop_at_their_limits(value):
     ("couple", "degc", "raw"), [("T", 23.79, 16225), ("T", 7.49, 14089), ("K", 20.82, 996), ("K", -5.0, 0)]
 )
 def test_adam_words_are_unsigned(couple, degc, raw):
-    assert word(Adam("adam-4118", couples=couple, sources={0: lambda: degc})) == raw
+    assert word(Adam("adam-4118", ranges=couple, sources={0: lambda: degc})) == raw
 
 
 def test_adam_k_step_is_21_millikelvin(value):
     source = value(996 * 1370 / 65535)
-    module = Adam("adam-6018", couples="K", sources={0: source})
+    module = Adam("adam-6018", ranges="K", sources={0: source})
     source.value += 0.0100
     assert word(module) == 996
     source.value += 0.0010
@@ -128,7 +128,7 @@ def test_adam_k_step_is_21_millikelvin(value):
 
 
 def test_adam_map(value):
-    module = Adam("adam-4018+", couples="K", sources={i: value(20.0) for i in range(7)})
+    module = Adam("adam-4018+", ranges="K", sources={i: value(20.0) for i in range(7)})
     module.faults.set("open", input=2)
     module.faults.set("over", input=3)
     module.faults.set("under", input=4)
@@ -202,7 +202,7 @@ def test_both_words_of_a_value_come_from_one_conversion():
 
 def test_frozen_and_wild(value):
     source = value(20.0)
-    module = Adam("adam-4118", couples="K", sources={0: source})
+    module = Adam("adam-4118", ranges="K", sources={0: source})
     before = word(module)
     module.faults.set("frozen", input=0)
     source.value = 30.0
@@ -217,9 +217,9 @@ def test_frozen_and_wild(value):
     "build",
     [
         lambda: Adam("adam-9999", sources={}),
-        lambda: Adam("adam-4018+", couples="N", sources={}),
+        lambda: Adam("adam-4018+", ranges="N", sources={}),
         lambda: Adam("adam-4018+", sources={8: float}),
-        lambda: IcpDas("m-7018r", couples="K", ranges="10V", sources={}),
+        lambda: IcpDas("m-7018r", ranges="10V", sources={}),
     ],
 )
 def test_what_does_not_exist_is_refused(build):

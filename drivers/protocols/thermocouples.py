@@ -1,12 +1,13 @@
 """Thermocouple ranges and type codes, maker by maker.
 
 Sources: ICP DAS ET-7000/PET-7000 register table, appendix A; Advantech ADAM-4000 manual, appendix B, with the
-scaling of Advantech's own class library; for modules that give °C themselves the limits of IEC 60584-1.
+scaling of Advantech's own class library; for modules that report °C the limits of IEC 60584-1.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.reading import Quality, Reading
@@ -19,7 +20,7 @@ _TOLERANCE_DEGC = 0.06
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Span:
-    """Range of one couple in one maker's modules.
+    """Range of one thermocouple type in one maker's modules.
 
     Parameters
     ----------
@@ -38,8 +39,8 @@ class Span:
         """Full scale of the two's complement format: the larger end of the range, °C."""
         return max(abs(self.low_degc), self.high_degc)
 
-    def judged(self, value_degc: float) -> Reading:
-        """Make a reading of a temperature, with the quality its place in the range gives."""
+    def reading(self, value_degc: float) -> Reading:
+        """Make a reading of a temperature, with the quality that follows from the range."""
         if not math.isfinite(value_degc):
             return Reading.bad(Quality.INVALID, f"not a number ({value_degc})")
         if value_degc > self.high_degc + _TOLERANCE_DEGC:
@@ -62,20 +63,20 @@ class Span:
         if (mark := icp_mark(raw)) is not None:
             return mark
         if raw & 0x8000:
-            return self.judged((raw - 0x10000) / 32768.0 * self.full_degc)
+            return self.reading((raw - 0x10000) / 32768.0 * self.full_degc)
         # Type M alone has its full scale at -200 °C, and +100 °C at 4000.
-        return self.judged(raw / (32768.0 if -self.low_degc > self.high_degc else 32767.0) * self.full_degc)
+        return self.reading(raw / (32768.0 if -self.low_degc > self.high_degc else 32767.0) * self.full_degc)
 
     def icp_engineering(self, raw: int, step_degc: float) -> Reading:
         """Scale a word of an ICP DAS module in engineering format: a signed count of steps."""
         if (mark := icp_mark(raw)) is not None:
             return mark
-        return self.judged((raw - (raw >> 15 << 16)) * step_degc)
+        return self.reading((raw - (raw >> 15 << 16)) * step_degc)
 
     def advantech(self, raw: int) -> Reading:
         """Scale a word of an Advantech module: `low + word / 65535 × (high − low)`.
 
-        Such a module cannot report anything outside its range: it stays at the end.
+        Such a module cannot report a value outside its range: it stays at the end.
 
         Examples
         --------
@@ -92,7 +93,7 @@ class Span:
 def icp_mark(raw: int) -> Reading | None:
     """Recognise the words by which an ICP DAS module reports a broken wire."""
     if raw == OPEN_WORD:
-        return Reading.bad(Quality.OPEN, "open couple, or above the range (7FFF)")
+        return Reading.bad(Quality.OPEN, "open thermocouple, or above the range (7FFF)")
     if raw == UNDER_WORD:
         return Reading.bad(Quality.UNDER, "below the range, or a broken wire (8000)")
     return None
@@ -135,12 +136,12 @@ STANDARD = {
 }
 
 
-def couple_of_code(table: dict[str, Span], code: int) -> str:
-    """Name the couple of a type code, for messages.
+def type_of_code(table: Mapping[str, Span], code: int) -> str:
+    """Name the thermocouple of a type code, for messages.
 
     Examples
     --------
-    >>> couple_of_code(ICPDAS, 0x0E)
+    >>> type_of_code(ICPDAS, 0x0E)
     'type J'
     """
-    return next((f"type {name}" for name, span in table.items() if span.code == code), "no couple")
+    return next((f"type {name}" for name, span in table.items() if span.code == code), "no thermocouple type")
