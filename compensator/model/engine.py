@@ -17,7 +17,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.errors import ModelError
-from compensator.model.effects import Effect, Signals, kinds
+from compensator.model.effects import EffectStream, Signals, effect_from, kinds
 from compensator.model.observer import Observer, ObserverState
 from compensator.model.thermal_model import ThermalModel
 
@@ -407,8 +407,6 @@ class Engine:
                 self._held[name] = value
         signals = self._signals
         signals.drive, signals.ambient_k = self._observer.drive, self._observer.ambient_k
-        difference = inputs.t_q_k - inputs.at_k
-        signals.difference_k = self._observer.difference_k if math.isnan(difference) else difference
         signals.y_dtf_um, signals.y_tdtf_um = dtf, tdtf
         signals.channels = self._held
         return tuple(effect.step(signals) for effect in self._effects)
@@ -467,10 +465,9 @@ def _interpolated(value: float, before: float, after: float, part: float) -> tup
     return before + part * (after - before), True
 
 
-def _make_effect(model: ThermalModel, index: int) -> Effect:
+def _make_effect(model: ThermalModel, index: int) -> EffectStream:
     entry = model.effects[index]
-    maker = kinds().get(entry.kind)
-    if maker is None:
-        known = ", ".join(sorted(kinds())) or "none yet"
+    if entry.kind not in kinds():
+        known = ", ".join(sorted(kinds()))
         raise ModelError(f"model {model.name}: effect {index + 1} has kind {entry.kind!r}, expected one of: {known}")
-    return maker.from_table(entry.table, model.period_s)
+    return EffectStream(effect_from(entry.kind, entry.table), model.period_s / 60.0)

@@ -276,11 +276,6 @@ class Observer:
         return math.sqrt(max(float(self._P[self._q, self._q]), 0.0))
 
     @property
-    def difference_k(self) -> float:
-        """Estimated T_Q − AT, as a change from the reference, K."""
-        return self._expected_t_q() - self._x[self._a]
-
-    @property
     def y_variance_um2(self) -> float:
         """Variance of y that sensor noise and missing samples cause, µm²."""
         return self._y_var
