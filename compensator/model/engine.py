@@ -185,7 +185,6 @@ class Engine:
         self._held: dict[str, float] = {}
         self._last_complete: Inputs | None = None
         self._gap: Gap | None = None
-        self._signals = Signals()
 
     # ------------------------------------------------------------------ reference and state
 
@@ -405,16 +404,18 @@ class Engine:
         for name, value in inputs.channels.items():
             if not math.isnan(value):
                 self._held[name] = value
-        signals = self._signals
-        signals.drive, signals.ambient_k = self._observer.drive, self._observer.ambient_k
-        signals.y_dtf_um, signals.y_tdtf_um = dtf, tdtf
-        signals.channels = self._held
+        signals = self._signals(dtf, tdtf)
         return tuple(effect.step(signals) for effect in self._effects)
+
+    def _signals(self, dtf: float, tdtf: float) -> Signals:
+        observer = self._observer
+        return Signals(
+            drive=observer.drive, ambient_k=observer.ambient_k, y_dtf_um=dtf, y_tdtf_um=tdtf, channels=self._held
+        )
 
     def _effects_rate(self, dtf_ahead: float, tdtf_ahead: float, shares: tuple[float, ...]) -> float:
         """Growth of the effects over the next sample: step them on the signals ahead, then take that back."""
-        signals = self._signals
-        signals.y_dtf_um, signals.y_tdtf_um = dtf_ahead, tdtf_ahead
+        signals = self._signals(dtf_ahead, tdtf_ahead)
         growth = 0.0
         for effect, share in zip(self._effects, shares, strict=True):
             state = effect.snapshot()

@@ -190,11 +190,6 @@ class ThermalModel:
         changes: dict[str, Any] = {replaced.lower(): path}
         return dataclasses.replace(self, **changes)
 
-    @property
-    def drive_unit(self) -> str:
-        """Unit of what drives the DTF: `W` or `K`."""
-        return "W" if self.kind == "heat" else "K"
-
 
 def check_runnable(model: ThermalModel) -> None:
     """Refuse dynamics that cannot be run in a service.

@@ -75,7 +75,10 @@ def test_every_form_streams_what_it_filters(form, data, seed):
         tdtf=FUNCTION,
     )
     stream = EffectStream(effect, 1.0)
-    stepped = [stream.step(Signals(*values[:4], channels={"c": values[4]})) for values in walk.T.tolist()]
+    stepped = [
+        stream.step(Signals(drive=u, ambient_k=a, y_dtf_um=y, y_tdtf_um=z, channels={"c": c}))
+        for u, a, y, z, c in walk.T.tolist()
+    ]
     filtered = effect.law(record, effect.blocks(1.0))
     assert stepped == pytest.approx(filtered, abs=1e-9 * max(1.0, float(np.max(np.abs(filtered)))))
 

@@ -31,7 +31,6 @@ class LatePath(Effect):
     lag_min: float = number(0.0, 1440.0)
 
     def blocks(self, period_min: float) -> tuple[Any, ...]:
-        """Return lag and delay."""
         return Lag(self.lag_min, period_min), Delay(self.delay_min, period_min)
 
     def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
@@ -42,7 +41,6 @@ class LatePath(Effect):
         return (lag(moved) if self.lag_min > 0.0 else moved) - share
 
     def explain(self, rms_um: float) -> str:
-        """Say what is late."""
         return f"The response of the {self.path} is late by {self._times()} ({rms_um:.2g} µm rms)."
 
     def _times(self) -> str:
@@ -73,7 +71,6 @@ class LateSensor(LatePath):
         return np.asarray(early[: share.size] - share)
 
     def explain(self, rms_um: float) -> str:
-        """Say what is late, and what to do about it."""
         sensor = "T_Q" if self.path == "TTF" else "AT"
         return (
             f"The sensor {sensor} responds late, with {self._times()}, so the model is wrong after each change of the "

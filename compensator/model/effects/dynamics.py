@@ -31,7 +31,6 @@ class MissingMode(Effect):
     gain: float = number()
 
     def blocks(self, period_min: float) -> tuple[Any, ...]:
-        """Return the mode."""
         return (Lag(self.tau_min, period_min),)
 
     def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
@@ -39,7 +38,6 @@ class MissingMode(Effect):
         return self.gain * blocks[0](signals.source(self.path))
 
     def explain(self, rms_um: float) -> str:
-        """Say what is missing."""
         return (
             f"The {self.path} lacks a mode with a time constant of {shown(self.tau_min)} min ({rms_um:.2g} µm rms): a "
             "thermal mass that the calibration did not excite, or not for long enough."
@@ -65,7 +63,6 @@ class MistimedMode(Effect):
     instead_of_min: float = number(0.0, 1e5)
 
     def blocks(self, period_min: float) -> tuple[Any, ...]:
-        """Return the mode as it is."""
         return (Lag(self.tau_min, period_min),)
 
     def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
@@ -75,7 +72,6 @@ class MistimedMode(Effect):
         return (self.instead_of_min / self.tau_min - 1.0) * (share - blocks[0](share))
 
     def explain(self, rms_um: float) -> str:
-        """Say what is mistimed."""
         return (
             f"A mode of the {self.path} has a time constant of {shown(self.tau_min)} min instead of "
             f"{shown(self.instead_of_min)} min ({rms_um:.2g} µm rms): heat is stored or lost differently than during "
@@ -107,15 +103,12 @@ class ChangedPaths(BankEffect, Effect):
     gain_ambient: tuple[float, ...] = numbers()
 
     def blocks(self, period_min: float) -> tuple[Any, ...]:
-        """Return the bank of both inputs."""
         return (FilterBank(self.tau_min, (self.gain, self.gain_ambient), period_min),)
 
     def inputs(self, signals: Any, blocks: Sequence[Any]) -> tuple[Signal, ...]:
-        """Return what drives the paths."""
         return signals.drive, signals.ambient_k
 
     def effective_parameters(self, count: int) -> int:
-        """Return fewer than there are gains: the ridge ties them together."""
         return 6
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
@@ -124,7 +117,6 @@ class ChangedPaths(BankEffect, Effect):
         return {names[0]: math.fsum(self.gain), names[-1]: math.fsum(self.gain_ambient)}
 
     def explain(self, rms_um: float) -> str:
-        """Say what is changed."""
         return (
             f"DTF and TDTF have other dynamics than during calibration ({rms_um:.2g} µm rms): a mass or a contact was "
             "added, removed or altered."

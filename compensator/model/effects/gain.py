@@ -25,7 +25,6 @@ class Gain(Effect):
         return self.change * signals.share(self.path)
 
     def explain(self, rms_um: float) -> str:
-        """Say what is wrong."""
         return (
             f"The gain of the {self.path} is {shown(abs(100.0 * self.change))} % too "
             f"{'low' if self.change > 0 else 'high'} ({rms_um:.2g} µm rms): the machine responds differently than "

@@ -28,7 +28,6 @@ class Hysteresis(Effect):
     half_width_um: float = number(0.0, 1e4)
 
     def blocks(self, period_min: float) -> tuple[Any, ...]:
-        """Return the play."""
         return ((Play if self.form == "play" else Stick)(self.half_width_um),)
 
     def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
@@ -37,7 +36,6 @@ class Hysteresis(Effect):
         return blocks[0](share) - share
 
     def explain(self, rms_um: float) -> str:
-        """Say what sticks."""
         what = "deformation" if self.path == "all" else f"deformation from the {self.path}"
         return (
             f"The {what} sticks and slips with a half-width of {shown(self.half_width_um)} µm ({rms_um:.2g} µm rms): "

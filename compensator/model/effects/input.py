@@ -43,17 +43,14 @@ class Input(BankEffect, Effect):
     delay_min: float = number(0.0, 1440.0)
 
     def blocks(self, period_min: float) -> tuple[Any, ...]:
-        """Return start, delay and lags."""
         bank = FilterBank(self.tau_min, (self.gain,), period_min)
         return FromStart(), Delay(self.delay_min, period_min), bank
 
     def inputs(self, signals: Any, blocks: Sequence[Any]) -> tuple[Signal, ...]:
-        """Return the curved channel, as its change from the start, delayed."""
         from_start, delay, _ = blocks
         return (delay(from_start(CURVES[self.curve](signals.channels[self.channel]))),)
 
     def explain(self, rms_um: float) -> str:
-        """Say what acts."""
         lags = ("lags of " if len(self.tau_min) > 1 else "a lag of ") + " and ".join(map(shown, self.tau_min))
         delay = f" and a dead time of {shown(self.delay_min)} min" if self.delay_min else ""
         return (
@@ -86,7 +83,6 @@ class InputBank(Input):
     ridge = BANK_RIDGE
 
     def effective_parameters(self, count: int) -> int:
-        """Return fewer than there are gains: the ridge ties them together."""
         return 5
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
@@ -95,7 +91,6 @@ class InputBank(Input):
         return {name: math.fsum(self.gain), "half_time_min": self._half_time()}
 
     def explain(self, rms_um: float) -> str:
-        """Say what acts."""
         return (
             f"The channel {self.channel}{_WORDS[self.curve]} moves Y by {rms_um:.2g} µm rms; half of the response to a "
             f"step is reached after {shown(self._half_time())} min. The base model lacks this input; the extended "

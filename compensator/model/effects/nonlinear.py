@@ -38,7 +38,6 @@ class Nonlinear(Effect):
         return self.change * (share * (part if self.form == "square" else abs(part)))
 
     def explain(self, rms_um: float) -> str:
-        """Say what depends on the size."""
         per = "100 W or K of its input" if self.form == "drive" else "100 µm"
         return (
             f"The gain of the {self.path} changes with its own size, by {shown(100.0 * self.change)} % per {per} "
@@ -63,7 +62,6 @@ class NonlinearDrive(Nonlinear):
     a: tuple[float, ...] = numbers()
 
     def blocks(self, period_min: float) -> tuple[Any, ...]:
-        """Return the path's function."""
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
     def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:

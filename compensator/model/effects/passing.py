@@ -39,7 +39,6 @@ class Drift(Passing):
         return self.um_per_h * (signals.minutes / 60.0)
 
     def explain(self, rms_um: float) -> str:
-        """Say what drifts."""
         return (
             f"Y drifts by {shown(self.um_per_h)} µm per hour ({rms_um:.2g} µm rms) whatever the inputs do: a creeping "
             "probe mount is no error of the machine. Check the mount, measure against a fixed reference."
@@ -65,7 +64,6 @@ class Settling(Passing):
         return self.size_um * (1.0 - np.exp(-signals.minutes / self.tau_min))
 
     def explain(self, rms_um: float) -> str:
-        """Say what settles."""
         return (
             f"Y drifts by {shown(self.size_um)} µm with a time constant of {shown(self.tau_min)} min ({rms_um:.2g} µm "
             "rms) whatever the inputs do: a mount or a joint that settles is no error of the machine. Check the mount, "
@@ -94,7 +92,6 @@ class Step(Passing):
         return self.jump_um * np.clip((signals.minutes - self.at_min) / signals.period_min + 1.0, 0.0, 1.0)
 
     def explain(self, rms_um: float) -> str:
-        """Say what jumped."""
         return (
             f"Y jumps by {shown(self.jump_um)} µm at {self.at_min / 60.0:.2f} h ({rms_um:.2g} µm rms) and stays there: "
             "something was knocked or slipped. Check the probe mount and the clamping, then zero again."
@@ -120,12 +117,10 @@ class Periodic(Passing):
     period_min: float = 1.0
 
     def columns(self, signals: Any, blocks: Sequence[Any]) -> Matrix:
-        """Return sine and cosine."""
         angle = 2.0 * np.pi * signals.minutes / self.period_min
         return np.column_stack((np.sin(angle), np.cos(angle)))
 
     def explain(self, rms_um: float) -> str:
-        """Say what oscillates."""
         size = float(np.hypot(self.sine_um, self.cosine_um))
         return (
             f"Y oscillates by ±{shown(size)} µm with a period of {shown(self.period_min)} min that no channel shows "

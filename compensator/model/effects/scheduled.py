@@ -37,11 +37,9 @@ class Scheduled(Effect):
     span: float = number(1e-12)
 
     def blocks(self, period_min: float) -> tuple[Any, ...]:
-        """Return the channel's zero, and what the form adds."""
         return FromStart(0.0 if self.origin == "zero" else NAN), *self.inner(period_min)
 
     def inner(self, period_min: float) -> tuple[Any, ...]:
-        """Return the blocks of the form."""
         return ()
 
     def scale(self, signals: Any, blocks: Sequence[Any]) -> Signal:
@@ -49,7 +47,6 @@ class Scheduled(Effect):
         return blocks[0](signals.channels[self.channel]) / self.span
 
     def explain(self, rms_um: float) -> str:
-        """Say what changes what."""
         change = self.named({"change": getattr(self, "change", 0.0)})["change"]
         return (
             f"The {self.what} of the {self.path} changes with {self.channel}, by {shown(100.0 * change)} % over the "
@@ -97,7 +94,6 @@ class DriveScheduled(Scheduled):
     a: tuple[float, ...] = numbers()
 
     def inner(self, period_min: float) -> tuple[Any, ...]:
-        """Return the path's function."""
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
     def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
@@ -115,7 +111,6 @@ class SpeedScheduled(Scheduled):
     tau_min: float = number(0.0, 1e5)
 
     def inner(self, period_min: float) -> tuple[Any, ...]:
-        """Return the lag."""
         return (Lag(self.tau_min, period_min),)
 
     def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
@@ -143,16 +138,13 @@ class BankScheduled(BankEffect, Scheduled):
     dc_gain: float = 1.0
 
     def inner(self, period_min: float) -> tuple[Any, ...]:
-        """Return the bank of both inputs."""
         return (FilterBank(self.tau_min, (self.gain, self.gain_share), period_min),)
 
     def inputs(self, signals: Any, blocks: Sequence[Any]) -> tuple[Signal, ...]:
-        """Return drive and share of the path, times the channel."""
         c = self.scale(signals, blocks)
         return c * signals.source(self.path), c * signals.share(self.path)
 
     def effective_parameters(self, count: int) -> int:
-        """Return fewer than there are gains: the ridge ties them together."""
         return 7
 
     def named(self, given: dict[str, float]) -> dict[str, float]:

@@ -12,14 +12,27 @@ from compensator.model.effects.blocks import Signal
 from compensator.model.transfer_function import SampledTransferFunction
 
 
-class _ByPath:
-    """Access to signals by the name of a path."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Signals:
+    """Signals of one sample.
 
-    __slots__ = ()
-    drive: Signal
-    ambient_k: Signal
-    y_dtf_um: Signal
-    y_tdtf_um: Signal
+    Parameters
+    ----------
+    drive : float
+        Estimated heat, W (T_Q − AT, K, in a direct model).
+    ambient_k : float
+        AT as a change from the reference, K.
+    y_dtf_um, y_tdtf_um : float
+        Share of each path, µm.
+    channels : mapping of str to float
+        Auxiliary channels, in their own units; the last good value where one is missing.
+    """
+
+    drive: Signal = 0.0
+    ambient_k: Signal = 0.0
+    y_dtf_um: Signal = 0.0
+    y_tdtf_um: Signal = 0.0
+    channels: Mapping[str, Signal] = field(default_factory=dict)
 
     def share(self, path: str) -> Signal:
         """Return the share of a path in y, µm (`all`: of both); the TTF's is the DTF's, which it drives."""
@@ -32,41 +45,14 @@ class _ByPath:
         return self.ambient_k if path == "TDTF" else self.drive
 
 
-@dataclass(slots=True)
-class Signals(_ByPath):
-    """Signals of one sample.
-
-    Parameters
-    ----------
-    drive : float
-        Estimated heat, W (T_Q − AT, K, in a direct model).
-    ambient_k : float
-        AT as a change from the reference, K.
-    y_dtf_um, y_tdtf_um : float
-        Share of each path, µm.
-    channels : dict of str to float
-        Auxiliary channels, in their own units; the last good value where one is missing.
-    """
-
-    drive: float = 0.0
-    ambient_k: float = 0.0
-    y_dtf_um: float = 0.0
-    y_tdtf_um: float = 0.0
-    channels: dict[str, float] = field(default_factory=dict)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RecordSignals(_ByPath):
-    """Signals over a whole record.
+class RecordSignals(Signals):
+    """Signals over a whole record: each an array, shape (n,), channels with gaps bridged.
 
     Parameters
     ----------
     period_min : float
         Sample period, min.
-    drive, ambient_k, y_dtf_um, y_tdtf_um : numpy.ndarray, shape (n,)
-        As in `Signals`.
-    channels : mapping of str to numpy.ndarray, shape (n,)
-        Auxiliary channels, gaps bridged.
     dtf, tdtf : SampledTransferFunction
         Paths of the base model.
     number : int
@@ -74,11 +60,6 @@ class RecordSignals(_ByPath):
     """
 
     period_min: float
-    drive: Vector
-    ambient_k: Vector
-    y_dtf_um: Vector
-    y_tdtf_um: Vector
-    channels: Mapping[str, Vector]
     dtf: SampledTransferFunction
     tdtf: SampledTransferFunction
     number: int = 0

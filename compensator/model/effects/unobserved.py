@@ -44,7 +44,6 @@ class Unobserved(Effect):
     sizes_um: tuple[float, ...] = ()
 
     def columns(self, signals: Any, blocks: Sequence[Any]) -> Matrix:
-        """Return each switching behind the lag; zero in other records than its own."""
         columns = []
         for record, at in self.times:
             step = np.clip((signals.minutes - at) / signals.period_min + 1.0, 0.0, 1.0)
@@ -52,11 +51,9 @@ class Unobserved(Effect):
         return np.column_stack(columns)
 
     def effective_parameters(self, count: int) -> int:
-        """Return the lag, and time and size of each switching."""
         return count + len(self.times)
 
     def explain(self, rms_um: float) -> str:
-        """Say when, how fast and how large."""
         first = min(at for _, at in self.times) / 60.0
         largest = max(abs(size) for size in self.sizes_um)
         return (
