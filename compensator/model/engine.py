@@ -414,13 +414,11 @@ class Engine:
         )
 
     def _effects_rate(self, dtf_ahead: float, tdtf_ahead: float, shares: tuple[float, ...]) -> float:
-        """Growth of the effects over the next sample: step them on the signals ahead, then take that back."""
+        """Return the growth of the effects over the next sample, from the signals ahead, µm/min."""
         signals = self._signals(dtf_ahead, tdtf_ahead)
         growth = 0.0
         for effect, share in zip(self._effects, shares, strict=True):
-            state = effect.snapshot()
-            growth += effect.step(signals) - share
-            effect.restore(state)
+            growth += effect.peek(signals) - share
         return growth / self._period_min
 
     def _keep(self, inputs: Inputs) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensator.model.effects.base import EffectStream, effect_from, forms
+from compensator.model.effects.base import EffectStream, effect_from, filters, forms
 from compensator.model.effects.blocks import Delay, FilterBank, FromStart, Function, Lag, Play, Stick
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.transfer_function import SampledTransferFunction
@@ -34,9 +34,9 @@ def test_a_block_filters_a_record_as_it_steps_and_goes_on_from_its_state(name, u
     stepped = []
     for k, value in enumerate(u.tolist()):
         again.state = block.state
-        stepped.append(block(value))
-        assert again(value) == stepped[k]
-    assert stepped == pytest.approx(BLOCKS[name](x)(u), abs=1e-9 * max(1.0, float(np.max(np.abs(u)))))
+        stepped.append(block.step(value))
+        assert again.step(value) == stepped[k]
+    assert stepped == pytest.approx(BLOCKS[name](x).filter(u), abs=1e-9 * max(1.0, float(np.max(np.abs(u)))))
 
 
 def drawn(data, field):
@@ -79,7 +79,7 @@ def test_every_form_streams_what_it_filters(form, data, seed):
         stream.step(Signals(drive=u, ambient_k=a, y_dtf_um=y, y_tdtf_um=z, channels={"c": c}))
         for u, a, y, z, c in walk.T.tolist()
     ]
-    filtered = effect.law(record, effect.blocks(1.0))
+    filtered = effect.law(record, filters(effect.blocks(1.0)))
     assert stepped == pytest.approx(filtered, abs=1e-9 * max(1.0, float(np.max(np.abs(filtered)))))
 
 

@@ -216,8 +216,8 @@ class ChannelLag(Effect):
     def blocks(self, period_min: float) -> tuple[Any, ...]:
         return (Slow(),)
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Any:
-        return self.gain_um_per_k * blocks[0](signals.channels[self.channel])
+    def law(self, signals: Any, run: Sequence[Any]) -> Any:
+        return self.gain_um_per_k * run[0](signals.channels[self.channel])
 
 
 @pytest.fixture

@@ -11,20 +11,22 @@ import dataclasses
 import importlib
 import math
 import pkgutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
 from compensator.arrays import Matrix
-from compensator.model.effects.blocks import Block, FilterBank, Signal
-from compensator.model.effects.signals import Signals
+from compensator.model.effects.blocks import NAN, Block, FilterBank, Signal
+from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import Table
 
 if TYPE_CHECKING:
     from compensator.model.effects.hypothesis import Context, Hypothesis
 
+#: `step` or `filter` of a block.
+Run = Callable[..., Signal]
 #: Keys that every effect may have in the model file.
 _COMMON = ("form", "std", "explanation")
 
@@ -92,13 +94,21 @@ class Effect:
         """Return the blocks of the law, at rest, in the order of the snapshot."""
         return ()
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
-        """Return the addition to y, µm: of one sample from `Signals`, of a whole record from `RecordSignals`."""
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the addition to y, µm.
+
+        Parameters
+        ----------
+        signals : Signals or RecordSignals
+            Of one sample, or over a whole record.
+        run : sequence of callable
+            `step` or `filter` of each of the blocks.
+        """
         raise NotImplementedError
 
-    def columns(self, signals: Any, blocks: Sequence[Any]) -> Matrix:
-        """Return, over a record, one column for each linear parameter (one in all where there is none), µm."""
-        return np.asarray(self.law(signals, blocks))[:, None]
+    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+        """Return one column for each linear parameter (one in all where there is none), µm."""
+        return np.asarray(self.law(record, filters(blocks)))[:, None]
 
     # ------------------------------------------------------------------ contract with search, service and reports
 
@@ -143,18 +153,23 @@ class BankEffect:
 
     __slots__ = ()
 
-    def inputs(self, signals: Any, blocks: Sequence[Any]) -> tuple[Signal, ...]:
+    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
         """Return the inputs of the filter bank."""
         raise NotImplementedError
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the weighted sum of the bank."""
-        return blocks[-1](*self.inputs(signals, blocks))
+        return run[-1](*self.inputs(signals, run))
 
-    def columns(self, signals: Any, blocks: Sequence[Any]) -> Matrix:
+    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
         """Return every input behind every lag."""
         bank: FilterBank = blocks[-1]
-        return bank.columns(*self.inputs(signals, blocks))
+        return bank.columns(*self.inputs(record, filters(blocks)))
+
+
+def filters(blocks: Sequence[Any]) -> list[Run]:
+    """Return what blocks do with a whole record."""
+    return [block.filter for block in blocks]
 
 
 class EffectStream:
@@ -171,13 +186,22 @@ class EffectStream:
     def __init__(self, effect: Effect, period_min: float) -> None:
         self.effect, self.kind, self.channels = effect, effect.kind, effect.channels
         self._blocks: tuple[Block, ...] = effect.blocks(period_min)
+        self._steps = [block.step for block in self._blocks]
 
     def step(self, signals: Signals) -> float:
         """Advance by one sample and return the addition to y, µm; 0 before its channels were seen."""
         for channel in self.channels:
-            if math.isnan(signals.channels.get(channel, math.nan)):
+            if math.isnan(signals.channels.get(channel, NAN)):
                 return 0.0
-        return float(self.effect.law(signals, self._blocks))
+        return float(self.effect.law(signals, self._steps))
+
+    def peek(self, signals: Signals) -> float:
+        """Return what `step` would, and stay where it is."""
+        states = [block.state for block in self._blocks]
+        y = self.step(signals)
+        for block, state in zip(self._blocks, states, strict=True):
+            block.state = state
+        return y
 
     def snapshot(self) -> tuple[float, ...]:
         """Return everything that it must remember to go on with the same bits."""

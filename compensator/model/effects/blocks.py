@@ -1,7 +1,7 @@
 """Blocks that the laws of effects are composed of.
 
-A block called with a float advances by one sample (`step`); called with a vector it returns its response to a whole
-record from rest (`filter`). So one law, written with blocks, serves the engine and the fit.
+A block advances by one sample (`step`) or returns its response to a whole record from rest (`filter`). A law is given
+the one or the other of its blocks, so that the same law serves the engine and the fit.
 """
 
 from __future__ import annotations
@@ -27,10 +27,6 @@ class Block:
 
     #: Everything that it must remember to go on with the same bits.
     state: tuple[float, ...] = ()
-
-    def __call__(self, u: Signal) -> Signal:
-        """Filter a record or advance by one sample."""
-        return self.filter(u) if isinstance(u, np.ndarray) else self.step(u)
 
     def step(self, u: float) -> float:
         """Advance by one sample."""
@@ -106,35 +102,28 @@ class FilterBank:
     """
 
     def __init__(self, taus_min: Sequence[float], gains: Sequence[Sequence[float]], period_min: float) -> None:
-        for weights in gains:
-            if len(taus_min) != len(weights):
-                raise ModelError(f"a filter bank: {len(taus_min)} tau_min for {len(weights)} gain, expected as many")
-        self._gains = tuple(tuple(weights) for weights in gains)
-        self._lags = tuple(tuple(Lag(tau, period_min) for tau in taus_min) for _ in gains)
-
-    def __call__(self, *inputs: Signal) -> Signal:
-        """Filter records or advance by one sample."""
-        if isinstance(inputs[0], np.ndarray):
-            return self.columns(*inputs) @ np.array([gain for weights in self._gains for gain in weights])
-        return self.step(*inputs)
+        for row in gains:
+            if len(taus_min) != len(row):
+                raise ModelError(f"a filter bank: {len(taus_min)} tau_min for {len(row)} gain, expected as many")
+        self._rows = [[(gain, Lag(tau, period_min)) for gain, tau in zip(row, taus_min, strict=True)] for row in gains]
+        self._lags = [lag for row in self._rows for _, lag in row]
 
     @property
     def state(self) -> tuple[float, ...]:
         """The states of all lags, input by input."""
-        return tuple(value for lags in self._lags for lag in lags for value in lag.state)
+        return tuple(value for lag in self._lags for value in lag.state)
 
     @state.setter
     def state(self, values: tuple[float, ...]) -> None:
-        lags = [lag for row in self._lags for lag in row]
-        for i, lag in enumerate(lags):
+        for i, lag in enumerate(self._lags):
             lag.state = tuple(values[2 * i : 2 * i + 2])
 
     def step(self, *inputs: float) -> float:
         """Advance by one sample."""
         sums = []
-        for u, gains, lags in zip(inputs, self._gains, self._lags, strict=True):
+        for u, row in zip(inputs, self._rows, strict=True):
             total = 0.0
-            for gain, lag in zip(gains, lags, strict=True):
+            for gain, lag in row:
                 total += gain * lag.step(u)
             sums.append(total)
         result = sums[0]
@@ -142,10 +131,13 @@ class FilterBank:
             result += total
         return result
 
+    def filter(self, *inputs: Vector) -> Vector:
+        """Return the response to records from rest; the state stays as it is."""
+        return np.asarray(self.columns(*inputs) @ np.array([gain for row in self._rows for gain, _ in row]))
+
     def columns(self, *inputs: Vector) -> Matrix:
         """Return each input behind each lag, unweighted, shape (n, inputs · lags)."""
-        pairs = zip(inputs, self._lags, strict=True)
-        return np.column_stack([lag.filter(u) for u, lags in pairs for lag in lags])
+        return np.column_stack([lag.filter(u) for u, row in zip(inputs, self._rows, strict=True) for _, lag in row])
 
 
 class Delay(Block):

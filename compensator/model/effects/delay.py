@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from compensator.model.effects.base import Effect, number, register, text
+from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Delay, Lag, Signal, shifted
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, shown
 
@@ -33,9 +33,9 @@ class LatePath(Effect):
     def blocks(self, period_min: float) -> tuple[Any, ...]:
         return Lag(self.lag_min, period_min), Delay(self.delay_min, period_min)
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the difference that being late makes."""
-        lag, delay = blocks
+        lag, delay = run
         share = signals.share(self.path)
         moved = delay(share)
         return (lag(moved) if self.lag_min > 0.0 else moved) - share
@@ -60,7 +60,7 @@ class LateSensor(LatePath):
 
     deployable = False
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return what the share would have been with an immediate sensor, less what it is."""
         share, period_min = signals.share(self.path), signals.period_min
         # Beyond the end of the record the path goes on with its drive as it is.

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from compensator.model.effects.base import BankEffect, Effect, number, numbers, only, register, text
+from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import FilterBank, Lag, Signal
 from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, numbered, shown
 
@@ -33,9 +33,9 @@ class MissingMode(Effect):
     def blocks(self, period_min: float) -> tuple[Any, ...]:
         return (Lag(self.tau_min, period_min),)
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the response of the mode."""
-        return self.gain * blocks[0](signals.source(self.path))
+        return self.gain * run[0](signals.source(self.path))
 
     def explain(self, rms_um: float) -> str:
         return (
@@ -65,11 +65,11 @@ class MistimedMode(Effect):
     def blocks(self, period_min: float) -> tuple[Any, ...]:
         return (Lag(self.tau_min, period_min),)
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the difference that the other time constant makes."""
         share = signals.share(self.path)
         # (1 + τ₀ s) / (1 + τ s) − 1 = (τ₀/τ − 1) (1 − L(τ))
-        return (self.instead_of_min / self.tau_min - 1.0) * (share - blocks[0](share))
+        return (self.instead_of_min / self.tau_min - 1.0) * (share - run[0](share))
 
     def explain(self, rms_um: float) -> str:
         return (
@@ -105,7 +105,7 @@ class ChangedPaths(BankEffect, Effect):
     def blocks(self, period_min: float) -> tuple[Any, ...]:
         return (FilterBank(self.tau_min, (self.gain, self.gain_ambient), period_min),)
 
-    def inputs(self, signals: Any, blocks: Sequence[Any]) -> tuple[Signal, ...]:
+    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
         return signals.drive, signals.ambient_k
 
     def effective_parameters(self, count: int) -> int:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from compensator.model.effects.base import Effect, number, register, text
+from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Play, Signal, Stick
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, shown
 
@@ -30,10 +30,10 @@ class Hysteresis(Effect):
     def blocks(self, period_min: float) -> tuple[Any, ...]:
         return ((Play if self.form == "play" else Stick)(self.half_width_um),)
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return how far it lags behind."""
         share = signals.share(self.path)
-        return blocks[0](share) - share
+        return run[0](share) - share
 
     def explain(self, rms_um: float) -> str:
         what = "deformation" if self.path == "all" else f"deformation from the {self.path}"

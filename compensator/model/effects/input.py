@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.model.effects.base import BankEffect, Effect, number, numbers, register, text
+from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
 from compensator.model.effects.blocks import Delay, FilterBank, FromStart, Signal
 from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, numbered, shown
 
@@ -46,8 +46,8 @@ class Input(BankEffect, Effect):
         bank = FilterBank(self.tau_min, (self.gain,), period_min)
         return FromStart(), Delay(self.delay_min, period_min), bank
 
-    def inputs(self, signals: Any, blocks: Sequence[Any]) -> tuple[Signal, ...]:
-        from_start, delay, _ = blocks
+    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+        from_start, delay, _ = run
         return (delay(from_start(CURVES[self.curve](signals.channels[self.channel]))),)
 
     def explain(self, rms_um: float) -> str:

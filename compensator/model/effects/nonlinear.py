@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from compensator.model.effects.base import Effect, number, numbers, only, register, text
+from compensator.model.effects.base import Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Function, Signal
 from compensator.model.effects.hypothesis import Context, Hypothesis, shown
 from compensator.model.transfer_function import SampledTransferFunction
@@ -29,7 +29,7 @@ class Nonlinear(Effect):
     form: str = text(*FORMS)
     change: float = number()
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the curve of the share."""
         share = signals.share(self.path)
         part = share / 100.0
@@ -64,10 +64,10 @@ class NonlinearDrive(Nonlinear):
     def blocks(self, period_min: float) -> tuple[Any, ...]:
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the response to the curved drive."""
         drive = signals.source(self.path)
-        return self.change * blocks[0](drive * abs(drive) / 100.0)
+        return self.change * run[0](drive * abs(drive) / 100.0)
 
     @classmethod
     def propose(cls, context: Context) -> Iterator[Hypothesis]:

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Matrix
-from compensator.model.effects.base import Effect, register
+from compensator.model.effects.base import Effect, Run, register
 from compensator.model.effects.blocks import Signal
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, shown
+from compensator.model.effects.signals import RecordSignals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +35,7 @@ class Drift(Passing):
     linear = ("um_per_h",)
     um_per_h: float = 1.0
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the ramp."""
         return self.um_per_h * (signals.minutes / 60.0)
 
@@ -59,7 +60,7 @@ class Settling(Passing):
     size_um: float = 1.0
     tau_min: float = 1.0
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return 1 − exp(−t/τ), scaled."""
         return self.size_um * (1.0 - np.exp(-signals.minutes / self.tau_min))
 
@@ -87,7 +88,7 @@ class Step(Passing):
     jump_um: float = 1.0
     at_min: float = 0.0
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the jump, over one sample."""
         return self.jump_um * np.clip((signals.minutes - self.at_min) / signals.period_min + 1.0, 0.0, 1.0)
 
@@ -116,8 +117,8 @@ class Periodic(Passing):
     cosine_um: float = 1.0
     period_min: float = 1.0
 
-    def columns(self, signals: Any, blocks: Sequence[Any]) -> Matrix:
-        angle = 2.0 * np.pi * signals.minutes / self.period_min
+    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+        angle = 2.0 * np.pi * record.minutes / self.period_min
         return np.column_stack((np.sin(angle), np.cos(angle)))
 
     def explain(self, rms_um: float) -> str:

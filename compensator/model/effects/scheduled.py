@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from compensator.model.effects.base import BankEffect, Effect, number, numbers, only, register, text
+from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import NAN, FilterBank, FromStart, Function, Lag, Signal
 from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, numbered, shown
 from compensator.model.transfer_function import SampledTransferFunction
@@ -42,9 +42,9 @@ class Scheduled(Effect):
     def inner(self, period_min: float) -> tuple[Any, ...]:
         return ()
 
-    def scale(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def scale(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the channel in units of its span."""
-        return blocks[0](signals.channels[self.channel]) / self.span
+        return run[0](signals.channels[self.channel]) / self.span
 
     def explain(self, rms_um: float) -> str:
         change = self.named({"change": getattr(self, "change", 0.0)})["change"]
@@ -61,9 +61,9 @@ class ShareScheduled(Scheduled):
     form: str = only(default="share")
     change: float = number()
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the share times the channel."""
-        return self.change * self.scale(signals, blocks) * signals.share(self.path)
+        return self.change * self.scale(signals, run) * signals.share(self.path)
 
     @classmethod
     def propose(cls, context: Context) -> Iterator[Hypothesis]:
@@ -96,9 +96,9 @@ class DriveScheduled(Scheduled):
     def inner(self, period_min: float) -> tuple[Any, ...]:
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return the response to the drive times the channel."""
-        return self.change * blocks[1](self.scale(signals, blocks) * signals.source(self.path))
+        return self.change * run[1](self.scale(signals, run) * signals.source(self.path))
 
 
 @register
@@ -113,10 +113,10 @@ class SpeedScheduled(Scheduled):
     def inner(self, period_min: float) -> tuple[Any, ...]:
         return (Lag(self.tau_min, period_min),)
 
-    def law(self, signals: Any, blocks: Sequence[Any]) -> Signal:
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return what the lag takes off the share, times the channel."""
         share = signals.share(self.path)
-        return self.change * self.scale(signals, blocks) * (blocks[1](share) - share)
+        return self.change * self.scale(signals, run) * (run[1](share) - share)
 
 
 @register
@@ -140,8 +140,8 @@ class BankScheduled(BankEffect, Scheduled):
     def inner(self, period_min: float) -> tuple[Any, ...]:
         return (FilterBank(self.tau_min, (self.gain, self.gain_share), period_min),)
 
-    def inputs(self, signals: Any, blocks: Sequence[Any]) -> tuple[Signal, ...]:
-        c = self.scale(signals, blocks)
+    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+        c = self.scale(signals, run)
         return c * signals.source(self.path), c * signals.share(self.path)
 
     def effective_parameters(self, count: int) -> int:

@@ -17,6 +17,7 @@ from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, register
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.hypothesis import shown
+from compensator.model.effects.signals import RecordSignals
 
 
 @register
@@ -43,11 +44,11 @@ class Unobserved(Effect):
     times: tuple[tuple[int, float], ...] = ()
     sizes_um: tuple[float, ...] = ()
 
-    def columns(self, signals: Any, blocks: Sequence[Any]) -> Matrix:
+    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
         columns = []
-        for record, at in self.times:
-            step = np.clip((signals.minutes - at) / signals.period_min + 1.0, 0.0, 1.0)
-            columns.append(Lag(self.tau_min, signals.period_min).filter(step * float(record == signals.number)))
+        for number, at in self.times:
+            step = np.clip((record.minutes - at) / record.period_min + 1.0, 0.0, 1.0)
+            columns.append(Lag(self.tau_min, record.period_min).filter(step * float(number == record.number)))
         return np.column_stack(columns)
 
     def effective_parameters(self, count: int) -> int:
