@@ -25,7 +25,6 @@ from compensator.diagnose.outcome import (
     warnings_of,
 )
 from compensator.diagnose.refit import Refit, refit
-from compensator.model.simulation import scores
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.progress import ExecutorMap, Progress
 from compensator.reasons import Caution
@@ -55,7 +54,7 @@ def diagnose_by_refit(
     executor_map : callable
         Does the fits without a block: `map`, or that of an executor.
     """
-    y, deformation = evidence.y_um, evidence.deformation_um
+    deformation = evidence.deformation_um
     whole = refit(evidence)
     before, after = _held_out(evidence, progress, executor_map)
     effects = _effects(evidence, whole)
@@ -66,10 +65,7 @@ def diagnose_by_refit(
     return Diagnosis(
         verdict="unexplained" if not effects else "explained" if clean else "partly_explained",
         effects=effects,
-        before=scores(y, y - before),
-        after=scores(y, y - (after if effects else before)),
         held_out=f"{HELD_OUT}; before: the paths of the first model alone, also refitted to the others",
-        noise_floor_um=evidence.noise.noise_um,
         model=_extended(model, whole, effects) if helps else model,
         evidence=evidence,
         residual_before=bare,

@@ -30,7 +30,6 @@ from compensator.diagnose.outcome import (
     warnings_of,
 )
 from compensator.diagnose.search import Search, Selection
-from compensator.model.simulation import scores
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
 from compensator.reasons import Caution
@@ -93,14 +92,10 @@ def _by_search(model: ThermalModel, evidence: Evidence, progress: Progress, exec
         kept_out = [e.signal[evidence.used] for e in everything if not e.deployable]
         stated = _stated(model, rms_of(after), evidence.noise.noise_um, kept_out)
         extended = dataclasses.replace(extended, y_std_um=stated)
-    y = evidence.y_um
     return Diagnosis(
         verdict=_verdict(evidence, found, helps=helps),
         effects=effects,
-        before=scores(y, y - before),
-        after=scores(y, y - after),
         held_out=HELD_OUT,
-        noise_floor_um=evidence.noise.noise_um,
         model=extended,
         evidence=evidence,
         residual_before=np.where(evidence.used, found.before.residual, np.nan),

@@ -11,7 +11,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
-from compensator.model.simulation import Scores
+from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import EffectTable, ThermalModel
 from compensator.reasons import Caution
 
@@ -95,12 +95,8 @@ class Diagnosis:
         In one word.
     effects : tuple of Effect
         In order of the error that they remove.
-    before, after : Scores
-        On data that took no part in choosing or fitting.
     held_out : str
-        How that was measured.
-    noise_floor_um : float
-        What the sensors' noise alone makes, µm.
+        How the errors before and after were measured.
     model : ThermalModel
         The base model with every deployable effect.
     evidence : Evidence
@@ -117,10 +113,7 @@ class Diagnosis:
 
     verdict: Verdict
     effects: tuple[Effect, ...]
-    before: Scores
-    after: Scores
     held_out: str
-    noise_floor_um: float
     model: ThermalModel
     evidence: Evidence
     residual_before: Vector
@@ -129,6 +122,25 @@ class Diagnosis:
     held_out_after: Vector
     tried: tuple[tuple[str, float], ...]
     warnings: tuple[Caution, ...]
+
+    @property
+    def before(self) -> Scores:
+        """Errors of the base model on data that took no part in choosing or fitting."""
+        return self._scores(self.held_out_before)
+
+    @property
+    def after(self) -> Scores:
+        """The same with every effect."""
+        return self._scores(self.held_out_after)
+
+    @property
+    def noise_floor_um(self) -> float:
+        """What the sensors' noise alone makes of the residual, µm."""
+        return self.evidence.noise.noise_um
+
+    def _scores(self, residual: Vector) -> Scores:
+        y = self.evidence.y_um
+        return scores(y, y - residual)
 
 
 def rms_of(values: Vector) -> float:

@@ -17,15 +17,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, columns_of, fit_terms
+from compensator.diagnose.scan import Scan
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, proposals
-
-#: Single precision: half the memory, and more digits than a first ranking needs.
-Coarse = npt.NDArray[np.float32]
 
 #: Most effects looked for.
 MOST = 4
@@ -91,9 +88,8 @@ class Search:
     def __init__(self, evidence: Evidence) -> None:
         self.evidence = evidence
         self.approximate = evidence.context.approximate
-        self.hypotheses = proposals(evidence.context)
-        self.places = len({hypothesis.place for hypothesis in self.hypotheses}) + 1
-        self._grids: dict[int, list[tuple[tuple[float, ...], Coarse]]] = {}
+        self.scan = Scan(evidence)
+        self.places = len({hypothesis.place for hypothesis in self.scan.hypotheses}) + 1
 
     def run(self, *, unobserved: bool = True) -> Selection:
         """Search what the inputs explain, then whether a source that no channel shows explains it better.
@@ -188,7 +184,7 @@ class Search:
             return fit
         others = [term.start for term in _foreground(fit)]
         if not others:
-            simpler: list[Start] = [(h, ()) for h in self.hypotheses if h.effect.names_background]
+            simpler: list[Start] = [(h, ()) for h in self.scan.hypotheses if h.effect.names_background]
             if not self._explain_most(simpler, fit, before):
                 return fit
             others = [start for start in simpler if start[0].place[1] == behind.hypothesis.place[1]]
@@ -234,7 +230,7 @@ class Search:
         starts = fit.starts(without)
         base = fit_terms(self.evidence, starts) if without is not None else fit
         found = []
-        for hypothesis, values in self._scan(base, kept)[: POLISHED if without is None else EXCHANGED]:
+        for hypothesis, values in self.scan.ranked(base, kept)[: POLISHED if without is None else EXCHANGED]:
             fitted = fit_terms(self.evidence, [*starts, (hypothesis, values)])
             if self._is_plausible(fitted.terms[-1]):
                 found.append(Candidate(fit=fitted, index=len(starts), score=self.score(fitted, 1.0)))
@@ -243,39 +239,6 @@ class Search:
         inflation = self._inflation(min(found, key=lambda item: item.score).fit)
         found = [dataclasses.replace(item, score=self.score(item.fit, inflation)) for item in found]
         return sorted(found, key=lambda item: item.score)
-
-    def _scan(self, base: Fit, kept: Sequence[Term]) -> list[tuple[Hypothesis, tuple[float, ...]]]:
-        """Rank the hypotheses of free places by what their best grid point would explain of the residual."""
-        known = [columns_of(self.evidence, *term.start)[0] for term in base.terms]
-        whole = np.concatenate(known, axis=1) if known and sum(k.shape[1] for k in known) else None
-        q = None if whole is None else np.linalg.qr(whole)[0].astype(np.float32)
-        residual = base.residual.astype(np.float32)
-        count, log_count = self.evidence.count, math.log(self.evidence.count)
-        occupied = {term.hypothesis.place for term in kept}
-        ranked = []
-        for hypothesis in self.hypotheses:
-            if hypothesis.place in occupied:
-                continue
-            best: tuple[float, tuple[float, ...]] | None = None
-            for values, table in self._grid(hypothesis):
-                gain = _explained(table if q is None else table - q @ (q.T @ table), residual)
-                if best is None or gain > best[0]:
-                    best = (gain, values)
-            if best is not None:
-                left = max(base.cost - best[0], 1e-3 * base.cost)
-                ranked.append((count * math.log(left) + hypothesis.parameters * log_count, hypothesis, best[1]))
-        return [(hypothesis, values) for _, hypothesis, values in sorted(ranked, key=lambda item: item[0])]
-
-    def _grid(self, hypothesis: Hypothesis) -> list[tuple[tuple[float, ...], Coarse]]:
-        key = id(hypothesis)
-        if key not in self._grids:
-            tables = []
-            for values in hypothesis.grid():
-                table = np.concatenate([hypothesis.columns(record, values) for record in self.evidence.signals])
-                table[~self.evidence.used] = 0.0
-                tables.append((values, self.evidence.without_nuisances(table).astype(np.float32)))
-            self._grids[key] = tables
-        return self._grids[key]
 
     def _improved(self, fit: Fit) -> Fit:
         """Exchange effects one at a time as long as that helps: what was found first may have stood for two."""
@@ -330,7 +293,7 @@ class Search:
         kept = fit.starts(index)
         base = fit_terms(self.evidence, kept)
         found: dict[tuple[str, str, str], Candidate] = {}
-        for hypothesis, values in self._scan(base, fit.terms):
+        for hypothesis, values in self.scan.ranked(base, fit.terms):
             if hypothesis.place not in found and len(found) < EXCHANGED:
                 fitted = fit_terms(self.evidence, [*kept, (hypothesis, values)], evaluations=10)
                 found[hypothesis.place] = Candidate(fit=fitted, index=len(kept), score=self.score(fitted, 1.0))
@@ -340,14 +303,3 @@ class Search:
 def _foreground(fit: Fit) -> list[Term]:
     """Return the effects that stand for themselves."""
     return [term for term in fit.terms if not term.hypothesis.effect.background]
-
-
-def _explained(x: Coarse, residual: Coarse) -> float:
-    """Return how much of the residual's sum of squares some columns explain."""
-    if x.shape[1] == 1:
-        size = float(x[:, 0] @ x[:, 0])
-        return float((x[:, 0] @ residual) ** 2 / size) if size > 1e-12 else 0.0
-    q, r = np.linalg.qr(x)
-    good = np.abs(np.diag(r)) > 1e-5 * np.linalg.norm(r, axis=0) + 1e-9
-    part = q.T @ residual
-    return float(np.sum(part[good] ** 2))

@@ -1,9 +1,8 @@
 """The streaming engine: a thermal model and its effects, one sample at a time.
 
-The service, `simulate`, `identify`, `diagnose` and `replay` run this class and no other. `run` is `step` over a
-whole record, so both give the same bits. A step takes constant time, but for the one that ends a gap: it goes
-back to the last complete sample and walks over the missing ones with interpolated inputs, at most
-`bridge_samples` of them.
+The service, `simulate`, `identify`, `diagnose` and `replay` all run this class. `run` is `step` over a whole record, so
+both give the same bits. A step takes constant time, except the one that ends a gap: it returns to the last complete
+sample and repeats the missing ones with interpolated inputs, at most `bridge_samples` of them.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ from compensator.model.thermal_model import ThermalModel
 
 NAN = float("nan")
 
-#: Longest run of incomplete samples that is walked over again once both temperatures are back.
+#: Longest run of incomplete samples that is repeated once both temperatures are back.
 BRIDGE_SAMPLES = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Values that the inputs are taken as changes from.
+    """Temperatures that the inputs are changes from.
 
     Parameters
     ----------
@@ -108,9 +107,9 @@ class EngineState:
     channels : tuple of (str, float)
         Last good value of each channel that an effect uses.
     reference : Reference
-        What the inputs are taken as changes from.
+        What the inputs are changes from.
     last_complete : Inputs, optional
-        The last complete sample, where a gap that begins after it may be walked over.
+        The last complete sample, where a gap that begins after it may be bridged.
     gap : Gap, optional
         The gap under way.
     """
@@ -125,21 +124,21 @@ class EngineState:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Incomplete samples since the last complete one, kept to be walked over again.
+    """Incomplete samples since the last complete one, kept to be repeated.
 
     Parameters
     ----------
     state : EngineState
         State before the first of them.
     before : Inputs or None
-        The complete sample before them; None where nothing before is known.
+        The complete sample before them; None where there is none.
     samples : tuple of Inputs
         The incomplete samples.
     limit : int
         A gap of more samples than this is left as predicted.
     held : bool
-        Whether the missing values are taken to have been as those after the gap from its beginning, instead of
-        on a straight line between its ends.
+        Whether the missing values are assumed to have been those after the gap all along, instead of on a straight
+        line between its ends.
     """
 
     state: EngineState
@@ -190,7 +189,7 @@ class Engine:
 
     @property
     def reference(self) -> Reference:
-        """What the inputs are taken as changes from."""
+        """What the inputs are changes from."""
         return self._reference
 
     @property
@@ -199,7 +198,7 @@ class Engine:
         return not (math.isnan(self._reference.t_q_degc) or math.isnan(self._reference.at_degc))
 
     def set_reference(self, t_q_degc: float, at_degc: float) -> None:
-        """Start at rest, with these temperatures as zero (ignored where the model takes them as they are).
+        """Start at rest, with these temperatures as zero (ignored where the model's inputs are absolute).
 
         Raises
         ------
@@ -269,7 +268,7 @@ class Engine:
     # ------------------------------------------------------------------ one sample
 
     def step(self, t_q_degc: float, at_degc: float, channels: Mapping[str, float] | None = None) -> Estimate:
-        """Take one sample in.
+        """Advance by one sample.
 
         Parameters
         ----------
@@ -300,11 +299,11 @@ class Engine:
         if inputs.complete:
             if self._gap is not None:
                 unknown = self._observer.covariance_ahead()
-                self._walk_over(self._gap, inputs)
+                self._repeat(self._gap, inputs)
                 self._gap = None
             self._last_complete = inputs
         else:
-            self._keep(inputs)
+            self._remember(inputs)
         return self._advance(inputs, unknown=unknown)
 
     def run(
@@ -313,7 +312,7 @@ class Engine:
         at_degc: Sequence[float] | Vector,
         channels: Mapping[str, Sequence[float] | Vector] | None = None,
     ) -> list[Estimate]:
-        """Take a whole record in, sample by sample.
+        """Run over a whole record, sample by sample.
 
         Parameters
         ----------
@@ -340,15 +339,15 @@ class Engine:
         ]
 
     def skip(self, samples: int, *, held: bool = False) -> Estimate:
-        """Pass over samples that nobody took, as missing ones; the next complete sample walks over them again.
+        """Skip samples that were not taken, as missing ones; the next complete sample repeats them.
 
         Parameters
         ----------
         samples : int
-            How many, at least 1. However many they are, they are walked over.
+            How many, at least 1; there is no limit to what is repeated.
         held : bool
-            The machine is taken to have been all the while as it is found after the gap, instead of on a straight
-            line between its two ends: what is known before says nothing about the end of a long gap.
+            Whether the machine is assumed to have been all along as it is found after the gap, instead of on a straight
+            line between its ends: the state before a long gap says nothing about its end.
 
         Returns
         -------
@@ -362,7 +361,7 @@ class Engine:
         """
         gap = self._gap or Gap(state=self.snapshot(), before=self._last_complete)
         if held or gap.before is not None:
-            # A long pause must not use up what a short loss of a sensor after it may take.
+            # A long pause must not use up the limit of a short sensor loss after it.
             limit = max(gap.limit, len(gap.samples) + samples + self.bridge_samples)
             self._gap = dataclasses.replace(gap, limit=limit, held=held or gap.held)
         for _ in range(samples):
@@ -421,8 +420,8 @@ class Engine:
             growth += effect.peek(signals) - share
         return growth / self._period_min
 
-    def _keep(self, inputs: Inputs) -> None:
-        """Keep an incomplete sample, as long as a walk over the gap is still wanted."""
+    def _remember(self, inputs: Inputs) -> None:
+        """Keep an incomplete sample, as long as the gap can still be bridged."""
         if self._gap is None and self._last_complete is not None:
             self._gap = Gap(state=self.snapshot(), before=self._last_complete, limit=self.bridge_samples)
         if self._gap is not None:
@@ -430,8 +429,8 @@ class Engine:
             if len(self._gap.samples) > self._gap.limit:
                 self._gap = self._last_complete = None
 
-    def _walk_over(self, gap: Gap, after: Inputs) -> None:
-        """Go back to the last complete sample and step over the gap with interpolated inputs."""
+    def _repeat(self, gap: Gap, after: Inputs) -> None:
+        """Return to the last complete sample and repeat the gap with interpolated inputs."""
         reference = self._reference
         self.restore(gap.state)
         self._reference = reference

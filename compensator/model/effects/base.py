@@ -74,13 +74,13 @@ class Effect:
     deployable: ClassVar[bool] = True
     #: Whether a channel or path shows its cause; if not, nothing is known of it on other data.
     observed: ClassVar[bool] = True
-    #: Whether it absorbs any change of the paths, and so stands behind other effects instead of among them.
+    #: Whether it can absorb any change of the paths: it is named only where no other effect explains most of that.
     background: ClassVar[bool] = False
-    #: Whether it is the simpler name of a background effect that it explains most of.
+    #: Whether it gives its name to a background effect that it explains most of.
     names_background: ClassVar[bool] = False
     #: Least share of the residual's sum of squares that it must explain.
     worth: ClassVar[float] = 0.05
-    #: The same beside another effect where forms are approximate: what depends on time alone fits what they leave.
+    #: The same together with another effect where forms are approximate: what depends on time alone fits the rest.
     worth_beside: ClassVar[float] = 0.05
     #: Ridge weight on its linear parameters, against columns of norm 1; 0 leaves them free.
     ridge: ClassVar[float] = 0.0

@@ -148,7 +148,7 @@ class Context:
         Coefficients b and a of each path.
     approximate : bool
         Whether effects have only approximately any of the forms, as on a machine that the model was identified on:
-        filter banks are then proposed beside the exact forms.
+        filter banks are then proposed in addition to the exact forms.
     """
 
     has_ambient: bool
@@ -173,7 +173,7 @@ class Context:
         return tuple(name for name, size in self.sizes_um.items() if size > 0.0)
 
     def drive_unit(self, path: str) -> str:
-        """Return the unit of what drives a path, as it stands in names."""
+        """Return the unit of what drives a path, as names of parameters have it."""
         return "w" if path == "DTF" and self.has_ttf else "k"
 
     @property

@@ -21,7 +21,7 @@ from compensator.model.effects.signals import RecordSignals
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Passing(Effect):
-    """What all of them share: they are not deployed, and weigh little beside another effect."""
+    """What all of them share: they are not deployed, and must explain much where there is another effect."""
 
     deployable = False
     worth_beside = 0.75
