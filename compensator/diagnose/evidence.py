@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from compensator.arrays import Mask, Matrix, Vector
 from compensator.data.runs import Run, noise_std
@@ -75,7 +76,7 @@ class Evidence:
     @property
     def y_um(self) -> Vector:
         """Measured deformation on every sample of all runs, shape (n,), µm; NaN where it is missing."""
-        return _measured(self.runs)
+        return np.concatenate([run.y_um for run in self.runs])
 
     @property
     def spread_um(self) -> float:
@@ -103,8 +104,13 @@ class Evidence:
     def without(self, mask: Mask) -> Evidence:
         """Return the evidence without some of its samples."""
         used = self.used & ~mask
-        values = np.where(self.used, self.residual, np.nan)
-        return gathered(self.runs, self.signals, values, used, self.context, self.noise)
+        return dataclasses.replace(
+            self,
+            residual=np.where(used, self.residual, 0.0),
+            used=used,
+            basis=_basis(self.nuisances, used),
+            noise=dataclasses.replace(self.noise, count=int(used.sum())),
+        )
 
     def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
         """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
@@ -121,18 +127,14 @@ class Evidence:
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
         return np.asarray(open_ - table @ coefficients)
 
-    def parts(self, values: Vector) -> list[Vector]:
-        """Cut a signal of all runs into one for each run, samples used only."""
-        cuts = np.cumsum([record.size for record in self.signals])[:-1]
-        pairs = zip(np.split(values, cuts), np.split(self.used, cuts), strict=True)
-        return [v[u] for v, u in pairs]
-
     def variance_inflation(self, values: Vector) -> float:
         """Return how much more power a residual has at low frequencies than white noise of its variance, at least 1.
 
         The effective number of samples is smaller by this factor.
         """
-        return max(1.0, low_frequency_ratio(self.parts(values)))
+        cuts = np.cumsum([record.size for record in self.signals])[:-1]
+        pairs = zip(np.split(values, cuts), np.split(self.used, cuts), strict=True)
+        return max(1.0, low_frequency_ratio([v[u] for v, u in pairs]))
 
 
 def signals_of(model: ThermalModel, run: Run, number: int = 0) -> RecordSignals:
@@ -187,44 +189,25 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         names = ", ".join(dict.fromkeys(run.name for run in runs))
         raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
     noise_um = noise_floor(model, runs)
-    own = own_error(model, noise_um, float(np.nanstd(_measured(runs))))
-    noise = NoiseTest(count=int(used.sum()), noise_um=noise_um, own_error_um=own)
-    return gathered(runs, signals, residual, used, _context(model, runs, signals), noise)
-
-
-def _measured(runs: Sequence[Run]) -> Vector:
-    return np.concatenate([run.y_um for run in runs])
-
-
-def gathered(
-    runs: Sequence[Run],
-    signals: Sequence[RecordSignals],
-    residual: Vector,
-    used: Mask,
-    context: Context,
-    noise: NoiseTest,
-) -> Evidence:
-    """Put runs and their residual together with the basis of their nuisances."""
-    blocks = [_nuisances(record, context) for record in signals]
-    sizes = [record.size for record in signals]
-    table = np.zeros((sum(sizes), sum(block.shape[1] for block in blocks)))
-    row = column = 0
-    for block in blocks:
-        table[row : row + block.shape[0], column : column + block.shape[1]] = block
-        row, column = row + block.shape[0], column + block.shape[1]
-    seen = np.where(used[:, None], table, 0.0)
-    u, s, _ = np.linalg.svd(seen, full_matrices=False)
-    basis = u[:, s > STATE_PRIOR * s[0]]
+    spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
+    context = _context(model, runs, signals)
+    nuisances = np.asarray(block_diag(*(_nuisances(record, context) for record in signals)))
     return Evidence(
         runs=tuple(runs),
         signals=tuple(signals),
         residual=np.where(used, residual, 0.0),
         used=used,
-        nuisances=table,
-        basis=basis,
+        nuisances=nuisances,
+        basis=_basis(nuisances, used),
         context=context,
-        noise=dataclasses.replace(noise, count=int(used.sum())),
+        noise=NoiseTest(count=int(used.sum()), noise_um=noise_um, own_error_um=own_error(model, noise_um, spread_um)),
     )
+
+
+def _basis(nuisances: Matrix, used: Mask) -> Matrix:
+    """Return orthonormal columns that the nuisances span on the samples used."""
+    u, s, _ = np.linalg.svd(np.where(used[:, None], nuisances, 0.0), full_matrices=False)
+    return u[:, s > STATE_PRIOR * s[0]]
 
 
 def _nuisances(record: RecordSignals, context: Context) -> Matrix:

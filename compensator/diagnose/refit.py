@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from compensator.arrays import Indices, Mask, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
@@ -131,11 +132,7 @@ class _Fitting:
         drives = [[record.drive for record in records]]
         if context.has_ambient:
             drives.append([record.ambient_k for record in records])
-        runs = np.zeros((evidence.used.size, len(records)))
-        start = 0
-        for i, record in enumerate(records):
-            runs[start : start + record.size, i] = 1.0
-            start += record.size
+        runs = block_diag(*(np.ones((record.size, 1)) for record in records))
         groups = [
             *(np.concatenate([bank.columns(u) for u in drive]) for drive in drives),
             *(np.concatenate([h.columns(record, ()) for record in records]) for h in self.hypotheses),
