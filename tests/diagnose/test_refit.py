@@ -1,4 +1,4 @@
-"""A base model that was calibrated while something acted: its paths are refitted beside what it lacks."""
+"""A base model that was calibrated while something acted: its paths are refitted together with what it lacks."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Nobody tells the search which effect there is; it names kind and place, and what it adds holds on another day."""
+"""The search names kind and place of an effect that it is not given, and what it adds holds on another day."""
 
 import numpy as np
 import pytest

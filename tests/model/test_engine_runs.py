@@ -117,7 +117,7 @@ def test_kalman_agrees_with_the_riccati_equation() -> None:
     assert last.y_std_um**2 - model.y_std_um**2 == pytest.approx(C @ posterior @ C, rel=5e-3)
 
 
-def test_kalman_has_less_noise_and_tells_how_much() -> None:
+def test_kalman_has_less_noise_and_states_how_much() -> None:
     """0.05 K on T_Q − AT alone: 0.133 µm behind the plain inverse, about 0.11 behind the Kalman filter."""
     assert QUILL.ttf is not None
     heat = np.tile(np.repeat([0.0, 60.0, 30.0, 90.0, 0.0], 192), 3)
@@ -130,8 +130,8 @@ def test_kalman_has_less_noise_and_tells_how_much() -> None:
         engine.set_reference(20.0, 20.0)
         run = engine.run(20.0 + difference + noise, np.full(heat.size, 20.0))
         rms[method] = float(np.std(y_of(run) - QUILL.dtf.sampled.response(heat)))
-        told = math.sqrt(run[-1].y_std_um ** 2 - model.y_std_um**2)
-        assert told == pytest.approx(rms[method], rel=0.15)
+        stated = math.sqrt(run[-1].y_std_um ** 2 - model.y_std_um**2)
+        assert stated == pytest.approx(rms[method], rel=0.15)
     assert rms["inverse"] == pytest.approx(0.133, abs=0.01)
     assert rms["kalman"] < 0.9 * rms["inverse"]
 

@@ -1,6 +1,6 @@
 """What every kind of effect shares: parameters, law, place in the model file, registration.
 
-An effect adds to the predicted deformation. A wrong gain of the DTF adds `g · y_dtf`, a late path adds
+An effect adds to the predicted deformation. A wrong gain of the DTF adds `g · y_dtf`, a delayed path adds
 `y(t − d) − y(t)`, an unused channel adds its own response: every kind can be written as an addition, because the base
 is linear in its drive.
 """

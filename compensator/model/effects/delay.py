@@ -1,7 +1,7 @@
-"""`delay`: a path or its sensor is late.
+"""`delay`: a path or its sensor is delayed.
 
 path     y += L(lag) · y_path(t − d) − y_path(t)
-sensor   y += y_path(t + d) + lag · dy_path/dt (t + d) − y_path(t): the machine was where the late sensor is now
+sensor   y += y_path(t + d) + lag · dy_path/dt (t + d) − y_path(t): the machine was where the delayed sensor is now
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Delay, Lag, Signal, shifted
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, shown
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
 
 #: Samples that a path is run on beyond a record's end.
 AHEAD = 64
@@ -22,8 +22,8 @@ LAG = Free(name="lag_min", low=0.05, high=60.0, grid=(0.5, 1.0, 2.0, 4.0, 8.0, 1
 
 
 @register
-class LatePath(Effect):
-    """A path that is late."""
+class DelayedPath(Effect):
+    """A delayed path."""
 
     kind = "delay"
     path: str = text("DTF", "TDTF")
@@ -34,18 +34,18 @@ class LatePath(Effect):
         return Lag(self.lag_min, period_min), Delay(self.delay_min, period_min)
 
     def law(self, signals: Any, run: Sequence[Run]) -> Signal:
-        """Return the difference that being late makes."""
+        """Return the difference that the delay makes."""
         lag, delay = run
         share = signals.share(self.path)
         moved = delay(share)
         return (lag(moved) if self.lag_min > 0.0 else moved) - share
 
     def explain(self, rms_um: float) -> str:
-        return f"The response of the {self.path} is late by {self._times()} ({rms_um:.2g} µm rms)."
+        return f"The response of the {self.path} is delayed by {self._times()} ({rms_um:.2g} µm rms)."
 
     def _times(self) -> str:
         times = (("a dead time", self.delay_min), ("a lag", self.lag_min))
-        return " and ".join(f"{what} of {shown(value)} min" for what, value in times if value)
+        return " and ".join(f"{what} of {digits(value)} min" for what, value in times if value)
 
     @classmethod
     def propose(cls, context: Context) -> Iterator[Hypothesis]:
@@ -55,8 +55,8 @@ class LatePath(Effect):
 
 
 @register
-class LateSensor(LatePath):
-    """A sensor that is late: the correction would need the future."""
+class DelayedSensor(DelayedPath):
+    """A delayed sensor: the correction would need the future."""
 
     deployable = False
 
@@ -73,7 +73,7 @@ class LateSensor(LatePath):
     def explain(self, rms_um: float) -> str:
         sensor = "T_Q" if self.path == "TTF" else "AT"
         return (
-            f"The sensor {sensor} responds late, with {self._times()}, so the model is wrong after each change of the "
+            f"The sensor {sensor} is delayed by {self._times()}, so the model is wrong after each change of the "
             f"heat ({rms_um:.2g} µm rms). That cannot be corrected in real time: move the sensor closer to the source, "
             "or mount it with better thermal contact."
         )
@@ -84,8 +84,8 @@ class LateSensor(LatePath):
         if "DTF" not in context.paths:
             return
         path, prefix = ("TTF", "") if context.has_ttf else ("DTF", "sensor, ")
-        late = cls(path=path, delay_min=0.0, lag_min=0.0)
-        yield Hypothesis(effect=late, form=f"{prefix}dead time", free=(DELAY,))
-        yield Hypothesis(effect=late, form=f"{prefix}lag", free=(LAG,))
+        delayed = cls(path=path, delay_min=0.0, lag_min=0.0)
+        yield Hypothesis(effect=delayed, form=f"{prefix}dead time", free=(DELAY,))
+        yield Hypothesis(effect=delayed, form=f"{prefix}lag", free=(LAG,))
         if context.has_ttf:
-            yield Hypothesis(effect=late, form="dead time and lag", free=(DELAY, LAG))
+            yield Hypothesis(effect=delayed, form="dead time and lag", free=(DELAY, LAG))

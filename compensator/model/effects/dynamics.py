@@ -16,7 +16,7 @@ from typing import Any
 
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import FilterBank, Lag, Signal
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, numbered, shown
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered
 
 
 @register
@@ -39,7 +39,7 @@ class MissingMode(Effect):
 
     def explain(self, rms_um: float) -> str:
         return (
-            f"The {self.path} lacks a mode with a time constant of {shown(self.tau_min)} min ({rms_um:.2g} µm rms): a "
+            f"The {self.path} lacks a mode with a time constant of {digits(self.tau_min)} min ({rms_um:.2g} µm rms): a "
             "thermal mass that the calibration did not excite, or not for long enough."
         )
 
@@ -73,8 +73,8 @@ class MistimedMode(Effect):
 
     def explain(self, rms_um: float) -> str:
         return (
-            f"A mode of the {self.path} has a time constant of {shown(self.tau_min)} min instead of "
-            f"{shown(self.instead_of_min)} min ({rms_um:.2g} µm rms): heat is stored or lost differently than during "
+            f"A mode of the {self.path} has a time constant of {digits(self.tau_min)} min instead of "
+            f"{digits(self.instead_of_min)} min ({rms_um:.2g} µm rms): heat is stored or lost differently than during "
             "calibration."
         )
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Signal
-from compensator.model.effects.hypothesis import Context, Hypothesis, shown
+from compensator.model.effects.hypothesis import Context, Hypothesis, digits
 
 
 @register
@@ -26,7 +26,7 @@ class Gain(Effect):
 
     def explain(self, rms_um: float) -> str:
         return (
-            f"The gain of the {self.path} is {shown(abs(100.0 * self.change))} % too "
+            f"The gain of the {self.path} is {digits(abs(100.0 * self.change))} % too "
             f"{'low' if self.change > 0 else 'high'} ({rms_um:.2g} µm rms): the machine responds differently than "
             "during calibration."
         )

@@ -200,6 +200,6 @@ def numbered(name: str, count: int) -> tuple[str, ...]:
     return tuple(f"{name}_{i}" for i in range(1, count + 1))
 
 
-def shown(value: float) -> str:
+def digits(value: float) -> str:
     """Return a number as an engineer writes it."""
     return f"{value:.3g}"

@@ -13,7 +13,7 @@ import numpy as np
 
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Play, Signal, Stick
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, shown
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
 
 FORMS = ("play", "stick")
 
@@ -38,7 +38,7 @@ class Hysteresis(Effect):
     def explain(self, rms_um: float) -> str:
         what = "deformation" if self.path == "all" else f"deformation from the {self.path}"
         return (
-            f"The {what} sticks and slips with a half-width of {shown(self.half_width_um)} µm ({rms_um:.2g} µm rms): "
+            f"The {what} sticks and slips with a half-width of {digits(self.half_width_um)} µm ({rms_um:.2g} µm rms): "
             "a joint or guideway with play or friction."
         )
 

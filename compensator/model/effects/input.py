@@ -17,7 +17,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
 from compensator.model.effects.blocks import Delay, FilterBank, FromStart, Signal
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, numbered, shown
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, digits, numbered
 
 #: Curves by name: of one sample, or of a record.
 CURVES: Mapping[str, Callable[[Signal], Signal]] = {
@@ -51,8 +51,8 @@ class Input(BankEffect, Effect):
         return (delay(from_start(CURVES[self.curve](signals.channels[self.channel]))),)
 
     def explain(self, rms_um: float) -> str:
-        lags = ("lags of " if len(self.tau_min) > 1 else "a lag of ") + " and ".join(map(shown, self.tau_min))
-        delay = f" and a dead time of {shown(self.delay_min)} min" if self.delay_min else ""
+        lags = ("lags of " if len(self.tau_min) > 1 else "a lag of ") + " and ".join(map(digits, self.tau_min))
+        delay = f" and a dead time of {digits(self.delay_min)} min" if self.delay_min else ""
         return (
             f"The channel {self.channel}{_WORDS[self.curve]} moves Y by {rms_um:.2g} µm rms with {lags} min{delay}. "
             "The base model lacks this input; the extended model needs the channel."
@@ -93,7 +93,7 @@ class InputBank(Input):
     def explain(self, rms_um: float) -> str:
         return (
             f"The channel {self.channel}{_WORDS[self.curve]} moves Y by {rms_um:.2g} µm rms; half of the response to a "
-            f"step is reached after {shown(self._half_time())} min. The base model lacks this input; the extended "
+            f"step is reached after {digits(self._half_time())} min. The base model lacks this input; the extended "
             "model needs the channel."
         )
 

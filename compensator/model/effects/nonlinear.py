@@ -13,7 +13,7 @@ from typing import Any
 
 from compensator.model.effects.base import Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Function, Signal
-from compensator.model.effects.hypothesis import Context, Hypothesis, shown
+from compensator.model.effects.hypothesis import Context, Hypothesis, digits
 from compensator.model.transfer_function import SampledTransferFunction
 
 FORMS = ("square", "odd square", "cube")
@@ -40,7 +40,7 @@ class Nonlinear(Effect):
     def explain(self, rms_um: float) -> str:
         per = "100 W or K of its input" if self.form == "drive" else "100 µm"
         return (
-            f"The gain of the {self.path} changes with its own size, by {shown(100.0 * self.change)} % per {per} "
+            f"The gain of the {self.path} changes with its own size, by {digits(100.0 * self.change)} % per {per} "
             f"({rms_um:.2g} µm rms): a joint that yields, or surfaces that lose more heat when hot."
         )
 

@@ -15,7 +15,7 @@ import numpy as np
 from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Run, register
 from compensator.model.effects.blocks import Signal
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, shown
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
 from compensator.model.effects.signals import RecordSignals
 
 
@@ -41,7 +41,7 @@ class Drift(Passing):
 
     def explain(self, rms_um: float) -> str:
         return (
-            f"Y drifts by {shown(self.um_per_h)} µm per hour ({rms_um:.2g} µm rms) whatever the inputs do: a creeping "
+            f"Y drifts by {digits(self.um_per_h)} µm per hour ({rms_um:.2g} µm rms) whatever the inputs do: a creeping "
             "probe mount is no error of the machine. Check the mount, measure against a fixed reference."
         )
 
@@ -66,8 +66,8 @@ class Settling(Passing):
 
     def explain(self, rms_um: float) -> str:
         return (
-            f"Y drifts by {shown(self.size_um)} µm with a time constant of {shown(self.tau_min)} min ({rms_um:.2g} µm "
-            "rms) whatever the inputs do: a mount or a joint that settles is no error of the machine. Check the mount, "
+            f"Y drifts by {digits(self.size_um)} µm with a time constant of {digits(self.tau_min)} min ({rms_um:.2g} "
+            "µm rms) whatever the inputs do: a mount or joint that settles is no error of the machine. Check the mount, "
             "measure against a fixed reference."
         )
 
@@ -94,7 +94,7 @@ class Step(Passing):
 
     def explain(self, rms_um: float) -> str:
         return (
-            f"Y jumps by {shown(self.jump_um)} µm at {self.at_min / 60.0:.2f} h ({rms_um:.2g} µm rms) and stays there: "
+            f"Y jumps by {digits(self.jump_um)} µm at {self.at_min / 60.0:.2f} h ({rms_um:.2g} µm rms) and stays: "
             "something was knocked or slipped. Check the probe mount and the clamping, then zero again."
         )
 
@@ -124,7 +124,7 @@ class Periodic(Passing):
     def explain(self, rms_um: float) -> str:
         size = float(np.hypot(self.sine_um, self.cosine_um))
         return (
-            f"Y oscillates by ±{shown(size)} µm with a period of {shown(self.period_min)} min that no channel shows "
+            f"Y oscillates by ±{digits(size)} µm with a period of {digits(self.period_min)} min that no channel shows "
             f"({rms_um:.2g} µm rms): air conditioning, lubrication, a cabinet cooler. Log a channel of it."
         )
 

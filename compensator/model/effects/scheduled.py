@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import NAN, FilterBank, FromStart, Function, Lag, Signal
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, numbered, shown
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered
 from compensator.model.transfer_function import SampledTransferFunction
 
 
@@ -49,8 +49,8 @@ class Scheduled(Effect):
     def explain(self, rms_um: float) -> str:
         change = self.named({"change": getattr(self, "change", 0.0)})["change"]
         return (
-            f"The {self.what} of the {self.path} changes with {self.channel}, by {shown(100.0 * change)} % over the "
-            f"channel's span of {shown(self.span)} ({rms_um:.2g} µm rms): it changes how much heat takes this path."
+            f"The {self.what} of the {self.path} changes with {self.channel}, by {digits(100.0 * change)} % over the "
+            f"channel's span of {digits(self.span)} ({rms_um:.2g} µm rms): it changes how much heat takes this path."
         )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, register
 from compensator.model.effects.blocks import Lag
-from compensator.model.effects.hypothesis import shown
+from compensator.model.effects.hypothesis import digits
 from compensator.model.effects.signals import RecordSignals
 
 
@@ -59,6 +59,6 @@ class Unobserved(Effect):
         largest = max(abs(size) for size in self.sizes_um)
         return (
             f"Something acts that no channel shows: switched {len(self.times)} times from {first:.1f} h on, it moves Y "
-            f"by up to {shown(largest)} µm with a lag of {shown(self.tau_min)} min ({rms_um:.2g} µm rms). Find what "
+            f"by up to {digits(largest)} µm with a lag of {digits(self.tau_min)} min ({rms_um:.2g} µm rms). Find what "
             "runs then (pump, cooler, drive, sun) and log a channel of it."
         )
