@@ -42,7 +42,7 @@ class Drift(Passing):
     def explain(self, rms_um: float) -> str:
         return (
             f"Y drifts by {digits(self.um_per_h)} µm per hour ({rms_um:.2g} µm rms) whatever the inputs do: a creeping "
-            "probe mount is no error of the machine. Check the mount, measure against a fixed reference."
+            "probe mount is no error of the machine. Check the mount and measure against a fixed reference."
         )
 
     @classmethod
@@ -67,8 +67,8 @@ class Settling(Passing):
     def explain(self, rms_um: float) -> str:
         return (
             f"Y drifts by {digits(self.size_um)} µm with a time constant of {digits(self.tau_min)} min ({rms_um:.2g} "
-            "µm rms) whatever the inputs do: a mount or joint that settles is no error of the machine. Check the mount, "
-            "measure against a fixed reference."
+            "µm rms) whatever the inputs do: a mount or joint that settles is no error of the machine. Check the mount "
+            "and measure against a fixed reference."
         )
 
     @classmethod
