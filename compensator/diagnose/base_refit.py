@@ -1,33 +1,30 @@
-"""The diagnosis of a base model that is far off: its paths are fitted anew beside the channels that it lacks.
+"""Diagnosis of a base model that is far off: its paths are refitted beside the channels that it lacks.
 
-Held-out errors as everywhere: for each block of time the whole choice is made again without it. The error before is
-that of the paths alone, fitted anew without the block too: the first model may have seen it in its calibration.
+Held-out errors as everywhere: for each block of time the whole choice is repeated without it. The error before is that
+of the paths alone, also refitted without the block: the first model may have seen it in its calibration.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.joint import Part, response
+from compensator.diagnose.fit import Term, response
 from compensator.diagnose.outcome import (
     FOLDS,
     HELD_OUT,
-    NOISE_TIMES,
-    RIVAL_TIMES,
     Diagnosis,
     Effect,
-    Rival,
-    how_to_tell_apart,
+    rivals_of,
     rms_of,
     table_of,
     warnings_of,
 )
-from compensator.diagnose.refit import Refit, Tried, refit
-from compensator.model.simulation import scores
+from compensator.diagnose.refit import Refit, refit
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.progress import ExecutorMap, Progress
 from compensator.reasons import Caution
@@ -41,8 +38,10 @@ def is_far_off(model: ThermalModel, evidence: Evidence) -> bool:
     return model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um
 
 
-def diagnose_anew(model: ThermalModel, evidence: Evidence, progress: Progress, executor_map: ExecutorMap) -> Diagnosis:
-    """Fit the base anew with the channels that it lacks, and say what that is worth on held-out blocks.
+def diagnose_by_refit(
+    model: ThermalModel, evidence: Evidence, progress: Progress, executor_map: ExecutorMap
+) -> Diagnosis:
+    """Refit the base with the channels that it lacks, and measure on held-out blocks what that is worth.
 
     Parameters
     ----------
@@ -55,21 +54,18 @@ def diagnose_anew(model: ThermalModel, evidence: Evidence, progress: Progress, e
     executor_map : callable
         Does the fits without a block: `map`, or that of an executor.
     """
-    y, open_ = evidence.y_um, evidence.deformation_um
+    deformation = evidence.deformation_um
     whole = refit(evidence)
     before, after = _held_out(evidence, progress, executor_map)
     effects = _effects(evidence, whole)
     helps = bool(effects) and rms_of(after) <= rms_of(before)
-    left = np.where(evidence.used, open_ - whole.predicted, np.nan)
-    bare = np.where(evidence.used, open_ - whole.by_paths, np.nan)
-    clean = rms_of(after) < NOISE_TIMES * evidence.noise_um
+    left = np.where(evidence.used, deformation - whole.predicted, np.nan)
+    bare = np.where(evidence.used, deformation - whole.by_paths, np.nan)
+    clean = evidence.noise.is_explained_held_out(rms_of(after))
     return Diagnosis(
         verdict="unexplained" if not effects else "explained" if clean else "partly_explained",
         effects=effects,
-        before=scores(y, y - before),
-        after=scores(y, y - (after if effects else before)),
-        held_out=f"{HELD_OUT}; before: the first model's paths alone, fitted anew to the others",
-        noise_floor_um=evidence.noise_um,
+        held_out=f"{HELD_OUT}; before: the paths of the first model alone, also refitted to the others",
         model=_extended(model, whole, effects) if helps else model,
         evidence=evidence,
         residual_before=bare,
@@ -77,60 +73,51 @@ def diagnose_anew(model: ThermalModel, evidence: Evidence, progress: Progress, e
         held_out_before=before,
         held_out_after=after if effects else before,
         tried=_tried(whole),
-        warnings=(*_words(model, whole, helps), *warnings_of(effects, before, after)),
+        warnings=(*_refitted(model, whole, helps), *warnings_of(effects, before, after)),
     )
 
 
 def _held_out(evidence: Evidence, progress: Progress, executor_map: ExecutorMap) -> tuple[Vector, Vector]:
     """Return the residual of the base and of the refit on every block, each without that block."""
     before, after = (np.full(evidence.used.size, np.nan) for _ in range(2))
-    open_ = evidence.deformation_um
+    deformation = evidence.deformation_um
     progress(1, FOLDS + 1)
     blocks = list(evidence.blocks(FOLDS))
-    fits = executor_map(refit, [evidence.hidden(block) for block in blocks])
+    fits = executor_map(refit, [evidence.without(block) for block in blocks])
     for done, (block, seen) in enumerate(zip(blocks, fits, strict=True), start=2):
         progress(done, FOLDS + 1)
-        before[block] = (open_ - seen.by_paths)[block]
-        after[block] = (open_ - seen.predicted)[block]
+        before[block] = (deformation - seen.by_paths)[block]
+        after[block] = (deformation - seen.predicted)[block]
     return before, after
 
 
 def _effects(evidence: Evidence, whole: Refit) -> tuple[Effect, ...]:
     effects = []
-    for i, (part, std) in enumerate(zip(whole.parts, whole.std, strict=True)):
-        wave = response(evidence, part)
+    for i, (term, std) in enumerate(zip(whole.terms, whole.std, strict=True)):
+        signal = response(evidence, term)
         effects.append(
             Effect(
-                part=part,
+                term=term,
                 std=std,
-                explanation=part.hypothesis.explain(part.named, float(np.std(wave[evidence.used]))),
+                explanation=term.effect.explain(float(np.std(signal[evidence.used]))),
                 rms_before_um=whole.rms_um[i],
                 rms_after_um=whole.rms_um[i + 1],
-                wave=wave,
-                rivals=_rivals(part, whole.rivals[i], whole.rms_um[i + 1]),
+                signal=signal,
+                rivals=rivals_of(term, _others(whole, i), whole.rms_um[i + 1]),
             )
         )
     return tuple(effects)
 
 
-def _rivals(part: Part, others: tuple[Tried, ...], after: float) -> tuple[Rival, ...]:
-    rivals: list[Rival] = []
-    seen = {part.hypothesis.channel}
-    for other in others:
-        hypothesis = other.hypothesis
-        if hypothesis.channel not in seen and other.rms_um <= RIVAL_TIMES * after:
-            seen.add(hypothesis.channel)
-            # How fast the rival would be is not asked: its lags are those of the effect.
-            rival = Part(hypothesis=hypothesis, values=(), amplitudes=part.amplitudes)
-            words = how_to_tell_apart(part, rival)
-            rivals.append(Rival(part=rival, rms_after_um=other.rms_um, how_to_tell_apart=words))
-    return tuple(rivals[:3])
+def _others(whole: Refit, index: int) -> Iterator[tuple[Term, float]]:
+    """Yield the other channels in the place of one, with its gains: how fast they act is not compared."""
+    gains = whole.terms[index].amplitudes
+    for other in whole.rivals[index]:
+        yield Term(hypothesis=other.hypothesis, values=(), amplitudes=gains), other.rms_um
 
 
 def _tried(whole: Refit) -> tuple[tuple[str, float], ...]:
-    if not whole.rivals:
-        return ()
-    return tuple((f"input {t.hypothesis.channel} ({t.hypothesis.curve})", t.rms_um) for t in whole.rivals[0][:12])
+    return tuple((c.hypothesis.label, c.rms_um) for c in whole.rivals[0][:12]) if whole.rivals else ()
 
 
 def _extended(model: ThermalModel, whole: Refit, effects: tuple[Effect, ...]) -> ThermalModel:
@@ -147,7 +134,8 @@ def _extended(model: ThermalModel, whole: Refit, effects: tuple[Effect, ...]) ->
     )
 
 
-def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, ...]:
+def _refitted(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, ...]:
+    """Return the warning that the paths are not those of the first model."""
     if not helps:
         return ()
     paths = [("DTF", model.dtf, whole.dtf)]
@@ -157,10 +145,8 @@ def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, ...
         f"{name} from {old.sampled.dc_gain:.3g} to {new.dc_gain:.3g} {old.unit.replace('um', 'µm')}"
         for name, old, new in paths
     )
-    return (
-        Caution(
-            "fitted_anew",
-            "The first model was calibrated while this acted and misses much of its own data, so its paths were fitted "
-            f"anew beside it; gains went: {gains}.",
-        ),
+    text = (
+        "The first model was calibrated while this acted and misses much of its own data, so its paths were refitted "
+        f"together with it; gains changed: {gains}."
     )
+    return (Caution("fitted_anew", text),)

@@ -1,30 +1,28 @@
-"""What a diagnosis says: effects, rivals, errors before and after, the extended model."""
+"""Results of a diagnosis: effects, rivals, errors before and after, the extended model."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.joint import Part
-from compensator.model.simulation import Scores
+from compensator.diagnose.fit import Term
+from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import EffectTable, ThermalModel
 from compensator.reasons import Caution
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 
-#: Blocks that are held out in turn, and how that is told.
+#: Blocks that are held out, one after another, and how that is described.
 FOLDS = 3
 HELD_OUT = (
-    f"each of {FOLDS} blocks of time predicted after choosing and fitting on the others; zero and initial state from "
-    "the others, too"
+    f"each of {FOLDS} blocks of time predicted after choosing and fitting on the others; zero and initial state also "
+    "from the others"
 )
-#: What is left counts as noise up to this many times its level.
-NOISE_TIMES = 1.5
 #: Another explanation is a rival while it leaves no more than this many times as much.
 RIVAL_TIMES = 1.2
 
@@ -35,7 +33,7 @@ class Effect:
 
     Parameters
     ----------
-    part : Part
+    term : Term
         Hypothesis and values.
     std : dict of str to float
         Standard errors.
@@ -43,33 +41,48 @@ class Effect:
         For an engineer.
     rms_before_um, rms_after_um : float
         Residual without it and with it, the others in place, µm.
-    wave : numpy.ndarray, shape (n,)
+    signal : numpy.ndarray, shape (n,)
         What it adds to y, µm, all runs one after another.
     rivals : tuple of Rival
         What explains it nearly as well.
     """
 
-    part: Part
+    term: Term
     std: dict[str, float]
     explanation: str
     rms_before_um: float
     rms_after_um: float
-    wave: Vector
+    signal: Vector
     rivals: tuple[Rival, ...]
+
+    @property
+    def place(self) -> tuple[str, str, str]:
+        """Kind, path and channel."""
+        return self.term.hypothesis.place
+
+    @property
+    def named(self) -> dict[str, float]:
+        """Every parameter by name."""
+        return self.term.named
 
     @property
     def deployable(self) -> bool:
         """Whether the service can run it."""
-        return self.part.hypothesis.deployable
+        return self.term.hypothesis.effect.deployable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rival:
     """Another explanation that is nearly as good."""
 
-    part: Part
+    term: Term
     rms_after_um: float
     how_to_tell_apart: str
+
+    @property
+    def label(self) -> str:
+        """Kind and place in words."""
+        return " ".join(filter(None, self.term.hypothesis.place))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,12 +95,8 @@ class Diagnosis:
         In one word.
     effects : tuple of Effect
         In order of the error that they remove.
-    before, after : Scores
-        On data that took no part in choosing or fitting.
     held_out : str
-        How that was measured.
-    noise_floor_um : float
-        What the sensors' noise alone makes, µm.
+        How the errors before and after were measured.
     model : ThermalModel
         The base model with every deployable effect.
     evidence : Evidence
@@ -95,19 +104,16 @@ class Diagnosis:
     residual_before, residual_after : numpy.ndarray, shape (n,)
         Of the fit to everything, nuisances taken out, µm; NaN where y is missing.
     held_out_before, held_out_after : numpy.ndarray, shape (n,)
-        The same, each block by a search without it.
+        The same, each block by a search that did not see it.
     tried : tuple of (str, float)
         Explanations of the largest effect and the rms that each leaves, µm, best first.
     warnings : tuple of Caution
-        In words.
+        What to know before relying on it.
     """
 
     verdict: Verdict
     effects: tuple[Effect, ...]
-    before: Scores
-    after: Scores
     held_out: str
-    noise_floor_um: float
     model: ThermalModel
     evidence: Evidence
     residual_before: Vector
@@ -117,58 +123,97 @@ class Diagnosis:
     tried: tuple[tuple[str, float], ...]
     warnings: tuple[Caution, ...]
 
+    @property
+    def before(self) -> Scores:
+        """Errors of the base model on data that took no part in choosing or fitting."""
+        return self._scores(self.held_out_before)
+
+    @property
+    def after(self) -> Scores:
+        """The same with every effect."""
+        return self._scores(self.held_out_after)
+
+    @property
+    def noise_floor_um(self) -> float:
+        """What the sensors' noise alone makes of the residual, µm."""
+        return self.evidence.noise.noise_um
+
+    def _scores(self, residual: Vector) -> Scores:
+        y = self.evidence.y_um
+        return scores(y, y - residual)
+
 
 def rms_of(values: Vector) -> float:
-    """Return the root mean square of what is there."""
+    """Return the root mean square of the values that are not missing."""
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def how_to_tell_apart(first: Part, second: Part) -> str:
-    """Say which experiment would tell two explanations apart."""
-    slow = max((v for p in (first, second) for n, v in p.named.items() if n.endswith("_min")), default=30.0)
+def rivals_of(term: Term, others: Iterable[tuple[Term, float]], after_um: float) -> tuple[Rival, ...]:
+    """Return the best of other explanations, one for each place, that leave nearly as little as an effect.
+
+    Parameters
+    ----------
+    term : Term
+        The effect.
+    others : iterable of (Term, float)
+        Other explanations and the rms that each leaves, µm, best first.
+    after_um : float
+        What the effect leaves, µm rms.
+    """
+    rivals: dict[tuple[str, str, str], Rival] = {}
+    for other, rms in others:
+        place = other.hypothesis.place
+        if place != term.hypothesis.place and place not in rivals and rms <= RIVAL_TIMES * after_um:
+            words = how_to_tell_apart(term, other)
+            rivals[place] = Rival(term=other, rms_after_um=rms, how_to_tell_apart=words)
+    return tuple(rivals.values())[:3]
+
+
+def how_to_tell_apart(first: Term, second: Term) -> str:
+    """Return which experiment tells two explanations apart."""
+    slow = max((v for term in (first, second) for n, v in term.named.items() if n.endswith("_min")), default=30.0)
     hours = max(1.0, 3.0 * slow / 60.0)
-
-    def stimulus(part: Part) -> str:
-        hypothesis = part.hypothesis
-        if hypothesis.channel:
-            return f"step {hypothesis.channel} with the heat steady"
-        if hypothesis.path in ("DTF", "TTF"):
-            return "step the heat with every other channel steady"
-        if hypothesis.path == "TDTF":
-            return "let the ambient change by some kelvin without heat"
-        return "leave everything at rest"
-
-    one, two = stimulus(first), stimulus(second)
+    one, two = _stimulus(first), _stimulus(second)
     if one == two:
-        return f"{one.capitalize()}, at two sizes and up and down, and watch Y for {hours:.0f} h."
-    return f"{one.capitalize()}, then {two}; watch Y for {hours:.0f} h each: only one of the two moves it."
+        return f"{one.capitalize()}, with two step sizes, up and down, and record Y for {hours:.0f} h."
+    return f"{one.capitalize()}, then {two}; record Y for {hours:.0f} h each: only one of the two moves it."
+
+
+def _stimulus(term: Term) -> str:
+    _, path, channel = term.hypothesis.place
+    if channel:
+        return f"step {channel} with the heat steady"
+    if path in ("DTF", "TTF"):
+        return "step the heat with every other channel steady"
+    if path == "TDTF":
+        return "let the ambient temperature change by some kelvin without heat"
+    return "leave the machine at rest"
 
 
 def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[Caution, ...]:
-    """Say what to mind of the effects that were found."""
-    words = []
+    """Return what to know before relying on the effects that were found."""
+    warnings = []
     rms_before, rms_after = rms_of(before), rms_of(after)
     if effects and rms_after > rms_before:
-        words.append(
-            Caution(
-                "made_worse",
-                f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so "
-                "the model was left as it is.",
-            )
+        text = (
+            f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so the "
+            "model was left as it is."
         )
+        warnings.append(Caution("made_worse", text))
     for effect in effects:
-        loose = [name for name, std in effect.std.items() if std > abs(effect.part.named[name]) > 0.0]
+        kind, named = effect.place[0], effect.named
+        loose = [name for name, std in effect.std.items() if std > abs(named[name]) > 0.0]
         if loose:
-            said = f"{effect.part.hypothesis.kind}: {', '.join(loose)} is hardly determined."
-            words.append(Caution("hardly_determined", said))
+            text = f"{kind}: the standard error of {', '.join(loose)} is larger than the value."
+            warnings.append(Caution("hardly_determined", text))
         if effect.rivals:
-            names = ", ".join(" ".join(filter(None, rival.part.hypothesis.place)) for rival in effect.rivals)
-            words.append(Caution("nearly_as_good", f"{effect.part.hypothesis.kind}: nearly as good would be {names}."))
-    return tuple(words)
+            names = ", ".join(rival.label for rival in effect.rivals)
+            warnings.append(Caution("nearly_as_good", f"{kind}: {names} would explain it nearly as well."))
+    return tuple(warnings)
 
 
 def table_of(effect: Effect) -> EffectTable:
     """Return an effect as the model file holds it."""
-    part = effect.part
-    table: dict[str, Any] = part.hypothesis.table(part.values, part.amplitudes)
-    return EffectTable(kind=part.hypothesis.kind, table={**table, "std": effect.std, "explanation": effect.explanation})
+    found = effect.term.effect
+    table = {**found.to_table(), "std": effect.std, "explanation": effect.explanation}
+    return EffectTable(kind=found.kind, table=table)

@@ -1,15 +1,13 @@
-"""A base model that is far off: fitted anew together with what it lacks.
+"""A base model that is far off: refitted together with what it lacks.
 
 A model that was calibrated while something acted that it has no input for has bent its own paths to make up for it. Its
-residual is then no longer the effect, and whatever is found in it holds nowhere else. So the paths are fitted
-again, beside each channel in turn, and the channel that helps most on blocks of time that were held out is added; then
-the next.
+residual is then no longer the effect, and whatever is found in it holds nowhere else. So the paths are refitted beside
+each channel, the channel that helps most on held-out blocks of time is added, and so on.
 
-Every path and channel acts through a row of given lags, whose gains are held small: a ridge, with the weight `RIDGE`
-against columns of standard deviation 1 (the last fit takes a lighter one where that does better). So there is nothing
-to search, one Gram matrix of each block serves all fits, and hundreds of combinations are compared by their error on
-blocks of several lengths: short ones alone would favour what merely follows, long ones alone depend on where they
-begin.
+Every path and channel acts through a filter bank with a ridge on its gains, of weight `RIDGE` against columns of
+standard deviation 1 (the last fit uses a lighter one where that does better). So there is nothing to search, one Gram
+matrix of each block serves all fits, and hundreds of combinations are compared by their error on blocks of several
+lengths: short ones alone would favour what merely follows, long ones alone depend on where they begin.
 
 Sources: Hoerl and Kennard, Ridge regression (1970); Stone, Cross-validatory choice (1974).
 """
@@ -20,31 +18,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from compensator.arrays import Indices, Mask, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.joint import Part
-from compensator.model.effects.hypothesis import ROW, lag_pole, row
-from compensator.model.effects.input import RowHypothesis, rows
+from compensator.diagnose.fit import Term
+from compensator.model.effects.blocks import FilterBank, Lag
+from compensator.model.effects.hypothesis import BANK, Hypothesis
+from compensator.model.effects.input import banks
 from compensator.model.transfer_function import SampledTransferFunction
 
 #: Weight of the ridge, as a share of the samples.
 RIDGE = 0.03
-#: Weights of the last fit, the heaviest first; the one with the least error on held-out blocks is taken.
+#: Weights of the last fit, the heaviest first; the one with the least error on held-out blocks is chosen.
 RIDGES = (RIDGE, 0.01, 0.003, 0.001)
-#: Lengths of the blocks that are held out, h.
+#: Lengths of the held-out blocks, h.
 BLOCKS_H = (3.0, 5.0, 8.0)
 #: Most channels added, and what each must leave at most of the held-out error.
 MOST, LEAVES = 3, 0.9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Tried:
+class ChannelCandidate:
     """A channel and the error on held-out blocks with it.
 
     Parameters
     ----------
-    hypothesis : RowHypothesis
+    hypothesis : Hypothesis
         The channel and its curve.
     rms_um : float
         Free-run error on the blocks, µm.
@@ -52,7 +52,7 @@ class Tried:
         Sum of squares of each block, µm².
     """
 
-    hypothesis: RowHypothesis
+    hypothesis: Hypothesis
     rms_um: float
     blocks_um2: Vector
 
@@ -63,59 +63,59 @@ class Refit:
 
     Parameters
     ----------
-    parts : tuple of Part
-        The channels added, in the order in which they were.
+    terms : tuple of Term
+        The channels, in the order in which they were added.
     std : tuple of dict of str to float
-        Standard errors of what each part is named by, from leaving out one block at a time.
+        Standard errors of what each term is named by, from leaving out one block at a time.
     dtf, tdtf : SampledTransferFunction or None
-        The paths, fitted anew.
+        The refitted paths.
     predicted : numpy.ndarray, shape (n,)
         Deformation on every sample, the zero of each run included, µm.
     by_paths : numpy.ndarray, shape (n,)
         The same by the paths alone, fitted without any channel.
     rms_um : tuple of float
         Error on held-out blocks: of the base alone, then with each channel more.
-    rivals : tuple of tuple of Tried
-        For each part, the other channels in its place, best first.
+    rivals : tuple of tuple of ChannelCandidate
+        For each term, the other channels in its place, best first.
     """
 
-    parts: tuple[Part, ...]
+    terms: tuple[Term, ...]
     std: tuple[dict[str, float], ...]
     dtf: SampledTransferFunction
     tdtf: SampledTransferFunction | None
     predicted: Vector
     by_paths: Vector
     rms_um: tuple[float, ...]
-    rivals: tuple[tuple[Tried, ...], ...]
+    rivals: tuple[tuple[ChannelCandidate, ...], ...]
 
 
 def refit(evidence: Evidence) -> Refit:
-    """Fit the base anew and add channels while the error on held-out blocks falls.
+    """Refit the base and add channels while the error on held-out blocks falls.
 
     Parameters
     ----------
     evidence : Evidence
-        Residual and signals; only the samples used are looked at.
+        Residual and signals; nothing but the samples used takes part.
     """
     fitting = _Fitting(evidence)
-    chosen: list[RowHypothesis] = []
+    chosen: list[Hypothesis] = []
     best, blocks = fitting.held_out(chosen)
     errors, rivals = [best], []
     while len(chosen) < MOST:
-        taken = {hypothesis.channel for hypothesis in chosen}
-        tried = []
+        added = {hypothesis.effect.channel for hypothesis in chosen}
+        candidates = []
         for hypothesis in fitting.hypotheses:
-            if hypothesis.channel not in taken:
+            if hypothesis.effect.channel not in added:
                 rms, each = fitting.held_out([*chosen, hypothesis])
-                tried.append(Tried(hypothesis=hypothesis, rms_um=rms, blocks_um2=each))
-        tried.sort(key=lambda item: item.rms_um)
-        # A fall that a single block brings is that block's luck.
-        if not tried or tried[0].rms_um > LEAVES * best or np.mean(tried[0].blocks_um2 < blocks) <= 0.5:
+                candidates.append(ChannelCandidate(hypothesis=hypothesis, rms_um=rms, blocks_um2=each))
+        candidates.sort(key=lambda item: item.rms_um)
+        # A gain on a single block is due to that block.
+        if not candidates or candidates[0].rms_um > LEAVES * best or np.mean(candidates[0].blocks_um2 < blocks) <= 0.5:
             break
-        chosen.append(tried[0].hypothesis)
-        best, blocks = tried[0].rms_um, tried[0].blocks_um2
+        chosen.append(candidates[0].hypothesis)
+        best, blocks = candidates[0].rms_um, candidates[0].blocks_um2
         errors.append(best)
-        rivals.append(tuple(tried[1:]))
+        rivals.append(tuple(candidates[1:]))
     return fitting.result(chosen, tuple(errors), tuple(rivals))
 
 
@@ -124,34 +124,31 @@ class _Fitting:
 
     def __init__(self, evidence: Evidence) -> None:
         self.evidence = evidence
-        setting, period = evidence.setting, evidence.setting.period_min
-        self.taus = setting.row_min
-        self.hypotheses = rows(setting)
-        self.paths = ["drive", *(["ambient_k"] if setting.has_ambient else [])]
-        runs = np.zeros((evidence.used.size, len(evidence.waves)))
-        start = 0
-        for i, wave in enumerate(evidence.waves):
-            runs[start : start + wave.size, i] = 1.0
-            start += wave.size
+        context = evidence.context
+        self.taus = context.bank_min
+        self.hypotheses = banks(context)
+        bank = FilterBank(self.taus, [(1.0,) * BANK], context.period_min)
+        records = evidence.signals
+        drives = [[record.drive for record in records]]
+        if context.has_ambient:
+            drives.append([record.ambient_k for record in records])
+        runs = block_diag(*(np.ones((record.size, 1)) for record in records))
         groups = [
-            *(
-                np.concatenate([row(getattr(w, name), self.taus, period) for w in evidence.waves])
-                for name in self.paths
-            ),
-            *(np.concatenate([h.columns(w, ()) for w in evidence.waves]) for h in self.hypotheses),
+            *(np.concatenate([bank.columns(u) for u in drive]) for drive in drives),
+            *(np.concatenate([h.columns(record, ()) for record in records]) for h in self.hypotheses),
         ]
         whole = np.concatenate([runs, *groups], axis=1)
         scale = np.std(whole[evidence.used], axis=0)
         scale[: runs.shape[1]] = 1.0
         scale[scale == 0.0] = 1.0
         self.scale, self.table = scale, whole / scale
-        self.base = runs.shape[1] + ROW * len(self.paths)
+        self.base = runs.shape[1] + BANK * len(drives)
         self.y = evidence.deformation_um
         self.blocks = [self._grams(mask) for mask in self._masks()]
         self.all = self._grams([evidence.used])
 
     def _masks(self) -> list[list[Mask]]:
-        hours = self.evidence.count * self.evidence.setting.period_min / 60.0
+        hours = self.evidence.count * self.evidence.context.period_min / 60.0
         return [list(self.evidence.blocks(max(2, round(hours / length)))) for length in BLOCKS_H]
 
     def _grams(self, masks: Sequence[Mask]) -> list[tuple[Matrix, Vector, float, int]]:
@@ -161,16 +158,16 @@ class _Fitting:
             found.append((x.T @ x, x.T @ y, float(y @ y), int(mask.sum())))
         return found
 
-    def columns_of(self, chosen: Sequence[RowHypothesis]) -> Indices:
+    def columns_of(self, chosen: Sequence[Hypothesis]) -> Indices:
         """Return which columns a fit has: zeros and paths, then each channel's."""
         at = [np.arange(self.base)]
         for hypothesis in chosen:
-            first = self.base + ROW * self.hypotheses.index(hypothesis)
-            at.append(np.arange(first, first + ROW))
+            first = self.base + BANK * self.hypotheses.index(hypothesis)
+            at.append(np.arange(first, first + BANK))
         return np.concatenate(at)
 
-    def held_out(self, chosen: Sequence[RowHypothesis], ridge: float = RIDGE) -> tuple[float, Vector]:
-        """Return the error on blocks that were held out, µm rms, and the sum of squares of each."""
+    def held_out(self, chosen: Sequence[Hypothesis], ridge: float = RIDGE) -> tuple[float, Vector]:
+        """Return the error on held-out blocks, µm rms, and the sum of squares of each."""
         at = self.columns_of(chosen)
         cut = np.ix_(at, at)
         (gram, moment, _, count), errors, squares = self.all[0], [], []
@@ -183,8 +180,8 @@ class _Fitting:
             squares.append(sum(e for e, _ in errors[-len(blocks) :]) / sum(n for _, n in errors[-len(blocks) :]))
         return float(np.sqrt(np.mean(squares))), np.array([e for e, _ in errors])
 
-    def weights(self, chosen: Sequence[RowHypothesis], ridge: float, without: int | None = None) -> Vector:
-        """Return the weights of the fit to everything that is used, or to all but one of the shortest blocks."""
+    def weights(self, chosen: Sequence[Hypothesis], ridge: float, without: int | None = None) -> Vector:
+        """Return the weights of the fit to all samples used, or to all but one of the shortest blocks."""
         at = self.columns_of(chosen)
         gram, moment, _, count = self.all[0]
         if without is not None:
@@ -193,24 +190,24 @@ class _Fitting:
         return _solved(gram[np.ix_(at, at)], moment[at], ridge * count)
 
     def result(
-        self, chosen: Sequence[RowHypothesis], errors: tuple[float, ...], rivals: tuple[tuple[Tried, ...], ...]
+        self, chosen: Sequence[Hypothesis], errors: tuple[float, ...], rivals: tuple[tuple[ChannelCandidate, ...], ...]
     ) -> Refit:
-        """Fit to everything that is used, and take the pieces apart."""
+        """Fit to all samples used, and separate paths and channels."""
         at = self.columns_of(chosen)
         ridge = min(RIDGES, key=lambda weight: self.held_out(chosen, weight)[0])
         w = self.weights(chosen, ridge)
         gains = w / self.scale[at]
         others = [self.weights(chosen, ridge, i) / self.scale[at] for i in range(len(self.blocks[0]))]
-        parts, std = [], []
+        terms, std = [], []
         for i, hypothesis in enumerate(chosen):
-            own = slice(self.base + ROW * i, self.base + ROW * (i + 1))
-            parts.append(Part(hypothesis=hypothesis, values=(), amplitudes=tuple(gains[own].tolist())))
-            std.append(_jackknife(parts[-1], [other[own] for other in others]))
+            own = slice(self.base + BANK * i, self.base + BANK * (i + 1))
+            terms.append(Term(hypothesis=hypothesis, values=(), amplitudes=tuple(gains[own].tolist())))
+            std.append(_jackknife(terms[-1], [other[own] for other in others]))
         paths = [
-            self._function(gains[first : first + ROW]) for first in range(len(self.evidence.waves), self.base, ROW)
+            self._function(gains[first : first + BANK]) for first in range(len(self.evidence.signals), self.base, BANK)
         ]
         return Refit(
-            parts=tuple(parts),
+            terms=tuple(terms),
             std=tuple(std),
             dtf=paths[0],
             tdtf=paths[1] if len(paths) > 1 else None,
@@ -221,9 +218,9 @@ class _Fitting:
         )
 
     def _function(self, gains: Vector) -> SampledTransferFunction:
-        """Return a row of lags as one transfer function."""
-        period = self.evidence.setting.period_min
-        poles = np.array([lag_pole(tau, period) for tau in self.taus])
+        """Return a filter bank as one transfer function."""
+        period = self.evidence.context.period_min
+        poles = np.array([Lag(tau, period).pole for tau in self.taus])
         numerator = np.zeros(poles.size + 1)
         for i, gain in enumerate(gains.tolist()):
             half = (1.0 - poles[i]) / 2.0
@@ -237,11 +234,11 @@ def _solved(gram: Matrix, moment: Vector, ridge: float) -> Vector:
     return np.asarray(np.linalg.solve(gram + ridge * np.eye(moment.size), moment))
 
 
-def _jackknife(part: Part, others: Sequence[Vector]) -> dict[str, float]:
-    """Return standard errors of what a row of lags is named by, from fits that leave out one block each.
+def _jackknife(term: Term, others: Sequence[Vector]) -> dict[str, float]:
+    """Return standard errors of what a filter bank is named by, from fits that leave out one block each.
 
-    A coloured residual is in them; what the ridge takes off every fit alike is not.
+    They include the correlation of the residual in time, and not the ridge's shrinkage, which all fits share.
     """
-    named = [part.hypothesis.named((), gains.tolist()) for gains in others]
+    named = [term.hypothesis.named((), gains.tolist()) for gains in others]
     count = len(others)
-    return {name: float(np.std([n[name] for n in named]) * np.sqrt(count - 1)) for name in part.named}
+    return {name: float(np.std([n[name] for n in named]) * np.sqrt(count - 1)) for name in term.named}

@@ -8,7 +8,9 @@ import numpy as np
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.model.effects.hypothesis import Free, lowpass
+from compensator.diagnose.fit import Start
+from compensator.model.effects.blocks import Lag
+from compensator.model.effects.hypothesis import Free, Hypothesis
 from compensator.model.effects.unobserved import Unobserved
 
 Time = tuple[int, float]
@@ -17,13 +19,13 @@ Time = tuple[int, float]
 MOST = 32
 #: The lag is no longer than this share of the record: a longer one is a ramp.
 LONGEST_SHARE = 0.15
-#: Least share of a step's norm that must be left once nuisances and hidden samples are out of it.
+#: Least share of a step's norm that must be left without nuisances and held-out samples.
 SEEN_SHARE = 0.05
 #: Points of time that are tried in a record.
 POINTS = 240
 
 
-def switchings(evidence: Evidence, residual: Vector) -> tuple[Unobserved, tuple[float, ...]] | None:
+def switchings(evidence: Evidence, residual: Vector) -> Start | None:
     """Find steps behind a common lag that a residual may be made of, one after another.
 
     Parameters
@@ -35,41 +37,37 @@ def switchings(evidence: Evidence, residual: Vector) -> tuple[Unobserved, tuple[
 
     Returns
     -------
-    (Unobserved, values) or None
-        A hypothesis with its times, and where the search of its lag begins.
+    (Hypothesis, values) or None
+        An unobserved source with its times, and where the search of its lag begins.
     """
-    tau = evidence.setting.tau()
-    high = max(evidence.setting.minutes * LONGEST_SHARE, 2.0 * tau.low)
-    lags = [float(lag) for lag in np.geomspace(tau.low, high, 7)]
+    tau = evidence.context.tau()
+    high = max(evidence.context.minutes * LONGEST_SHARE, 2.0 * tau.low)
     grid = _grid(evidence)
-    rough = []
-    for lag in lags:
-        score, chosen = _pursue(_steps(evidence, grid, lag), residual, evidence.count, evidence.allowance)
+    ranked = []
+    for lag in np.geomspace(tau.low, high, 7).tolist():
+        score, chosen = _pursue(evidence, _steps(evidence, grid, lag), residual)
         if chosen:
-            rough.append((score, lag))
-    best: tuple[float, float, list[Time]] | None = None
-    for _, lag in sorted(rough)[:2]:
-        score, times = _carefully(evidence, residual, grid, lag)
-        if times and (best is None or score < best[0]):
-            best = (score, lag, times)
+            ranked.append((score, lag))
+    refined = [(*_refine(evidence, residual, grid, lag), lag) for _, lag in sorted(ranked)[:2]]
+    best = min((one for one in refined if one[1]), key=lambda one: one[0], default=None)
     if best is None:
         return None
-    found = tuple(sorted(best[2]))
-    hypothesis = Unobserved(
+    _, times, lag = best
+    hypothesis = Hypothesis(
+        effect=Unobserved(times=tuple(sorted(times)), sizes_um=(1.0,) * len(times)),
         form="switched",
         free=(Free(name="tau_min", low=tau.low, high=high, grid=()),),
-        amplitudes=tuple(f"size_{i}_um" for i in range(1, len(found) + 1)),
-        times=found,
-        order=tuple(id(wave) for wave in evidence.waves),
+        amplitudes=tuple(f"size_{i}_um" for i in range(1, len(times) + 1)),
     )
-    return hypothesis, (best[1],)
+    return hypothesis, (lag,)
 
 
 def _grid(evidence: Evidence) -> list[Time]:
-    result = []
-    for record, wave in enumerate(evidence.waves):
-        result += [(record, float(k * wave.period_min)) for k in range(2, wave.size - 2, _stride(wave.size))]
-    return result
+    return [
+        (record.number, float(k * record.period_min))
+        for record in evidence.signals
+        for k in range(2, record.size - 2, _stride(record.size))
+    ]
 
 
 def _stride(size: int) -> int:
@@ -78,11 +76,11 @@ def _stride(size: int) -> int:
 
 def _steps(evidence: Evidence, where: list[Time], lag: float) -> Matrix:
     """Return one column for each time: a step behind the lag, of norm 1, nuisances taken out."""
-    sizes = [wave.size for wave in evidence.waves]
+    sizes = [record.size for record in evidence.signals]
     begin = np.cumsum([0, *sizes[:-1]])
-    period = evidence.setting.period_min
+    period = evidence.context.period_min
     longest = max(sizes)
-    shape = lowpass(np.concatenate(([0.0], np.ones(longest + 1))), lag, period)[1:]
+    shape = Lag(lag, period).filter(np.concatenate(([0.0], np.ones(longest + 1))))[1:]
     table = np.zeros((sum(sizes), len(where)))
     for column, (record, at) in enumerate(where):
         first = int(at / period)
@@ -97,16 +95,16 @@ def _steps(evidence: Evidence, where: list[Time], lag: float) -> Matrix:
     table[~evidence.used] = 0.0
     table = evidence.without_nuisances(table)
     norm = np.linalg.norm(table, axis=0)
-    # A step that is hardly seen may have any size: leave it out.
+    # A step of which next to nothing is left may have any size: leave it out.
     norm[norm < SEEN_SHARE * whole + 1e-9] = np.inf
     return np.asarray(table / norm)
 
 
-def _pursue(table: Matrix, residual: Vector, count: int, allowance: float) -> tuple[float, list[int]]:
-    """Take the best step, refit, and go on while each is worth its two parameters (orthogonal matching pursuit)."""
+def _pursue(evidence: Evidence, table: Matrix, residual: Vector) -> tuple[float, list[int]]:
+    """Choose the best step, refit, and go on while each is worth its parameters (orthogonal matching pursuit)."""
     chosen: list[int] = []
     best: list[int] = []
-    left, score = residual, _score(residual, 0, count, allowance)
+    left, score = residual, _score(evidence, residual, 0)
     q = np.zeros((residual.size, 0))
     while len(chosen) < MOST:
         match = np.abs(table.T @ left)
@@ -119,7 +117,7 @@ def _pursue(table: Matrix, residual: Vector, count: int, allowance: float) -> tu
         q = np.column_stack((q, column / norm))
         chosen.append(i)
         left = residual - q @ (q.T @ residual)
-        now = _score(left, len(chosen), count, allowance)
+        now = _score(evidence, left, len(chosen))
         if now < score:
             score, best = now, list(chosen)
         elif len(chosen) > len(best) + 2:
@@ -127,21 +125,26 @@ def _pursue(table: Matrix, residual: Vector, count: int, allowance: float) -> tu
     return score, best
 
 
-def _score(left: Vector, steps: int, count: int, allowance: float) -> float:
-    return count * math.log(float(left @ left) + allowance + 1e-12) + (1 + 2 * steps) * math.log(count)
+def _score(evidence: Evidence, left: Vector, steps: int) -> float:
+    count = evidence.count
+    return count * math.log(float(left @ left) + evidence.noise.allowance + 1e-12) + (1 + 2 * steps) * math.log(count)
 
 
-def _carefully(evidence: Evidence, residual: Vector, grid: list[Time], lag: float) -> tuple[float, list[Time]]:
-    """Pursue again, each time moved to where it belongs before the next one is looked for."""
+def _refine(evidence: Evidence, residual: Vector, grid: list[Time], lag: float) -> tuple[float, list[Time]]:
+    """Pursue again, each time moved to where it fits best before the next one is looked for; then thin out."""
+
+    def score_of(times: list[Time]) -> float:
+        return _score(evidence, _left(evidence, residual, times, lag), len(times))
+
     table = _steps(evidence, grid, lag)
     times: list[Time] = []
-    best: tuple[float, list[Time]] = (_score(residual, 0, evidence.count, evidence.allowance), [])
+    best: tuple[float, list[Time]] = (_score(evidence, residual, 0), [])
     left, worse = residual, 0
     while len(times) < MOST and worse < 2:
         times.append(grid[int(np.argmax(np.abs(table.T @ left)))])
         times = _moved(evidence, residual, times, lag, last_only=len(times) % 4 != 0)
         left = _left(evidence, residual, times, lag)
-        now = _score(left, len(times), evidence.count, evidence.allowance)
+        now = _score(evidence, left, len(times))
         worse = 0 if now < best[0] else worse + 1
         if worse == 0:
             best = (now, list(times))
@@ -149,11 +152,8 @@ def _carefully(evidence: Evidence, residual: Vector, grid: list[Time], lag: floa
     times = _moved(evidence, residual, times, lag, last_only=False) if times else times
     while len(times) > 1:
         fewer = [times[:k] + times[k + 1 :] for k in range(len(times))]
-        scores = [
-            _score(_left(evidence, residual, some, lag), len(some), evidence.count, evidence.allowance)
-            for some in fewer
-        ]
-        score = _score(_left(evidence, residual, times, lag), len(times), evidence.count, evidence.allowance)
+        scores = [score_of(some) for some in fewer]
+        score = score_of(times)
         if min(scores) >= score:
             break
         times = fewer[int(np.argmin(scores))]
@@ -166,13 +166,13 @@ def _left(evidence: Evidence, residual: Vector, times: list[Time], lag: float) -
 
 
 def _moved(evidence: Evidence, residual: Vector, times: list[Time], lag: float, *, last_only: bool) -> list[Time]:
-    """Move one time after another by half samples, all sizes refitted, to where it takes the most."""
-    period = evidence.setting.period_min
+    """Move one time after another by half samples, all sizes refitted, to where it explains most."""
+    period = evidence.context.period_min
     times = list(times)
     for k in range(len(times) - 1 if last_only else 0, len(times)):
         record, at = times[k]
-        reach = _stride(evidence.waves[record].size)
-        last = (evidence.waves[record].size - 3) * period
+        reach = _stride(evidence.signals[record].size)
+        last = (evidence.signals[record].size - 3) * period
         near = [(record, min(max(at + d * period, 2 * period), last)) for d in np.arange(-reach, reach + 0.25, 0.5)]
         others = _steps(evidence, times[:k] + times[k + 1 :], lag)
         q = np.linalg.qr(others)[0]

@@ -1,9 +1,8 @@
 """The streaming engine: a thermal model and its effects, one sample at a time.
 
-The service, `simulate`, `identify`, `diagnose` and `replay` run this class and no other. `run` is `step` over a
-whole record, so both give the same bits. A step takes constant time, but for the one that ends a gap: it goes
-back to the last complete sample and walks over the missing ones with interpolated inputs, at most
-`bridge_samples` of them.
+The service, `simulate`, `identify`, `diagnose` and `replay` all run this class. `run` is `step` over a whole record, so
+both give the same bits. A step takes constant time, except the one that ends a gap: it returns to the last complete
+sample and repeats the missing ones with interpolated inputs, at most `bridge_samples` of them.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.errors import ModelError
-from compensator.model.effects import Effect, Signals, kinds
+from compensator.model.effects import EffectStream, Signals, effect_from, kinds
 from compensator.model.observer import Observer, ObserverState
 from compensator.model.thermal_model import ThermalModel
 
 NAN = float("nan")
 
-#: Longest run of incomplete samples that is walked over again once both temperatures are back.
+#: Longest run of incomplete samples that is repeated once both temperatures are back.
 BRIDGE_SAMPLES = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Values that the inputs are taken as changes from.
+    """Temperatures that the inputs are changes from.
 
     Parameters
     ----------
@@ -108,9 +107,9 @@ class EngineState:
     channels : tuple of (str, float)
         Last good value of each channel that an effect uses.
     reference : Reference
-        What the inputs are taken as changes from.
+        What the inputs are changes from.
     last_complete : Inputs, optional
-        The last complete sample, where a gap that begins after it may be walked over.
+        The last complete sample, where a gap that begins after it may be bridged.
     gap : Gap, optional
         The gap under way.
     """
@@ -125,21 +124,21 @@ class EngineState:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Incomplete samples since the last complete one, kept to be walked over again.
+    """Incomplete samples since the last complete one, kept to be repeated.
 
     Parameters
     ----------
     state : EngineState
         State before the first of them.
     before : Inputs or None
-        The complete sample before them; None where nothing before is known.
+        The complete sample before them; None where there is none.
     samples : tuple of Inputs
         The incomplete samples.
     limit : int
         A gap of more samples than this is left as predicted.
     held : bool
-        Whether the missing values are taken to have been as those after the gap from its beginning, instead of
-        on a straight line between its ends.
+        Whether the missing values are assumed to have been those after the gap all along, instead of on a straight
+        line between its ends.
     """
 
     state: EngineState
@@ -185,13 +184,12 @@ class Engine:
         self._held: dict[str, float] = {}
         self._last_complete: Inputs | None = None
         self._gap: Gap | None = None
-        self._signals = Signals()
 
     # ------------------------------------------------------------------ reference and state
 
     @property
     def reference(self) -> Reference:
-        """What the inputs are taken as changes from."""
+        """What the inputs are changes from."""
         return self._reference
 
     @property
@@ -200,7 +198,7 @@ class Engine:
         return not (math.isnan(self._reference.t_q_degc) or math.isnan(self._reference.at_degc))
 
     def set_reference(self, t_q_degc: float, at_degc: float) -> None:
-        """Start at rest, with these temperatures as zero (ignored where the model takes them as they are).
+        """Start at rest, with these temperatures as zero (ignored where the model's inputs are absolute).
 
         Raises
         ------
@@ -270,7 +268,7 @@ class Engine:
     # ------------------------------------------------------------------ one sample
 
     def step(self, t_q_degc: float, at_degc: float, channels: Mapping[str, float] | None = None) -> Estimate:
-        """Take one sample in.
+        """Advance by one sample.
 
         Parameters
         ----------
@@ -301,11 +299,11 @@ class Engine:
         if inputs.complete:
             if self._gap is not None:
                 unknown = self._observer.covariance_ahead()
-                self._walk_over(self._gap, inputs)
+                self._repeat(self._gap, inputs)
                 self._gap = None
             self._last_complete = inputs
         else:
-            self._keep(inputs)
+            self._remember(inputs)
         return self._advance(inputs, unknown=unknown)
 
     def run(
@@ -314,7 +312,7 @@ class Engine:
         at_degc: Sequence[float] | Vector,
         channels: Mapping[str, Sequence[float] | Vector] | None = None,
     ) -> list[Estimate]:
-        """Take a whole record in, sample by sample.
+        """Run over a whole record, sample by sample.
 
         Parameters
         ----------
@@ -341,15 +339,15 @@ class Engine:
         ]
 
     def skip(self, samples: int, *, held: bool = False) -> Estimate:
-        """Pass over samples that nobody took, as missing ones; the next complete sample walks over them again.
+        """Skip samples that were not taken, as missing ones; the next complete sample repeats them.
 
         Parameters
         ----------
         samples : int
-            How many, at least 1. However many they are, they are walked over.
+            How many, at least 1; there is no limit to what is repeated.
         held : bool
-            The machine is taken to have been all the while as it is found after the gap, instead of on a straight
-            line between its two ends: what is known before says nothing about the end of a long gap.
+            Whether the machine is assumed to have been all along as it is found after the gap, instead of on a straight
+            line between its ends: the state before a long gap says nothing about its end.
 
         Returns
         -------
@@ -363,7 +361,7 @@ class Engine:
         """
         gap = self._gap or Gap(state=self.snapshot(), before=self._last_complete)
         if held or gap.before is not None:
-            # A long pause must not use up what a short loss of a sensor after it may take.
+            # A long pause must not use up the limit of a short sensor loss after it.
             limit = max(gap.limit, len(gap.samples) + samples + self.bridge_samples)
             self._gap = dataclasses.replace(gap, limit=limit, held=held or gap.held)
         for _ in range(samples):
@@ -405,27 +403,25 @@ class Engine:
         for name, value in inputs.channels.items():
             if not math.isnan(value):
                 self._held[name] = value
-        signals = self._signals
-        signals.drive, signals.ambient_k = self._observer.drive, self._observer.ambient_k
-        difference = inputs.t_q_k - inputs.at_k
-        signals.difference_k = self._observer.difference_k if math.isnan(difference) else difference
-        signals.y_dtf_um, signals.y_tdtf_um = dtf, tdtf
-        signals.channels = self._held
+        signals = self._signals(dtf, tdtf)
         return tuple(effect.step(signals) for effect in self._effects)
 
+    def _signals(self, dtf: float, tdtf: float) -> Signals:
+        observer = self._observer
+        return Signals(
+            drive=observer.drive, ambient_k=observer.ambient_k, y_dtf_um=dtf, y_tdtf_um=tdtf, channels=self._held
+        )
+
     def _effects_rate(self, dtf_ahead: float, tdtf_ahead: float, shares: tuple[float, ...]) -> float:
-        """Growth of the effects over the next sample: step them on the signals ahead, then take that back."""
-        signals = self._signals
-        signals.y_dtf_um, signals.y_tdtf_um = dtf_ahead, tdtf_ahead
+        """Return the growth of the effects over the next sample, from the signals ahead, µm/min."""
+        signals = self._signals(dtf_ahead, tdtf_ahead)
         growth = 0.0
         for effect, share in zip(self._effects, shares, strict=True):
-            state = effect.snapshot()
-            growth += effect.step(signals) - share
-            effect.restore(state)
+            growth += effect.peek(signals) - share
         return growth / self._period_min
 
-    def _keep(self, inputs: Inputs) -> None:
-        """Keep an incomplete sample, as long as a walk over the gap is still wanted."""
+    def _remember(self, inputs: Inputs) -> None:
+        """Keep an incomplete sample, as long as the gap can still be bridged."""
         if self._gap is None and self._last_complete is not None:
             self._gap = Gap(state=self.snapshot(), before=self._last_complete, limit=self.bridge_samples)
         if self._gap is not None:
@@ -433,8 +429,8 @@ class Engine:
             if len(self._gap.samples) > self._gap.limit:
                 self._gap = self._last_complete = None
 
-    def _walk_over(self, gap: Gap, after: Inputs) -> None:
-        """Go back to the last complete sample and step over the gap with interpolated inputs."""
+    def _repeat(self, gap: Gap, after: Inputs) -> None:
+        """Return to the last complete sample and repeat the gap with interpolated inputs."""
         reference = self._reference
         self.restore(gap.state)
         self._reference = reference
@@ -467,10 +463,9 @@ def _interpolated(value: float, before: float, after: float, part: float) -> tup
     return before + part * (after - before), True
 
 
-def _make_effect(model: ThermalModel, index: int) -> Effect:
+def _make_effect(model: ThermalModel, index: int) -> EffectStream:
     entry = model.effects[index]
-    maker = kinds().get(entry.kind)
-    if maker is None:
-        known = ", ".join(sorted(kinds())) or "none yet"
+    if entry.kind not in kinds():
+        known = ", ".join(sorted(kinds()))
         raise ModelError(f"model {model.name}: effect {index + 1} has kind {entry.kind!r}, expected one of: {known}")
-    return maker.from_table(entry.table, model.period_s)
+    return EffectStream(effect_from(entry.kind, entry.table), model.period_s / 60.0)

@@ -1,4 +1,4 @@
-"""Writes a model file that an engineer can read: the numbers exactly, and beside them what they mean."""
+"""Writes a model file that an engineer can read: exact numbers, and comments on what they mean."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
 def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
-    """Write a model file, whole or not at all.
+    """Write a model file atomically.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
     Raises
     ------
     ModelError
-        If the model holds something that a file cannot; what stood there before stays.
+        If the model holds something that a file cannot; an existing file stays as it is.
 
     Examples
     --------
@@ -49,7 +49,7 @@ def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
     64
     """
     text = dump_model(model)
-    # Before the old file goes: the reader knows bounds that the model does not.
+    # Before the old file is replaced: the reader knows bounds that the model does not.
     parse_model(text.encode("utf-8"), source=str(path))
     with whole_file(path) as file:
         file.write(text)
@@ -84,7 +84,7 @@ def dump_model(model: ThermalModel) -> str:
 
 
 def _lines(model: ThermalModel) -> Iterator[str]:
-    drive = "heat, W" if model.kind == "heat" else "T_Q - AT, K (nobody measured the heat, so there is no TTF)"
+    drive = "heat, W" if model.kind == "heat" else "T_Q - AT, K (the heat was not measured, so there is no TTF)"
     yield _comment(f"Thermal model {model.name}. The DTF is driven by {drive}; the deformation is in um.")
     yield "# Functions of s: ascending powers, time in minutes. b and a: powers of 1/z at the sample period."
     yield "schema = 1"
@@ -192,7 +192,7 @@ def _estimator(kind: str, estimator: Estimator) -> Iterator[str]:
 
 def _effect(where: str, effect: EffectTable) -> Iterator[str]:
     if "kind" in effect.table:
-        raise ModelError(f"{where}: kind = {effect.table['kind']!r} stands beside the kind {effect.kind!r}")
+        raise ModelError(f"{where}: kind = {effect.table['kind']!r} in the table of an effect of kind {effect.kind!r}")
     yield from ("", "# Added to the base.", "[[effect]]", *_pairs(where, {"kind": effect.kind, **effect.table}))
 
 

@@ -1,22 +1,22 @@
 """Heat, path states and their uncertainty from T_Q and AT, one sample at a time.
 
-The three paths stand in one state vector, each in observer canonical form, with the drive *q* (heat, W, or
-T_Q − AT, K, in a direct model) and the ambient change *a* as random walks beside them:
+The three paths form one state vector, each in observer canonical form, together with the drive *q* (heat, W, or
+T_Q − AT, K, in a direct model) and the ambient change *a* as random walks:
 
     x[k+1] = F x[k] + w,   w_q ~ N(0, drive_walk²),  w_a ~ N(0, at_walk²)
     AT     = a + v_a
     T_Q    = C₁ x₁ + D₁ q + a + v_q
     y      = C₂ x₂ + D₂ q + C₃ x₃ + D₃ a
 
-Both ways to get the heat are observers of this one system and differ in their gains only:
+Both ways to estimate the heat are observers of this system; only their gains differ:
 
 - `inverse`: a = AT and q = (T_Q − AT − C₁ x₁) / D₁, which is the paper's TTF⁻¹ to the letter;
 - `kalman`: the optimal gains for white sensor noise.
 
-A missing measurement leaves out its update: the drive stays where it was, the state moves on, and the
+A missing measurement skips its update: the drive stays where it was, the state moves on, and the
 covariance *P* grows. Arithmetic is scalar float or element-wise, never a matrix product of a BLAS, whose
 order of summation depends on the processor: the same inputs give the same bits on every machine, which is
-what lets an audit compare bit by bit. Once *P* has settled its recursion is left out until a sample is
+what lets an audit compare bit by bit. Once *P* has settled, its recursion is skipped until a sample is
 missing.
 
 Source: Simon, Optimal State Estimation (2006), chapters 5 and 7 (sequential update, general gain).
@@ -53,7 +53,7 @@ class ObserverState:
     settled : bool
         Whether the covariance has reached its steady value.
     started : bool
-        Whether it has taken a sample since it was at rest.
+        Whether there was a sample since it was at rest.
     """
 
     x: tuple[float, ...]
@@ -75,7 +75,7 @@ class Observer:
     Parameters
     ----------
     model : ThermalModel
-        Paths, noise levels and the method of getting the heat.
+        Paths, noise levels and the method of estimating the heat.
     """
 
     def __init__(self, model: ThermalModel) -> None:
@@ -128,7 +128,7 @@ class Observer:
     # ------------------------------------------------------------------ one sample
 
     def step(self, t_q_k: float, at_k: float, *, extra_t_q_k2: float = 0.0, extra_at_k2: float = 0.0) -> None:
-        """Move on by one sample and take its measurements in.
+        """Advance by one sample and its measurements.
 
         Parameters
         ----------
@@ -276,11 +276,6 @@ class Observer:
         return math.sqrt(max(float(self._P[self._q, self._q]), 0.0))
 
     @property
-    def difference_k(self) -> float:
-        """Estimated T_Q − AT, as a change from the reference, K."""
-        return self._expected_t_q() - self._x[self._a]
-
-    @property
     def y_variance_um2(self) -> float:
         """Variance of y that sensor noise and missing samples cause, µm²."""
         return self._y_var
@@ -305,16 +300,16 @@ class Observer:
         return self._moved_covariance(self._P) if self._started else self._P
 
     def widen(self, ahead: Matrix) -> None:
-        """Take over what is not known after a gap whose inputs were interpolated.
+        """Set the covariance after a gap whose inputs were interpolated.
 
-        The errors of an interpolated drive hang together over the whole gap, so they do not average out, as the walk
-        over it counts them. A random walk that is seen again at the end of a gap has the straight line as its mean and
-        the covariance of the optimal filter, which left the gap out: that one stands, whatever the method.
+        The errors of an interpolated drive are correlated over the whole gap and do not average out, as the repeated
+        steps assume. A random walk that is measured again at the end of a gap has the straight line as its mean and the
+        covariance of the optimal filter, which skipped the gap: that one is used, whatever the method, if it is larger.
 
         Parameters
         ----------
         ahead : numpy.ndarray, shape (n, n)
-            Covariance before the measurements of the present sample, of an observer that walked over nothing.
+            Covariance before the measurements of the present sample, of an observer that skipped the gap.
         """
         column = ahead[:, self._a]
         gain = column / (float(column[self._a]) + self._r_at)

@@ -3,8 +3,8 @@
     heat = TTF⁻¹ · (T_Q − AT)
     y    = DTF · heat + TDTF · ΔAT + Σ effects
 
-Where nobody ever measured the heat there is no TTF: the DTF then leads from T_Q − AT straight to the
-deformation, in µm/K (`kind = "direct"`), and everything else stays as it is.
+Where the heat was never measured there is no TTF: the DTF then leads from T_Q − AT straight to the deformation, in
+µm/K (`kind = "direct"`), and everything else is the same.
 
 Source: Mares and Barta, Mechatronic approach in modeling, identification and control of thermal
 deformation of quill, equations (1) to (5).
@@ -39,7 +39,7 @@ RINGING_LIMIT = -0.8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Path:
-    """One path of the model: a transfer function as it stands in the model file.
+    """One path of the model: a transfer function as the model file gives it.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Path:
     continuous : TransferFunction, optional
         The function in s, where the file gives that form.
     covariance : tuple of tuple of float, optional
-        Covariance of the sampled coefficients `b_0 … b_n, a_1 … a_n`, where an identification left it.
+        Covariance of the sampled coefficients `b_0 … b_n, a_1 … a_n`, where an identification gives it.
     """
 
     sampled: SampledTransferFunction
@@ -70,7 +70,7 @@ class Path:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimator:
-    """How the heat is got from the temperatures.
+    """How the heat is estimated from the temperatures.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Estimator:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffectTable:
-    """One `[[effect]]` of the model file, not yet given to its kind.
+    """One `[[effect]]` of the model file, not yet read by its kind.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class ThermalModel:
     dtf : Path
         Heat (or T_Q − AT) to deformation.
     estimator : Estimator
-        How the heat is got.
+        How the heat is estimated.
     inputs : {"changes", "absolute"}
         Whether the temperatures count from their reference or as they are.
     validity : mapping of str to (float, float)
@@ -189,11 +189,6 @@ class ThermalModel:
         replaced, path = self.alternatives[name]
         changes: dict[str, Any] = {replaced.lower(): path}
         return dataclasses.replace(self, **changes)
-
-    @property
-    def drive_unit(self) -> str:
-        """Unit of what drives the DTF: `W` or `K`."""
-        return "W" if self.kind == "heat" else "K"
 
 
 def check_runnable(model: ThermalModel) -> None:

@@ -49,14 +49,15 @@ def _power(p: Sequence[float], exponent: int) -> list[float]:
     return result
 
 
-def _bilinear(coefficients: Sequence[float], order: int, rate: float) -> list[float]:
-    """Map an ascending polynomial in s to one in z⁻¹, times (1 + z⁻¹)^order."""
+def _substituted(
+    coefficients: Sequence[float], order: int, top: Sequence[float], bottom: Sequence[float]
+) -> list[float]:
+    """Put top/bottom for the variable of an ascending polynomial, times bottom^order."""
     result = [0.0] * (order + 1)
     for power, coefficient in enumerate(coefficients):
-        term = _product(_power([1.0, -1.0], power), _power([1.0, 1.0], order - power))
-        scale = coefficient * rate**power
+        term = _product(_power(top, power), _power(bottom, order - power))
         for i, t in enumerate(term):
-            result[i] += scale * t
+            result[i] += coefficient * t
     return result
 
 
@@ -238,8 +239,10 @@ class TransferFunction:
             If a pole sits at the rule's singular point s = 2/T.
         """
         rate = 2.0 / (period_s / 60.0)
-        b = _bilinear(self.numerator, self.order, rate)
-        a = _bilinear(self.denominator, self.order, rate)
+        b, a = (
+            _substituted([c * rate**k for k, c in enumerate(polynomial)], self.order, [1.0, -1.0], [1.0, 1.0])
+            for polynomial in (self.numerator, self.denominator)
+        )
         if a[0] == 0.0:
             raise ModelError(f"a pole at s = {rate:g}/min cannot be sampled at {period_s:g} s")
         return SampledTransferFunction(
@@ -270,17 +273,9 @@ def continuous_image(sampled: SampledTransferFunction, *, unit: str) -> Transfer
         If a pole sits at z = −1, which has no image.
     """
     half = sampled.period_s / 60.0 / 2.0
-    n = sampled.order
-
-    def image(coefficients: Sequence[float]) -> list[float]:
-        result = [0.0] * (n + 1)
-        for power, coefficient in enumerate(coefficients):
-            term = _product(_power([1.0, -half], power), _power([1.0, half], n - power))
-            for i, t in enumerate(term):
-                result[i] += coefficient * t
-        return result
-
-    numerator, denominator = image(sampled.b), image(sampled.a)
+    numerator, denominator = (
+        _substituted(polynomial, sampled.order, [1.0, -half], [1.0, half]) for polynomial in (sampled.b, sampled.a)
+    )
     lead = denominator[-1]
     if abs(lead) < 1e-14 * max(abs(c) for c in denominator):
         raise ModelError("a pole at z = -1 has no continuous image")

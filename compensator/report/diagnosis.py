@@ -114,7 +114,7 @@ def _errors(diagnosis: Diagnosis) -> Table:
 
 
 def _effect(t: Vector, effect: Effect) -> Section:
-    parameters = [[in_words(key), with_std(value, effect.std[key])] for key, value in effect.part.named.items()]
+    parameters = [[in_words(key), with_std(value, effect.std[key])] for key, value in effect.named.items()]
     rows = parameters[:SHOWN]
     rows.append(["residual of the fit without it, µm rms", f"{effect.rms_before_um:.2f}"])
     rows.append(["residual of the fit with it, µm rms", f"{effect.rms_after_um:.2f}"])
@@ -125,7 +125,7 @@ def _effect(t: Vector, effect: Effect) -> Section:
             title=f"What it adds: {name(effect)}",
             x_label="time, h",
             y_label="Y, µm",
-            lines=(Line("effect", t, effect.wave),),
+            lines=(Line("effect", t, effect.signal),),
             height=2.6,
         ),
         Table(head=["parameter", "value ± standard error"], rows=rows),
@@ -137,11 +137,7 @@ def _effect(t: Vector, effect: Effect) -> Section:
         blocks.append(
             Words(
                 title="Nearly as good",
-                lines=[
-                    f"{' '.join(w for w in r.part.hypothesis.place if w)}: leaves {r.rms_after_um:.2f} µm rms. "
-                    f"{r.how_to_tell_apart}"
-                    for r in effect.rivals
-                ],
+                lines=[f"{r.label}: leaves {r.rms_after_um:.2f} µm rms. {r.how_to_tell_apart}" for r in effect.rivals],
             )
         )
     return Section(title=name(effect), blocks=blocks)

@@ -14,6 +14,7 @@ import msgspec
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
 from compensator.messages import SCHEMA, Offset, Sample, State, number
+from compensator.model.effects import effect_from
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.guards import HEATED_W, SensorGuards
@@ -470,8 +471,7 @@ def slowest_min(model: ThermalModel) -> float:
     paths = [path for path in (model.ttf, model.dtf, model.tdtf) if path is not None]
     times = [tau for path in paths for tau in path.sampled.time_constants_min() if math.isfinite(tau)]
     for effect in model.effects:
-        tau = effect.table.get("tau_min", [])
-        times += tau if isinstance(tau, list) else [tau]
+        times += effect_from(effect.kind, effect.table).time_constants_min
     return max(times, default=model.period_s / 60.0)
 
 

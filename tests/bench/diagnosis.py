@@ -31,14 +31,10 @@ def one(kinds, seed):
     scenarios = [draw(kind, seed) for kind in kinds]
     columns, _, _ = record(scenarios, 1000 + seed, hours, **noise)
     began = time.perf_counter()
-    joint = Search(evidence_of(QUILL, runs_from(columns))).run().joint
+    terms = Search(evidence_of(QUILL, runs_from(columns))).run().fit.terms
     seconds = time.perf_counter() - began
-    named = sorted(p.hypothesis.place for p in joint.parts) == sorted(s.place for s in scenarios if s.place)
-    tables = tuple(
-        EffectTable(kind=p.hypothesis.kind, table=p.hypothesis.table(p.values, p.amplitudes))
-        for p in joint.parts
-        if p.hypothesis.deployable
-    )
+    named = sorted(t.hypothesis.place for t in terms) == sorted(s.place for s in scenarios if s.place)
+    tables = tuple(EffectTable(kind=t.effect.kind, table=t.effect.to_table()) for t in terms if t.effect.deployable)
     # What passes with time alone is no error that a model could remove on another day.
     lasting = [s for s in scenarios if s.place and s.place[0] not in ("drift", "step", "periodic", "unobserved")]
     fresh, true, effect = record(lasting, 5000 + seed, 24.0, **noise)

@@ -44,17 +44,17 @@ def one(model, own_um, seed, size_um):
     effects = [draw_effect(seed, size_um, HOURS)] if size_um else []
     evidence = evidence_of(model, runs(Duty.working_day(200 + seed, hours=HOURS), 300 + seed, effects))
     began = time.perf_counter()
-    parts = Search(evidence).run().joint.parts
+    terms = Search(evidence).run().fit.terms
     seconds = time.perf_counter() - began
-    named = [part.hypothesis.place for part in parts if not part.companion]
+    named = [term.hypothesis.place for term in terms if not term.companion]
     if not effects:
         return None, named, np.nan, seconds
     truth = effects[0].reveal().describe()
     place = tuple(str(truth.get(key) or "") for key in ("kind", "path", "channel"))
-    deployed = [p for p in parts if p.hypothesis.deployable]
-    if all(part.companion for part in deployed):
+    deployed = [term for term in terms if term.effect.deployable]
+    if all(term.companion for term in deployed):
         deployed = []
-    tables = [EffectTable(kind=p.hypothesis.kind, table=p.hypothesis.table(p.values, p.amplitudes)) for p in deployed]
+    tables = [EffectTable(kind=term.effect.kind, table=term.effect.to_table()) for term in deployed]
     fresh = runs(Duty.working_day(700 + seed, hours=24.0), 800 + seed, effects)[0]
 
     def error(candidate):

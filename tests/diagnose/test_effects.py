@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.joint import Part, response
+from compensator.diagnose.fit import Term, response
 from compensator.errors import ModelError
 from compensator.model.effects import kinds
 from compensator.model.effects.hypothesis import proposals
@@ -34,8 +34,14 @@ def evidence(day):
 
 def forms(evidence):
     wanted = ("coolant_degc", "fan_rpm", "")
-    rough = dataclasses.replace(evidence.setting, rough=True)
-    return [h for h in proposals(rough) if h.deployable and h.channel in wanted]
+    context = dataclasses.replace(evidence.context, approximate=True)
+    every = [*proposals(context), *proposals(context, background=True)]
+    return [h for h in every if h.effect.deployable and h.effect.channel in wanted]
+
+
+def table_of(hypothesis, values, amplitudes):
+    effect = hypothesis.with_values(values, amplitudes)
+    return EffectTable(kind=effect.kind, table=effect.to_table())
 
 
 def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
@@ -44,17 +50,17 @@ def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
     for hypothesis in forms(evidence):
         values = tuple(free.grid[len(free.grid) // 2] for free in hypothesis.free)
         amplitudes = tuple(0.3 + 0.1 * i for i in range(len(hypothesis.amplitudes)))
-        part = Part(hypothesis=hypothesis, values=values, amplitudes=amplitudes)
-        table = EffectTable(kind=hypothesis.kind, table=hypothesis.table(values, amplitudes))
+        term = Term(hypothesis=hypothesis, values=values, amplitudes=amplitudes)
+        table = table_of(hypothesis, values, amplitudes)
         model = dataclasses.replace(INVERSE, effects=(table,))
-        model = parse_model(dump_model(model).encode(), source=hypothesis.kind)
+        model = parse_model(dump_model(model).encode(), source=table.kind)
         engine = Engine(model)
         engine.set_reference(*run.reference)
         streamed = [e.y_effects_um[0] for e in engine.run(run.t_q_degc, run.at_degc, run.channels)]
-        whole = response(evidence, part)
+        whole = response(evidence, term)
         scale = max(1.0, float(np.max(np.abs(whole))))
         assert streamed == pytest.approx(whole, abs=2e-6 * scale), (hypothesis.place, hypothesis.form)
-        seen.add(hypothesis.kind)
+        seen.add(table.kind)
     assert seen == set(kinds())
 
 
@@ -62,8 +68,8 @@ def test_a_restart_in_between_changes_no_bit(day, evidence):
     run = day[0]
     for hypothesis in forms(evidence):
         values = tuple(free.grid[0] for free in hypothesis.free)
-        table = hypothesis.table(values, (0.5,) * len(hypothesis.amplitudes))
-        model = dataclasses.replace(QUILL, effects=(EffectTable(kind=hypothesis.kind, table=table),))
+        table = table_of(hypothesis, values, (0.5,) * len(hypothesis.amplitudes))
+        model = dataclasses.replace(QUILL, effects=(table,))
         engine, second = Engine(model), Engine(model)
         engine.set_reference(*run.reference)
         channels = [{n: float(v[k]) for n, v in run.channels.items()} for k in range(200)]

@@ -42,7 +42,7 @@ def test_what_holds_on_another_day_holds_on_the_blocks_that_were_held_out(first)
     effect = draw_effect(27, 8.0, 24.0)
     assert effect.reveal().describe()["kind"] == "hysteresis"
     found = diagnose(model, machines.runs(Duty.working_day(104, hours=24.0), 104, [effect]))
-    assert [e.part.hypothesis.kind for e in found.effects] == ["hysteresis"]
+    assert [e.place[0] for e in found.effects] == ["hysteresis"]
     assert found.after.rms_um < 0.4 * found.before.rms_um
 
 

@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from compensator.model.effects import base, hypothesis, kinds
+from compensator.model.effects import base, kinds
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
@@ -25,8 +25,7 @@ BLOCKS = dict(re.findall(r"```python\n# ([\w/]+\.py)\n(.*?)```", PAGE.read_text(
 def stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """Add the page's file, and take everything back afterwards."""
     kinds()
-    monkeypatch.setattr(base, "_KINDS", dict(base._KINDS))
-    monkeypatch.setattr(hypothesis, "_PROPOSERS", list(hypothesis._PROPOSERS))
+    monkeypatch.setattr(base, "_FORMS", list(base._FORMS))
     imported("compensator.model.effects.stop", "compensator/model/effects/stop.py", monkeypatch)
 
 
@@ -39,7 +38,7 @@ def imported(name: str, path: str, monkeypatch: pytest.MonkeyPatch) -> ModuleTyp
 
 @pytest.mark.usefixtures("stop")
 def test_the_pages_test_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    imported("test_stop", "tests/diagnose/test_stop.py", monkeypatch).test_a_stop_is_found_and_told()
+    imported("test_stop", "tests/diagnose/test_stop.py", monkeypatch).test_a_stop_is_found_and_explained()
 
 
 @pytest.mark.usefixtures("stop")

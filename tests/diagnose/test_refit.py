@@ -1,4 +1,4 @@
-"""A base model that was calibrated while something acted: its paths are fitted anew beside what it lacks."""
+"""A base model that was calibrated while something acted: its paths are refitted together with what it lacks."""
 
 import dataclasses
 import json
@@ -61,11 +61,11 @@ def found(runs):
 
 
 def test_the_channel_and_its_curve_are_named(found):
-    assert [e.part.hypothesis.place for e in found.effects] == [("input", "", "spindle_rpm")]
+    assert [e.place for e in found.effects] == [("input", "", "spindle_rpm")]
     effect = found.effects[0]
-    assert effect.part.hypothesis.curve == "square"
+    assert effect.term.hypothesis.effect.curve == "square"
     assert effect.deployable
-    gain, half_time = effect.part.named["gain_um_per_rpm2"], effect.part.named["half_time_min"]
+    gain, half_time = effect.named["gain_um_per_rpm2"], effect.named["half_time_min"]
     assert gain == pytest.approx(-2.4e-6, rel=0.25)
     assert half_time == pytest.approx(70.0 * np.log(2.0), rel=0.35)
     assert 0.0 < effect.std["gain_um_per_rpm2"] < 0.2 * abs(gain)
@@ -84,13 +84,13 @@ def test_blocks_that_took_no_part_and_a_run_of_other_speeds_come_out_right(found
 
 def test_the_extended_model_says_what_error_it_has_left(found):
     assert found.model.y_std_um == found.model.held_out_rms_um < 1.5
-    assert any("fitted anew" in words for words in found.warnings)
+    assert any("were refitted" in str(words) for words in found.warnings)
 
 
 def test_a_model_that_does_not_say_how_good_it_is_comes_to_the_same(found, runs):
     silent = dataclasses.replace(calibrated(runs), provenance={})
     again = diagnose(silent, runs)
-    assert [e.part.hypothesis for e in again.effects] == [e.part.hypothesis for e in found.effects]
+    assert [e.term.hypothesis for e in again.effects] == [e.term.hypothesis for e in found.effects]
 
 
 def test_what_is_not_logged_is_not_made_up(runs):
@@ -101,17 +101,17 @@ def test_what_is_not_logged_is_not_made_up(runs):
     if not result.effects or result.after.rms_um > result.before.rms_um:
         assert result.model.effects == ()
     # Another probe moves with Y whatever the cause, and is no cause.
-    assert all(e.part.hypothesis.channel != "second_um" for e in result.effects)
+    assert all(e.place[2] != "second_um" for e in result.effects)
 
 
 def test_the_paths_are_what_the_fit_says(runs):
-    """The rows of lags, written as transfer functions, give the same deformation."""
+    """The filter banks, written as transfer functions, give the same deformation."""
     evidence = evidence_of(calibrated(runs), runs)
     whole = refit(evidence)
-    wave = evidence.waves[0]
-    y = whole.dtf.response(wave.drive - wave.drive[0]) + whole.tdtf.response(wave.ambient_k - wave.ambient_k[0])
-    for part in whole.parts:
-        y = y + part.hypothesis.columns(wave, ()) @ np.array(part.amplitudes)
+    record = evidence.signals[0]
+    y = whole.dtf.response(record.drive - record.drive[0]) + whole.tdtf.response(record.ambient_k - record.ambient_k[0])
+    for term in whole.terms:
+        y = y + term.hypothesis.columns(record, ()) @ np.array(term.amplitudes)
     zero = whole.predicted - y
     assert zero == pytest.approx(np.full(zero.size, zero[0]), abs=1e-6)
 
@@ -119,7 +119,7 @@ def test_the_paths_are_what_the_fit_says(runs):
 def test_held_out_samples_do_not_take_part(runs):
     evidence = evidence_of(calibrated(runs), runs)
     block = next(evidence.blocks(3))
-    seen = evidence.hidden(block)
+    seen = evidence.without(block)
     before = refit(seen)
     disturbed = runs_from(
         {
@@ -129,7 +129,7 @@ def test_held_out_samples_do_not_take_part(runs):
             **runs[0].channels,
         }
     )
-    again = refit(evidence_of(calibrated(runs), disturbed).hidden(block))
+    again = refit(evidence_of(calibrated(runs), disturbed).without(block))
     assert again.rms_um == pytest.approx(before.rms_um, rel=1e-6)
     assert not seen.deformation_um[block].any()
 
@@ -149,6 +149,6 @@ def test_the_other_probes_do_not_become_inputs():
     roles = {"t_q_degc": "t5_degc", "at_degc": "t16_degc", "y_um": "ch3_um"}
     runs = read_runs([FILE], roles, [], period_s=60.0)
     evidence = evidence_of(calibrated(runs), runs)
-    assert "spindle_rpm" in evidence.setting.channels
-    assert not [name for name in evidence.setting.channels if name.startswith("ch")]
-    assert json.dumps(sorted(evidence.setting.zeroed)) == '["spindle_rpm"]'
+    assert "spindle_rpm" in evidence.context.channels
+    assert not [name for name in evidence.context.channels if name.startswith("ch")]
+    assert json.dumps(sorted(evidence.context.zeroed)) == '["spindle_rpm"]'

@@ -1,4 +1,4 @@
-"""Nobody tells the search which effect there is; it names kind and place, and what it adds holds on another day."""
+"""The search names kind and place of an effect that it is not given, and what it adds holds on another day."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.joint import fit_joint, standard_errors
+from compensator.diagnose.fit import fit_terms, standard_errors
 from compensator.diagnose.search import Search
 from compensator.diagnose.summary import verdict
 from compensator.identify.calibration import predict
@@ -23,7 +23,7 @@ QUILL = load_model("quill")
 def named(scenarios, seed, hours=36.0, **noise):
     columns, _, _ = record(scenarios, seed, hours, **noise)
     found = Search(evidence_of(QUILL, runs_from(columns))).run()
-    return sorted(part.hypothesis.place for part in found.joint.parts)
+    return sorted(term.hypothesis.place for term in found.fit.terms)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -67,7 +67,7 @@ def test_what_cannot_be_deployed_is_explained_and_left_out(kind):
     scenario = draw(kind, 8)
     columns, _, _ = record([scenario], 1008, 24.0)
     diagnosis = diagnose(QUILL, runs_from(columns))
-    assert [e.part.hypothesis.place for e in diagnosis.effects] == [scenario.place]
+    assert [e.place for e in diagnosis.effects] == [scenario.place]
     assert not diagnosis.effects[0].deployable
     assert diagnosis.model.effects == ()
     assert len(diagnosis.effects[0].explanation.split()) > 12
@@ -85,7 +85,7 @@ def test_rough_data_hides_nothing_and_invents_nothing():
         columns[name][rng.integers(100, n, 6)] = np.nan
     columns["y_um"][rng.integers(100, n, 4)] += 40.0
     found = Search(evidence_of(QUILL, runs_from(columns))).run()
-    assert [part.hypothesis.place for part in found.joint.parts] == [("gain", "DTF", "")]
+    assert [term.hypothesis.place for term in found.fit.terms] == [("gain", "DTF", "")]
 
 
 def test_physics_of_another_hand():
@@ -94,8 +94,8 @@ def test_physics_of_another_hand():
     columns = World(PublishedQuill(effects=[StickSlip(play_um=6.0)]), duty, sensors, 5).record(60.0)
     columns.pop("t_s")
     diagnosis = diagnose(QUILL, runs_from(columns))
-    assert [e.part.hypothesis.place for e in diagnosis.effects] == [("hysteresis", "DTF", "")]
-    assert diagnosis.effects[0].part.named["half_width_um"] == pytest.approx(3.0, rel=0.1)
+    assert [e.place for e in diagnosis.effects] == [("hysteresis", "DTF", "")]
+    assert diagnosis.effects[0].named["half_width_um"] == pytest.approx(3.0, rel=0.1)
 
 
 def test_standard_errors_are_what_scatters():
@@ -106,10 +106,10 @@ def test_standard_errors_are_what_scatters():
         rng = np.random.default_rng(noise)
         columns["y_um"] = columns["y_um"] + rng.normal(0.0, 1.0, columns["y_um"].size)
         evidence = evidence_of(QUILL, runs_from(columns))
-        hypothesis = next(h for h in proposals(evidence.setting) if h.place == ("gain", "DTF", ""))
-        joint = fit_joint(evidence, [(hypothesis, ())])
-        values.append(joint.parts[0].amplitudes[0])
-        stds.append(standard_errors(evidence, joint, evidence.colour(joint.residual))[0]["change"])
+        hypothesis = next(h for h in proposals(evidence.context) if h.place == ("gain", "DTF", ""))
+        fit = fit_terms(evidence, [(hypothesis, ())])
+        values.append(fit.terms[0].amplitudes[0])
+        stds.append(standard_errors(evidence, fit, evidence.variance_inflation(fit.residual))[0]["change"])
     assert 0.5 * np.std(values) < np.mean(stds) < 2.0 * np.std(values)
 
 
@@ -129,4 +129,4 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     bad = diagnose(QUILL, runs_from(columns))
     assert bad.verdict == "partly_explained" and not bad.model.effects
     assert "made_worse" in [warning.code for warning in bad.warnings]
-    assert "does not hold on data that was not seen" in verdict(bad) and "is found" not in verdict(bad)
+    assert "does not hold on held-out data" in verdict(bad) and "is found" not in verdict(bad)

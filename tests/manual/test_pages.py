@@ -16,8 +16,7 @@ import pytest
 from compensator.cli import _parser
 from compensator.config import Config
 from compensator.identify.settings import Settings
-from compensator.model.effects import kinds
-from compensator.model.effects.hypothesis import Hypothesis
+from compensator.model.effects.base import Effect, forms
 from compensator.model.effects.passing import Drift
 from compensator.model.effects.unobserved import Unobserved
 from compensator.model.model_file import load_model
@@ -27,7 +26,7 @@ MODEL, IDENTIFY, DIAGNOSE = (TOP / f"compensator/{room}/MATHEMATICS.md" for room
 EFFECTS = TOP / "compensator/model/effects"
 #: `module.NAME` = value, as the pages on the mathematics quote what the code has.
 QUOTED = re.compile(r"`(\w+)\.(\w+)` = (-?[\d.]+(?:e-?\d+)?)")
-CLASSES = {"Settings": Settings(), "Drift": Drift, "Hypothesis": Hypothesis, "Unobserved": Unobserved}
+CLASSES = {"Settings": Settings(), "Drift": Drift, "Effect": Effect, "Unobserved": Unobserved}
 
 
 def constant(room: str, holder: str, name: str) -> Any:
@@ -57,14 +56,8 @@ def test_examples_on_the_page_run() -> None:
 
 def test_every_kind_of_effect_has_its_section_and_no_other_has() -> None:
     headings = re.findall(r"^### `(\w+)`$", MODEL.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    of_package = [c for c in descendants(Hypothesis) if (EFFECTS / f"{c.__module__.rpartition('.')[2]}.py").exists()]
-    every = {c.kind for c in of_package} | set(kinds())
-    assert sorted(headings) == sorted(every)
-
-
-def descendants(cls: type[Hypothesis]) -> set[type[Hypothesis]]:
-    kinds()  # imports every module of the package
-    return set(cls.__subclasses__()).union(*(descendants(sub) for sub in cls.__subclasses__()))
+    of_package = [f for f in forms() if (EFFECTS / f"{f.__module__.rpartition('.')[2]}.py").exists()]
+    assert sorted(headings) == sorted({form.kind for form in of_package})
 
 
 def test_the_table_of_the_published_model_is_the_models() -> None:

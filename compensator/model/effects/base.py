@@ -1,98 +1,275 @@
-"""What every effect shares: the signals it may use, its streaming step, its registration.
+"""What every kind of effect shares: parameters, law, place in the model file, registration.
 
-An effect adds to the predicted deformation. It sees the signals of the base model at the same sample and
-keeps a state of its own. A wrong gain of the DTF adds `g · y_dtf`, a late path adds `y(t − d) − y(t)`, an
-unused channel adds its own transfer function of that channel: every kind of the contract's table can be
-written as an addition, because the base is linear in its drive.
+An effect adds to the predicted deformation. A wrong gain of the DTF adds `g · y_dtf`, a delayed path adds
+`y(t − d) − y(t)`, an unused channel adds its own response: every kind can be written as an addition, because the base
+is linear in its drive.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import math
 import pkgutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
 
-from compensator.errors import ModelError
+import numpy as np
+
+from compensator.arrays import Matrix
+from compensator.model.effects.blocks import NAN, Block, FilterBank, Signal
+from compensator.model.effects.signals import RecordSignals, Signals
+from compensator.model.table import Table
+
+if TYPE_CHECKING:
+    from compensator.model.effects.hypothesis import Context, Hypothesis
+
+#: `step` or `filter` of a block.
+Run = Callable[..., Signal]
+#: Keys that every effect may have in the model file.
+_COMMON = ("form", "std", "explanation")
 
 
-@dataclass(slots=True)
-class Signals:
-    """Signals of one sample that an effect may use.
+def number(low: float = -math.inf, high: float = math.inf) -> Any:
+    """Return a parameter that the model file holds: a number between two bounds."""
+    return dataclasses.field(metadata={"read": lambda table, key: table.number(key, low, high)})
+
+
+def numbers(low: float = -math.inf, high: float = math.inf) -> Any:
+    """Return a parameter that the model file holds: a list of numbers between two bounds."""
+    return dataclasses.field(metadata={"read": lambda table, key: table.numbers(key, low, high)})
+
+
+def text(*choices: str) -> Any:
+    """Return a parameter that the model file holds: a string, one of the choices where there are any."""
+    return dataclasses.field(metadata=_text(choices))
+
+
+def only(*, default: str) -> Any:
+    """Return a parameter that the model file holds and that has one value in this form of the kind."""
+    return dataclasses.field(default=default, metadata=_text((default,)))
+
+
+def _text(choices: tuple[str, ...]) -> dict[str, Any]:
+    return {"read": lambda table, key: table.text(key, choices), "choices": choices}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effect:
+    """Parameters and law of an effect; each subclass is one form of one kind.
 
     Parameters
     ----------
-    drive : float
-        Estimated heat, W (T_Q − AT, K, in a direct model).
-    difference_k : float
-        T_Q − AT as a change from the reference, K.
-    ambient_k : float
-        AT as a change from the reference, K.
-    y_dtf_um, y_tdtf_um : float
-        Share of each path, µm.
-    channels : dict of str to float
-        Auxiliary channels, in their own units; the last good value where one is missing.
+    path, channel : str
+        Where it acts, if the kind needs it. Further parameters are fields of the subclass, those of the model file made
+        by `number`, `numbers` and `text`.
     """
 
-    drive: float = 0.0
-    difference_k: float = 0.0
-    ambient_k: float = 0.0
-    y_dtf_um: float = 0.0
-    y_tdtf_um: float = 0.0
-    channels: dict[str, float] = field(default_factory=dict)
+    #: Kind in the model file and in `diagnosis.json`.
+    kind: ClassVar[str] = ""
+    #: Fields that y is linear in, solved for instead of searched.
+    linear: ClassVar[tuple[str, ...]] = ()
+    #: Whether it can be computed in real time from what is measured.
+    deployable: ClassVar[bool] = True
+    #: Whether a channel or path shows its cause; if not, nothing is known of it on other data.
+    observed: ClassVar[bool] = True
+    #: Whether it can absorb any change of the paths: it is named only where no other effect explains most of that.
+    background: ClassVar[bool] = False
+    #: Whether it gives its name to a background effect that it explains most of.
+    names_background: ClassVar[bool] = False
+    #: Least share of the residual's sum of squares that it must explain.
+    worth: ClassVar[float] = 0.05
+    #: The same together with another effect where forms are approximate: what depends on time alone fits the rest.
+    worth_beside: ClassVar[float] = 0.05
+    #: Ridge weight on its linear parameters, against columns of norm 1; 0 leaves them free.
+    ridge: ClassVar[float] = 0.0
 
+    path: str = ""
+    channel: str = ""
 
-class Effect(Protocol):
-    """One effect that runs in the engine."""
+    # ------------------------------------------------------------------ law
 
-    @property
-    def kind(self) -> str:
-        """Kind, as in the model file."""
+    def blocks(self, period_min: float) -> tuple[Any, ...]:
+        """Return the blocks of the law, at rest, in the order of the snapshot."""
+        return ()
+
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the addition to y, µm.
+
+        Parameters
+        ----------
+        signals : Signals or RecordSignals
+            Of one sample, or over a whole record.
+        run : sequence of callable
+            `step` or `filter` of each of the blocks.
+        """
+        raise NotImplementedError
+
+    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+        """Return one column for each linear parameter (one in all where there is none), µm."""
+        return np.asarray(self.law(record, filters(blocks)))[:, None]
+
+    # ------------------------------------------------------------------ contract with search, service and reports
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Auxiliary channels that it needs."""
+        """Channels that it needs."""
+        return (self.channel,) if self.channel else ()
+
+    @property
+    def time_constants_min(self) -> tuple[float, ...]:
+        """Time constants, min: how long its state remembers."""
+        tau = getattr(self, "tau_min", ())
+        return tau if isinstance(tau, tuple) else (tau,)
+
+    def effective_parameters(self, count: int) -> int:
+        """Return how many parameters the data spend on it, of `count` that are searched or linear."""
+        return count
+
+    def named(self, given: dict[str, float]) -> dict[str, float]:
+        """Return the parameters that people read, from all that are searched or linear."""
+        return given
+
+    def explain(self, rms_um: float) -> str:
+        """Return one or two sentences for an engineer; `rms_um` is its share of y."""
+        raise NotImplementedError
+
+    @classmethod
+    def propose(cls, context: Context) -> Iterator[Hypothesis]:
+        """Yield the hypotheses that are worth a search on this data."""
+        yield from ()
+
+    # ------------------------------------------------------------------ model file
+
+    def to_table(self) -> dict[str, Any]:
+        """Return its `[[effect]]` table, without the kind."""
+        table = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if "read" in f.metadata}
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
+
+
+class BankEffect:
+    """Law of an effect that ends in a filter bank, its last block; goes before `Effect`."""
+
+    __slots__ = ()
+
+    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+        """Return the inputs of the filter bank."""
+        raise NotImplementedError
+
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the weighted sum of the bank."""
+        return run[-1](*self.inputs(signals, run))
+
+    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+        """Return every input behind every lag."""
+        bank: FilterBank = blocks[-1]
+        return bank.columns(*self.inputs(record, filters(blocks)))
+
+
+def filters(blocks: Sequence[Any]) -> list[Run]:
+    """Return what blocks do with a whole record."""
+    return [block.filter for block in blocks]
+
+
+class EffectStream:
+    """An effect at work, one sample at a time.
+
+    Parameters
+    ----------
+    effect : Effect
+        Parameters and law.
+    period_min : float
+        Sample period, min.
+    """
+
+    def __init__(self, effect: Effect, period_min: float) -> None:
+        self.effect, self.kind, self.channels = effect, effect.kind, effect.channels
+        self._blocks: tuple[Block, ...] = effect.blocks(period_min)
+        self._steps = [block.step for block in self._blocks]
 
     def step(self, signals: Signals) -> float:
-        """Advance by one sample and return the addition to y, µm."""
+        """Advance by one sample and return the addition to y, µm; 0 before its channels were seen."""
+        for channel in self.channels:
+            if math.isnan(signals.channels.get(channel, NAN)):
+                return 0.0
+        return float(self.effect.law(signals, self._steps))
+
+    def peek(self, signals: Signals) -> float:
+        """Return what `step` would, and stay where it is."""
+        states = [block.state for block in self._blocks]
+        y = self.step(signals)
+        for block, state in zip(self._blocks, states, strict=True):
+            block.state = state
+        return y
 
     def snapshot(self) -> tuple[float, ...]:
-        """Return the state."""
+        """Return everything that it must remember to go on with the same bits."""
+        return tuple(value for block in self._blocks for value in block.state)
 
     def restore(self, state: tuple[float, ...]) -> None:
-        """Take a state back."""
+        """Go on from a snapshot."""
+        start = 0
+        for block in self._blocks:
+            end = start + len(block.state)
+            block.state = tuple(state[start:end])
+            start = end
 
 
-class EffectKind(Protocol):
-    """How a kind of effect is made from its table in the model file."""
+# ---------------------------------------------------------------------- registration
 
-    def from_table(self, table: Mapping[str, Any], period_s: float) -> Effect:
-        """Make the effect; raise `ModelError` naming key and value where the table is wrong."""
-
-
-_KINDS: dict[str, EffectKind] = {}
+_E = TypeVar("_E", bound=Effect)
+_FORMS: list[type[Effect]] = []
 _loaded = False
 
 
-def register(kind: str) -> Callable[[EffectKind], EffectKind]:
-    """Register a kind of effect under its name in the model file."""
-
-    def add(maker: EffectKind) -> EffectKind:
-        if kind in _KINDS:
-            raise ModelError(f"effect kind {kind!r} is registered twice")
-        _KINDS[kind] = maker
-        return maker
-
-    return add
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(number, numbers, text, only))
+def register(form: type[_E]) -> type[_E]:
+    """Make a form of a kind of effect a frozen dataclass, and register it (class decorator)."""
+    made = dataclass(frozen=True, slots=True, kw_only=True)(form)
+    _FORMS.append(made)
+    return made
 
 
-def kinds() -> Mapping[str, EffectKind]:
-    """Return every kind, importing the package's modules on the first call."""
+def forms() -> Sequence[type[Effect]]:
+    """Return every form of every kind, importing the modules of the package on the first call."""
     global _loaded  # noqa: PLW0603  the imports below register themselves once
     if not _loaded:
         package = importlib.import_module("compensator.model.effects")
         for module in pkgutil.iter_modules(package.__path__):
             importlib.import_module(f"{package.__name__}.{module.name}")
         _loaded = True
-    return _KINDS
+    return _FORMS
+
+
+def kinds() -> Mapping[str, Sequence[type[Effect]]]:
+    """Return the forms that the engine runs, by kind."""
+    found: dict[str, list[type[Effect]]] = {}
+    for form in forms():
+        if form.deployable:
+            found.setdefault(form.kind, []).append(form)
+    return found
+
+
+def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
+    """Read an effect of one of the `kinds` from its table in the model file.
+
+    Raises
+    ------
+    ModelError
+        Naming key and value where the table is wrong.
+    """
+    candidates = kinds()[kind]
+    known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + list(_COMMON))
+    keys = Table(f"effect {kind}", table, tuple(known))
+    choices = {choice: form for form in candidates for choice in _choices(form)}
+    form = choices[keys.text("form", tuple(choices))] if choices else candidates[0]
+    return form(**{f.name: f.metadata["read"](keys, f.name) for f in _read(form)})
+
+
+def _read(form: type[Effect]) -> list[dataclasses.Field[Any]]:
+    return [f for f in dataclasses.fields(form) if "read" in f.metadata]
+
+
+def _choices(form: type[Effect]) -> tuple[str, ...]:
+    return next((f.metadata["choices"] for f in _read(form) if f.name == "form"), ())

@@ -1,70 +1,28 @@
-"""What a kind of effect can say of a whole record: the other half of each effect's file.
+"""Hypotheses: ways in which the model could lack something, and what proposals may build on.
 
-A hypothesis is one way in which the model could lack something. Its free parameters are searched, its
-amplitudes are linear and solved for:
+The searched parameters θ of an effect have bounds and a grid; its linear parameters are solved for:
 
     residual = fixed(θ) + Σ_j amplitude_j · column_j(θ) + what else there is
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from compensator.arrays import Matrix, Vector
-from compensator.model.effects.base import kinds
-from compensator.model.transfer_function import SampledTransferFunction
+from compensator.arrays import Matrix
+from compensator.model.effects.base import Effect, forms
+from compensator.model.effects.signals import RecordSignals
 
-#: Lags in a row, and the longest of them, min.
-ROW, ROW_LONGEST_MIN = 6, 600.0
-#: Weight that holds the gains of a row together.
-ROW_RIDGE = 1e-3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordSignals:
-    """Signals of the base model over a record, as the effects see them.
-
-    Parameters
-    ----------
-    period_min : float
-        Sample period, min.
-    drive, ambient_k, y_dtf_um, y_tdtf_um : numpy.ndarray, shape (n,)
-        As in `Signals`.
-    channels : mapping of str to numpy.ndarray, shape (n,)
-        Auxiliary channels, gaps bridged.
-    dtf, tdtf : SampledTransferFunction
-        The base model's paths.
-    """
-
-    period_min: float
-    drive: Vector
-    ambient_k: Vector
-    y_dtf_um: Vector
-    y_tdtf_um: Vector
-    channels: Mapping[str, Vector]
-    dtf: SampledTransferFunction
-    tdtf: SampledTransferFunction
-
-    @property
-    def size(self) -> int:
-        """Number of samples."""
-        return int(self.drive.size)
-
-    def share(self, path: str) -> Vector:
-        """Return the share of a path in y, µm; the TTF's is the DTF's, which it drives."""
-        return self.y_tdtf_um if path == "TDTF" else self.y_dtf_um
-
-    def source(self, path: str) -> Vector:
-        """Return what drives a path: heat, W (or T_Q − AT, K), or the ambient's change, K."""
-        return self.ambient_k if path == "TDTF" else self.drive
-
-    def function(self, path: str) -> SampledTransferFunction:
-        """Return a path's transfer function."""
-        return self.tdtf if path == "TDTF" else self.dtf
+#: Lags in a filter bank, and the longest of them, min.
+BANK, BANK_LONGEST_MIN = 6, 600.0
+#: Ridge weight on the gains of a filter bank.
+BANK_RIDGE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +38,9 @@ class Free:
     grid : tuple of float
         Where the search begins.
     log : bool
-        Searched in its logarithm.
+        Whether its logarithm is searched.
+    key : str
+        Field of the effect that it goes to, where that is not its name.
     """
 
     name: str
@@ -88,6 +48,7 @@ class Free:
     high: float
     grid: tuple[float, ...]
     log: bool = True
+    key: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,74 +57,79 @@ class Hypothesis:
 
     Parameters
     ----------
-    kind, path, channel, form : str
-        Kind and place by the contract; `form` tells variants of the same kind and place apart.
+    effect : Effect
+        What acts, its linear parameters 1 and its searched ones still open.
+    form : str
+        Tells variants of the same kind and place apart.
     free : tuple of Free
         Parameters that are searched.
     amplitudes : tuple of str
         Names of the linear parameters, with units.
+    path : str
+        Path that the diagnosis names, where it is not the effect's own.
+    ordered : bool
+        Whether the searched parameters are interchangeable, so that only ascending ones are tried.
     """
 
-    kind: ClassVar[str] = ""
-    deployable: ClassVar[bool] = True
-    #: Least share of the residual's sum of squares that it must take: less is of no use to anybody.
-    worth: ClassVar[float] = 0.05
-    #: The same beside another effect where forms are not exact: what acts at some time only follows what they leave.
-    worth_beside: ClassVar[float] = 0.05
-    #: Weight that holds its amplitudes small, against columns of norm 1; 0 leaves them free.
-    ridge: ClassVar[float] = 0.0
-    path: str = ""
-    channel: str = ""
+    effect: Effect
     form: str = ""
     free: tuple[Free, ...] = ()
     amplitudes: tuple[str, ...] = ()
+    path: str = ""
+    ordered: bool = False
 
     @property
     def place(self) -> tuple[str, str, str]:
         """Kind, path and channel: what the diagnosis names."""
-        return self.kind, self.path, self.channel
+        return self.effect.kind, self.path or self.effect.path, self.effect.channel
+
+    @property
+    def label(self) -> str:
+        """Kind, place and form in words."""
+        return " ".join(filter(None, (*self.place, f"({self.form})" if self.form else "")))
 
     @property
     def parameters(self) -> int:
-        """Number of parameters, searched and linear."""
-        return len(self.free) + len(self.amplitudes)
+        """Number of parameters that the data spend on it."""
+        return self.effect.effective_parameters(len(self.free) + len(self.amplitudes))
 
-    def fixed(self, waves: RecordSignals, values: Sequence[float]) -> Vector | None:
-        """Return the part that has no amplitude, µm; None where there is none."""
-        return None
+    def grid(self) -> list[tuple[float, ...]]:
+        """Return the points where a search begins."""
+        points = itertools.product(*(free.grid for free in self.free))
+        return [p for p in points if not self.ordered or all(a < b for a, b in itertools.pairwise(p))]
 
-    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return one column for each amplitude, shape (n, len(amplitudes))."""
-        return np.zeros((waves.size, 0))
+    def with_values(self, values: Sequence[float], amplitudes: Sequence[float] | None = None) -> Effect:
+        """Return the effect with its searched parameters, and its linear ones where they are given."""
+        changes: dict[str, Any] = {}
+        for free, value in zip(self.free, values, strict=True):
+            changes.setdefault(free.key or free.name, []).append(value)
+        for key, some in changes.items():
+            changes[key] = tuple(some) if isinstance(getattr(self.effect, key), tuple) else some[0]
+        if amplitudes is not None:
+            rest = iter(amplitudes)
+            for key in self.effect.linear:
+                unit = getattr(self.effect, key)
+                changes[key] = tuple(itertools.islice(rest, len(unit))) if isinstance(unit, tuple) else next(rest)
+        return dataclasses.replace(self.effect, **changes)
 
-    def trial(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return columns that a first scan may give any amplitude: the fixed part stands in where there is one."""
-        fixed = self.fixed(waves, values)
-        columns = self.columns(waves, values)
-        return columns if fixed is None else np.column_stack((fixed, columns))
+    def columns(self, record: RecordSignals, values: Sequence[float]) -> Matrix:
+        """Return one column for each amplitude over a record, shape (n, ·), µm; without amplitudes the fixed part."""
+        effect = self.with_values(values)
+        return effect.columns(record, effect.blocks(record.period_min))
 
     def named(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, float]:
         """Return every parameter by the name and unit that people read."""
         names = [*(free.name for free in self.free), *self.amplitudes]
-        return dict(zip(names, (*values, *amplitudes), strict=True))
-
-    def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
-        """Return the `[[effect]]` table that the engine runs."""
-        raise NotImplementedError
-
-    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
-        """Return one or two sentences for an engineer."""
-        raise NotImplementedError
+        given = dict(zip(names, (*values, *amplitudes), strict=True))
+        return self.with_values(values, amplitudes).named(given)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Setting:
-    """What a proposal may build on.
+class Context:
+    """What proposals may build on.
 
     Parameters
     ----------
-    channels : tuple of str
-        Channels that move.
     has_ambient, has_ttf : bool
         Whether the model has a TDTF and a TTF.
     minutes : float
@@ -175,17 +141,16 @@ class Setting:
     taus_min : mapping of str to tuple of float
         Time constants of each path, min.
     spans : mapping of str to float
-        Span of each channel, in its unit.
+        Span of each channel that moves, in its unit.
     zeroed : frozenset of str
         Channels with a zero of their own: they come near 0 and go far from it.
     functions : mapping of str to (tuple of float, tuple of float)
         Coefficients b and a of each path.
-    rough : bool
-        Whether the model was identified on a machine: effects there are only roughly of any form, so that rows of
-        lags are proposed beside the exact forms.
+    approximate : bool
+        Whether effects have only approximately any of the forms, as on a machine that the model was identified on:
+        filter banks are then proposed in addition to the exact forms.
     """
 
-    channels: tuple[str, ...]
     has_ambient: bool
     has_ttf: bool
     minutes: float
@@ -195,74 +160,46 @@ class Setting:
     spans: Mapping[str, float] = field(default_factory=dict)
     zeroed: frozenset[str] = frozenset()
     functions: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
-    rough: bool = False
+    approximate: bool = False
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels that move."""
+        return tuple(self.spans)
 
     @property
     def paths(self) -> tuple[str, ...]:
         """Paths that lead to the deformation and move it."""
         return tuple(name for name, size in self.sizes_um.items() if size > 0.0)
 
+    def drive_unit(self, path: str) -> str:
+        """Return the unit of what drives a path, as names of parameters have it."""
+        return "w" if path == "DTF" and self.has_ttf else "k"
+
     @property
-    def row_min(self) -> tuple[float, ...]:
-        """Return the time constants of a row of lags, from a sample to a third of the record."""
-        longest = min(ROW_LONGEST_MIN, max(self.minutes / 3.0, 20.0 * self.period_min))
-        return tuple(float(t) for t in np.geomspace(self.period_min, longest, ROW))
+    def bank_min(self) -> tuple[float, ...]:
+        """Time constants of a filter bank, from a sample to a third of the record, min."""
+        longest = min(BANK_LONGEST_MIN, max(self.minutes / 3.0, 20.0 * self.period_min))
+        return tuple(float(t) for t in np.geomspace(self.period_min, longest, BANK))
 
     def tau(self, name: str = "tau_min", low: float = 0.6) -> Free:
         """Return a time constant, from a sample to a third of the record."""
         high = max(self.minutes / 3.0, 10.0 * self.period_min)
         low = low * self.period_min
         grid = tuple(float(t) for t in np.geomspace(low, high, 12))
-        return Free(name=name, low=low, high=high, grid=grid)
+        return Free(name=name, low=low, high=high, grid=grid, key="tau_min")
 
 
-def lowpass(u: Vector, tau_min: float, period_min: float) -> Vector:
-    """Return a signal behind a first-order lag of gain 1, by Tustin's rule, at rest at its first value.
-
-    Examples
-    --------
-    >>> lowpass(np.array([1.0, 1.0, 2.0]), 5.0, 1.0).round(3)
-    array([1.   , 1.   , 1.091])
-    """
-    from scipy.signal import lfilter
-
-    p = lag_pole(tau_min, period_min)
-    half = (1.0 - p) / 2.0
-    return np.asarray(lfilter([half, half], [1.0, -p], u - u[0]) + u[0])
+def proposals(context: Context, *, background: bool = False) -> list[Hypothesis]:
+    """Return every hypothesis of every kind for this data: those that stand for themselves, or background ones."""
+    return [h for form in forms() if form.background == background for h in form.propose(context)]
 
 
-def row(u: Vector, taus_min: Sequence[float], period_min: float) -> Matrix:
-    """Return a signal behind each of a row of lags, shape (n, len(taus_min))."""
-    return np.column_stack([lowpass(u, tau, period_min) for tau in taus_min])
+def numbered(name: str, count: int) -> tuple[str, ...]:
+    """Return names of the gains of a filter bank."""
+    return tuple(f"{name}_{i}" for i in range(1, count + 1))
 
 
-def lag_pole(tau_min: float, period_min: float) -> float:
-    """Return Tustin's pole of a lag, not below 0."""
-    return max((2.0 * tau_min - period_min) / (2.0 * tau_min + period_min), 0.0)
-
-
-def late(u: Vector, delay_min: float, period_min: float) -> Vector:
-    """Return a signal that comes later by a delay (earlier, if negative); the ends hold."""
-    k = np.arange(u.size, dtype=np.float64)
-    return np.interp(k - delay_min / period_min, k, u)
-
-
-Proposer = Callable[[Setting], Iterator[Hypothesis]]
-_PROPOSERS: list[Proposer] = []
-
-
-def proposes(proposer: Proposer) -> Proposer:
-    """Register what a kind proposes."""
-    _PROPOSERS.append(proposer)
-    return proposer
-
-
-def proposals(setting: Setting) -> list[Hypothesis]:
-    """Return every hypothesis of every kind for this data."""
-    kinds()
-    return [hypothesis for proposer in _PROPOSERS for hypothesis in proposer(setting)]
-
-
-def shown(value: float) -> str:
+def digits(value: float) -> str:
     """Return a number as an engineer writes it."""
     return f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""`nonlinear`: a path's strength depends on its own size.
+"""`nonlinear`: the gain of a path depends on its own size.
 
 square       y += change · y_path² / 100 µm
 odd square   y += change · y_path · |y_path| / 100 µm
@@ -8,107 +8,71 @@ drive        y += change · G · (drive · |drive|) / 100, the size of what driv
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Iterator, Sequence
+from typing import Any
 
-import numpy as np
-
-from compensator.arrays import Matrix
-from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import Hypothesis, RecordSignals, Setting, proposes, shown
-from compensator.model.effects.stream import Function
-from compensator.model.effects.table import Table
+from compensator.model.effects.base import Effect, Run, number, numbers, only, register, text
+from compensator.model.effects.blocks import Function, Signal
+from compensator.model.effects.hypothesis import Context, Hypothesis, digits
 from compensator.model.transfer_function import SampledTransferFunction
 
-FORMS = ("square", "odd square", "cube", "drive")
+FORMS = ("square", "odd square", "cube")
 
 
-def _shaped(form: str, size: float) -> float:
-    part = size / 100.0
-    if form == "square":
-        return size * part
-    return size * abs(part) if form == "odd square" else size * part * part
-
-
-@register("nonlinear")
-class NonlinearEffect:
-    """The streaming side."""
+@register
+class Nonlinear(Effect):
+    """A curve of the path's share."""
 
     kind = "nonlinear"
-    channels: tuple[str, ...] = ()
+    linear = ("change",)
+    path: str = text("DTF", "TDTF")
+    form: str = text(*FORMS)
+    change: float = number()
 
-    def __init__(self, table: Mapping[str, Any], period_s: float) -> None:
-        keys = Table("nonlinear", table, ("path", "change", "b", "a"))
-        self._tdtf = keys.text("path", ("DTF", "TDTF")) == "TDTF"
-        self._form = keys.text("form", FORMS)
-        self._change = keys.number("change")
-        self._function: Function | None = None
-        if self._form == "drive":
-            self._function = Function(
-                SampledTransferFunction(b=keys.numbers("b"), a=keys.numbers("a"), period_s=period_s)
-            )
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the curve of the share."""
+        share = signals.share(self.path)
+        part = share / 100.0
+        if self.form == "cube":
+            return self.change * (share * part * part)
+        return self.change * (share * (part if self.form == "square" else abs(part)))
 
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any], period_s: float) -> Effect:
-        """Make the effect from its table in the model file."""
-        return cls(table, period_s)
-
-    def step(self, signals: Signals) -> float:
-        """Advance by one sample."""
-        if self._function is not None:
-            drive = signals.ambient_k if self._tdtf else signals.drive
-            return self._change * self._function.step(drive * abs(drive) / 100.0)
-        return self._change * _shaped(self._form, signals.y_tdtf_um if self._tdtf else signals.y_dtf_um)
-
-    def snapshot(self) -> tuple[float, ...]:
-        """Return the state."""
-        return self._function.state if self._function is not None else ()
-
-    def restore(self, state: tuple[float, ...]) -> None:
-        """Take a state back."""
-        if self._function is not None:
-            self._function.state = state
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NonlinearHypothesis(Hypothesis):
-    """The side of a whole record."""
-
-    kind: ClassVar[str] = "nonlinear"
-    function: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
-
-    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return the curve of the share, or the path's answer to the curve of its drive."""
-        if self.form == "drive":
-            drive = waves.source(self.path)
-            return waves.function(self.path).response(drive * np.abs(drive) / 100.0)[:, None]
-        share = waves.share(self.path)
-        size = {"square": share, "odd square": np.abs(share), "cube": share * share / 100.0}[self.form]
-        return np.asarray(share * size / 100.0)[:, None]
-
-    def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
-        """Return the table that the engine runs."""
-        extra: dict[str, Any] = {}
-        if self.form == "drive":
-            extra = {"b": list(self.function[0]), "a": list(self.function[1])}
-        return {"path": self.path, "form": self.form, "change": amplitudes[0], **extra}
-
-    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
-        """Say what depends on the size."""
-        change = next(iter(named.values()))
-        per = "100 W or K of its drive" if self.form == "drive" else "100 µm"
+    def explain(self, rms_um: float) -> str:
+        per = "100 W or K of its input" if self.form == "drive" else "100 µm"
         return (
-            f"The strength of the {self.path} changes with its own size, by {shown(100.0 * change)} % for {per} "
-            f"({rms_um:.2g} µm rms): a joint that gives way, or surfaces that lose heat better when hot."
+            f"The gain of the {self.path} changes with its own size, by {digits(100.0 * self.change)} % per {per} "
+            f"({rms_um:.2g} µm rms): a joint that yields, or surfaces that lose more heat when hot."
         )
 
+    @classmethod
+    def propose(cls, context: Context) -> Iterator[Hypothesis]:
+        """Propose every curve of every path."""
+        for path in context.paths:
+            for form in FORMS:
+                curve = cls(path=path, form=form, change=1.0)
+                yield Hypothesis(effect=curve, form=form, amplitudes=("change_per_100",))
 
-@proposes
-def propose(setting: Setting) -> Iterator[Hypothesis]:
-    """Propose curves of every path."""
-    for path in setting.paths:
-        for form in FORMS:
-            yield NonlinearHypothesis(
-                path=path, form=form, amplitudes=("change_per_100",), function=setting.functions.get(path, ((), ()))
-            )
+
+@register
+class NonlinearDrive(Nonlinear):
+    """The response of the path to a curve of its drive."""
+
+    form: str = only(default="drive")
+    b: tuple[float, ...] = numbers()
+    a: tuple[float, ...] = numbers()
+
+    def blocks(self, period_min: float) -> tuple[Any, ...]:
+        return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
+
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the response to the curved drive."""
+        drive = signals.source(self.path)
+        return self.change * run[0](drive * abs(drive) / 100.0)
+
+    @classmethod
+    def propose(cls, context: Context) -> Iterator[Hypothesis]:
+        """Propose every path."""
+        for path in context.paths:
+            b, a = context.functions[path]
+            drive = cls(path=path, change=1.0, b=b, a=a)
+            yield Hypothesis(effect=drive, form="drive", amplitudes=("change_per_100",))

@@ -1,115 +1,138 @@
-"""`drift`, `step`, `periodic`: what no input explains and time alone describes.
+"""`drift`, `step`, `periodic`: what depends on time alone.
 
-None of them can be deployed: a probe's mount that drifts or slips is no error of the machine, and a period
-that no channel shows has no phase that a model could know.
+None of them can be deployed: a probe mount that drifts or slips is no error of the machine, and a period that no
+channel shows has no phase that a model could know.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
 
-from compensator.arrays import Matrix, Vector
-from compensator.model.effects.hypothesis import Free, Hypothesis, RecordSignals, Setting, proposes, shown
+from compensator.arrays import Matrix
+from compensator.model.effects.base import Effect, Run, register
+from compensator.model.effects.blocks import Signal
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
+from compensator.model.effects.signals import RecordSignals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drift(Hypothesis):
+class Passing(Effect):
+    """What all of them share: they are not deployed, and must explain much where there is another effect."""
+
+    deployable = False
+    worth_beside = 0.75
+
+
+@register
+class Drift(Passing):
     """A ramp over the record."""
 
-    kind: ClassVar[str] = "drift"
-    deployable: ClassVar[bool] = False
-    worth_beside: ClassVar[float] = 0.75
+    kind = "drift"
+    linear = ("um_per_h",)
+    um_per_h: float = 1.0
 
-    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return the time, h."""
-        hours: Vector = np.arange(waves.size, dtype=np.float64) * waves.period_min / 60.0
-        return hours[:, None]
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the ramp."""
+        return self.um_per_h * (signals.minutes / 60.0)
 
-    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
-        """Say what drifts."""
+    def explain(self, rms_um: float) -> str:
         return (
-            f"Y drifts by {shown(named['um_per_h'])} µm an hour ({rms_um:.2g} µm rms) whatever the inputs do: a "
-            "creeping probe mount is no error of the machine. Check the mount, measure against a fixed reference."
+            f"Y drifts by {digits(self.um_per_h)} µm per hour ({rms_um:.2g} µm rms) whatever the inputs do: a creeping "
+            "probe mount is no error of the machine. Check the mount and measure against a fixed reference."
         )
 
+    @classmethod
+    def propose(cls, context: Context) -> Iterator[Hypothesis]:
+        """Propose a ramp."""
+        yield Hypothesis(effect=cls(), form="ramp", amplitudes=("um_per_h",))
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settling(Drift):
-    """A ramp that dies out."""
 
-    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return 1 − exp(−t/τ)."""
-        minutes: Vector = np.arange(waves.size, dtype=np.float64) * waves.period_min
-        return np.asarray(1.0 - np.exp(-minutes / values[0]))[:, None]
+@register
+class Settling(Passing):
+    """A drift that dies out."""
 
-    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
-        """Say what settles."""
+    kind = "drift"
+    linear = ("size_um",)
+    size_um: float = 1.0
+    tau_min: float = 1.0
+
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return 1 − exp(−t/τ), scaled."""
+        return self.size_um * (1.0 - np.exp(-signals.minutes / self.tau_min))
+
+    def explain(self, rms_um: float) -> str:
         return (
-            f"Y drifts by {shown(named['size_um'])} µm with a time constant of {shown(named['tau_min'])} min "
-            f"({rms_um:.2g} µm rms) whatever the inputs do: a mount or a joint that settles is no error of the "
-            "machine. Check the mount, measure against a fixed reference."
+            f"Y drifts by {digits(self.size_um)} µm with a time constant of {digits(self.tau_min)} min ({rms_um:.2g} "
+            "µm rms) whatever the inputs do: a mount or joint that settles is no error of the machine. Check the mount "
+            "and measure against a fixed reference."
         )
 
+    @classmethod
+    def propose(cls, context: Context) -> Iterator[Hypothesis]:
+        """Propose any time constant about the length of the record."""
+        taus = tuple(float(t) for t in np.geomspace(context.minutes / 8.0, 2.0 * context.minutes, 6))
+        free = Free(name="tau_min", low=context.minutes / 10.0, high=3.0 * context.minutes, grid=taus)
+        yield Hypothesis(effect=cls(), form="settling", free=(free,), amplitudes=("size_um",))
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Step(Hypothesis):
+
+@register
+class Step(Passing):
     """A jump at a time."""
 
-    kind: ClassVar[str] = "step"
-    deployable: ClassVar[bool] = False
-    worth_beside: ClassVar[float] = 0.75
+    kind = "step"
+    linear = ("jump_um",)
+    jump_um: float = 1.0
+    at_min: float = 0.0
 
-    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return 0 before and 1 after, over one sample."""
-        minutes = np.arange(waves.size) * waves.period_min
-        return np.asarray(np.clip((minutes - values[0]) / waves.period_min + 1.0, 0.0, 1.0))[:, None]
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the jump, over one sample."""
+        return self.jump_um * np.clip((signals.minutes - self.at_min) / signals.period_min + 1.0, 0.0, 1.0)
 
-    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
-        """Say what jumped."""
+    def explain(self, rms_um: float) -> str:
         return (
-            f"Y jumps by {shown(named['jump_um'])} µm at {named['at_min'] / 60.0:.2f} h ({rms_um:.2g} µm rms) and "
-            "stays: something was knocked or slipped. Look at the probe's mount and at the clamping; zero again."
+            f"Y jumps by {digits(self.jump_um)} µm at {self.at_min / 60.0:.2f} h ({rms_um:.2g} µm rms) and stays: "
+            "something was knocked or slipped. Check the probe mount and the clamping, then zero again."
         )
 
+    @classmethod
+    def propose(cls, context: Context) -> Iterator[Hypothesis]:
+        """Propose a jump at any time."""
+        minutes, period = context.minutes, context.period_min
+        grid = np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0))
+        at = Free(name="at_min", low=period, high=minutes - period, grid=tuple(grid.tolist()), log=False)
+        yield Hypothesis(effect=cls(), form="jump", free=(at,), amplitudes=("jump_um",))
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Periodic(Hypothesis):
+
+@register
+class Periodic(Passing):
     """A period that no channel shows."""
 
-    kind: ClassVar[str] = "periodic"
-    deployable: ClassVar[bool] = False
-    worth_beside: ClassVar[float] = 0.75
+    kind = "periodic"
+    linear = ("sine_um", "cosine_um")
+    sine_um: float = 1.0
+    cosine_um: float = 1.0
+    period_min: float = 1.0
 
-    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return sine and cosine."""
-        angle = 2.0 * np.pi * np.arange(waves.size) * waves.period_min / values[0]
+    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+        angle = 2.0 * np.pi * record.minutes / self.period_min
         return np.column_stack((np.sin(angle), np.cos(angle)))
 
-    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
-        """Say what swings."""
-        size = float(np.hypot(named["sine_um"], named["cosine_um"]))
+    def explain(self, rms_um: float) -> str:
+        size = float(np.hypot(self.sine_um, self.cosine_um))
         return (
-            f"Y swings by ±{shown(size)} µm with a period of {shown(named['period_min'])} min that no channel shows "
-            f"({rms_um:.2g} µm rms): air conditioning, lubrication, a cabinet's cooler. Log its channel."
+            f"Y oscillates by ±{digits(size)} µm with a period of {digits(self.period_min)} min that no channel shows "
+            f"({rms_um:.2g} µm rms): air conditioning, lubrication, a cabinet cooler. Log a channel of it."
         )
 
-
-@proposes
-def propose(setting: Setting) -> Iterator[Hypothesis]:
-    """Propose a ramp, a jump anywhere and every period that the record holds twice."""
-    minutes, period = setting.minutes, setting.period_min
-    yield Drift(form="ramp", amplitudes=("um_per_h",))
-    taus = tuple(float(t) for t in np.geomspace(minutes / 8.0, 2.0 * minutes, 6))
-    settle = Free(name="tau_min", low=minutes / 10.0, high=3.0 * minutes, grid=taus)
-    yield Settling(form="settling", free=(settle,), amplitudes=("size_um",))
-    grid = tuple(float(t) for t in np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0)))
-    at = Free(name="at_min", low=period, high=minutes - period, grid=grid, log=False)
-    yield Step(form="jump", free=(at,), amplitudes=("jump_um",))
-    frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes
-    periods = tuple(float(p) for p in 1.0 / frequencies)
-    free = Free(name="period_min", low=4.0 * period, high=minutes / 1.9, grid=periods)
-    yield Periodic(form="sine", free=(free,), amplitudes=("sine_um", "cosine_um"))
+    @classmethod
+    def propose(cls, context: Context) -> Iterator[Hypothesis]:
+        """Propose every period that the record holds about twice."""
+        minutes, period = context.minutes, context.period_min
+        frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes
+        grid = tuple((1.0 / frequencies).tolist())
+        free = Free(name="period_min", low=4.0 * period, high=minutes / 1.9, grid=grid)
+        yield Hypothesis(effect=cls(), form="sine", free=(free,), amplitudes=("sine_um", "cosine_um"))

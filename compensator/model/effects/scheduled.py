@@ -1,4 +1,4 @@
-"""`scheduled`: a measured channel changes a path's strength or speed.
+"""`scheduled`: a measured channel changes the gain or the speed of a path.
 
 share    y += change · c · y_path
 drive    y += change · G · (c · drive)
@@ -11,205 +11,142 @@ change from the start where it has none (a temperature).
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numpy as np
-
-from compensator.arrays import Matrix
-from compensator.model.effects.base import Effect, Signals, register
-from compensator.model.effects.hypothesis import (
-    ROW_RIDGE,
-    Hypothesis,
-    RecordSignals,
-    Setting,
-    lowpass,
-    proposes,
-    row,
-    shown,
-)
-from compensator.model.effects.stream import Function, Lag, Row
-from compensator.model.effects.table import Table
+from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
+from compensator.model.effects.blocks import NAN, FilterBank, FromStart, Function, Lag, Signal
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered
 from compensator.model.transfer_function import SampledTransferFunction
-
-FORMS = ("share", "drive", "speed", "row")
-ORIGINS = ("start", "zero")
-
-
-@register("scheduled")
-class ScheduledEffect:
-    """The streaming side."""
-
-    kind = "scheduled"
-
-    def __init__(self, table: Mapping[str, Any], period_s: float) -> None:
-        numbers = ("change", "span", "tau_min", "gain", "gain_share", "b", "a")
-        keys = Table("scheduled", table, ("path", "channel", "origin", *numbers))
-        self.channels = (keys.text("channel"),)
-        self._tdtf = keys.text("path", ("DTF", "TDTF")) == "TDTF"
-        self._form = keys.text("form", FORMS)
-        self._span = keys.number("span", 1e-12)
-        self._change = 1.0 if self._form == "row" else keys.number("change")
-        self._inner: Function | Lag | Row | None = None
-        self._by_share: Row | None = None
-        if self._form == "drive":
-            function = SampledTransferFunction(b=keys.numbers("b"), a=keys.numbers("a"), period_s=period_s)
-            self._inner = Function(function)
-        elif self._form == "speed":
-            self._inner = Lag(keys.number("tau_min", 0.0, 1e5), period_s / 60.0)
-        elif self._form == "row":
-            taus = keys.numbers("tau_min", 0.0, 1e5)
-            self._inner = Row(taus, keys.numbers("gain"), period_s / 60.0)
-            self._by_share = Row(taus, keys.numbers("gain_share"), period_s / 60.0)
-        self._start = 0.0 if keys.text("origin", ORIGINS) == "zero" else math.nan
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any], period_s: float) -> Effect:
-        """Make the effect from its table in the model file."""
-        return cls(table, period_s)
-
-    def step(self, signals: Signals) -> float:
-        """Advance by one sample; nothing acts before the channel was seen."""
-        value = signals.channels.get(self.channels[0], math.nan)
-        if math.isnan(value):
-            return 0.0
-        if math.isnan(self._start):
-            self._start = value
-        c = (value - self._start) / self._span
-        share = signals.y_tdtf_um if self._tdtf else signals.y_dtf_um
-        if self._inner is None:
-            return self._change * c * share
-        drive = signals.ambient_k if self._tdtf else signals.drive
-        if self._by_share is not None:
-            return self._inner.step(c * drive) + self._by_share.step(c * share)
-        if self._form == "drive":
-            return self._change * self._inner.step(c * drive)
-        return self._change * c * (self._inner.step(share) - share)
-
-    def snapshot(self) -> tuple[float, ...]:
-        """Return the state."""
-        return (self._start, *(v for part in (self._inner, self._by_share) if part is not None for v in part.state))
-
-    def restore(self, state: tuple[float, ...]) -> None:
-        """Take a state back."""
-        self._start = state[0]
-        if self._inner is not None:
-            end = 1 + len(self._inner.state)
-            self._inner.state = tuple(state[1:end])
-            if self._by_share is not None:
-                self._by_share.state = tuple(state[end:])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScheduledHypothesis(Hypothesis):
-    """The side of a whole record."""
+class Scheduled(Effect):
+    """What all forms share: the channel as a share of its span."""
 
-    kind: ClassVar[str] = "scheduled"
-    law: str = "share"
-    origin: str = "start"
-    span: float = 1.0
-    function: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
+    kind = "scheduled"
+    linear: ClassVar[tuple[str, ...]] = ("change",)
+    #: What of the path changes, in words.
+    what: ClassVar[str] = "gain"
+    path: str = text("DTF", "TDTF")
+    channel: str = text()
+    origin: str = text("start", "zero")
+    span: float = number(1e-12)
 
-    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return the path's share, drive or lag, times the channel."""
-        channel = waves.channels[self.channel]
-        c = (channel - (channel[0] if self.origin == "start" else 0.0)) / self.span
-        share = waves.share(self.path)
-        if self.law == "share":
-            return np.asarray(c * share)[:, None]
-        if self.law == "drive":
-            return waves.function(self.path).response(c * waves.source(self.path))[:, None]
-        return np.asarray(c * (lowpass(share, values[0], waves.period_min) - share))[:, None]
+    def blocks(self, period_min: float) -> tuple[Any, ...]:
+        return FromStart(0.0 if self.origin == "zero" else NAN), *self.inner(period_min)
 
-    def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
-        """Return the table that the engine runs."""
-        extra: dict[str, Any] = {}
-        if self.law == "drive":
-            extra = {"b": list(self.function[0]), "a": list(self.function[1])}
-        elif self.law == "speed":
-            extra = {"tau_min": values[0]}
-        place = {"path": self.path, "channel": self.channel, "form": self.law, "origin": self.origin}
-        return {**place, "change": amplitudes[0], "span": self.span, **extra}
+    def inner(self, period_min: float) -> tuple[Any, ...]:
+        return ()
 
-    def explain(self, named: Mapping[str, float], rms_um: float) -> str:
-        """Say what changes what."""
-        what = "speed" if self.law == "speed" else "strength"
+    def scale(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the channel in units of its span."""
+        return run[0](signals.channels[self.channel]) / self.span
+
+    def explain(self, rms_um: float) -> str:
+        change = self.named({"change": getattr(self, "change", 0.0)})["change"]
         return (
-            f"The {what} of the {self.path} changes with {self.channel}, by {shown(100.0 * named['change'])} % over "
-            f"the channel's span of {shown(self.span)} ({rms_um:.2g} µm rms): more or less of the heat goes another "
-            "way while it runs."
+            f"The {self.what} of the {self.path} changes with {self.channel}, by {digits(100.0 * change)} % over the "
+            f"channel's span of {digits(self.span)} ({rms_um:.2g} µm rms): it changes how much heat takes this path."
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RowScheduled(ScheduledHypothesis):
-    """A path that another channel drives, too, behind a row of lags."""
+@register
+class ShareScheduled(Scheduled):
+    """The share of the path, times the channel."""
 
-    ridge: ClassVar[float] = ROW_RIDGE
-    taus_min: tuple[float, ...] = ()
+    form: str = only(default="share")
+    change: float = number()
 
-    @property
-    def parameters(self) -> int:
-        """Number of parameters that the data spends on it: fewer than gains, because they are held together."""
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the share times the channel."""
+        return self.change * self.scale(signals, run) * signals.share(self.path)
+
+    @classmethod
+    def propose(cls, context: Context) -> Iterator[Hypothesis]:
+        """Propose every form for every channel that moves and every path."""
+        taus, change = context.bank_min, ("change",)
+        ones = (1.0,) * len(taus)
+        gains = (*numbered("gain", len(taus)), *numbered("gain_share", len(taus)))
+        for channel, path in itertools.product(context.channels, context.paths):
+            origin, (b, a) = "zero" if channel in context.zeroed else "start", context.functions[path]
+            place: dict[str, Any] = {"path": path, "channel": channel, "origin": origin, "span": context.spans[channel]}
+            if context.approximate:
+                dc_gain = math.fsum(b) / math.fsum(a)
+                bank = BankScheduled(**place, tau_min=taus, gain=ones, gain_share=ones, dc_gain=dc_gain)
+                yield Hypothesis(effect=bank, form="row", amplitudes=gains)
+            speed = SpeedScheduled(**place, change=1.0, tau_min=0.0)
+            yield Hypothesis(effect=cls(**place, change=1.0), form="share", amplitudes=change)
+            yield Hypothesis(effect=DriveScheduled(**place, change=1.0, b=b, a=a), form="drive", amplitudes=change)
+            yield Hypothesis(effect=speed, form="speed", free=(context.tau(),), amplitudes=change)
+
+
+@register
+class DriveScheduled(Scheduled):
+    """The path's response to its drive times the channel."""
+
+    form: str = only(default="drive")
+    change: float = number()
+    b: tuple[float, ...] = numbers()
+    a: tuple[float, ...] = numbers()
+
+    def inner(self, period_min: float) -> tuple[Any, ...]:
+        return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
+
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return the response to the drive times the channel."""
+        return self.change * run[1](self.scale(signals, run) * signals.source(self.path))
+
+
+@register
+class SpeedScheduled(Scheduled):
+    """A lag of the path, times the channel."""
+
+    what = "speed"
+    form: str = only(default="speed")
+    change: float = number()
+    tau_min: float = number(0.0, 1e5)
+
+    def inner(self, period_min: float) -> tuple[Any, ...]:
+        return (Lag(self.tau_min, period_min),)
+
+    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+        """Return what the lag takes off the share, times the channel."""
+        share = signals.share(self.path)
+        return self.change * self.scale(signals, run) * (run[1](share) - share)
+
+
+@register
+class BankScheduled(BankEffect, Scheduled):
+    """Drive and share of the path, times the channel, behind a filter bank.
+
+    Parameters
+    ----------
+    dc_gain : float
+        Gain of the path at rest, to name the change by; not in the model file.
+    """
+
+    linear = ("gain", "gain_share")
+    ridge = BANK_RIDGE
+    form: str = only(default="row")
+    tau_min: tuple[float, ...] = numbers(0.0, 1e5)
+    gain: tuple[float, ...] = numbers()
+    gain_share: tuple[float, ...] = numbers()
+    dc_gain: float = 1.0
+
+    def inner(self, period_min: float) -> tuple[Any, ...]:
+        return (FilterBank(self.tau_min, (self.gain, self.gain_share), period_min),)
+
+    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+        c = self.scale(signals, run)
+        return c * signals.source(self.path), c * signals.share(self.path)
+
+    def effective_parameters(self, count: int) -> int:
         return 7
 
-    def columns(self, waves: RecordSignals, values: Sequence[float]) -> Matrix:
-        """Return what drives the path, times the channel, behind each lag."""
-        channel = waves.channels[self.channel]
-        c = (channel - (channel[0] if self.origin == "start" else 0.0)) / self.span
-        sources = waves.source(self.path), waves.share(self.path)
-        return np.hstack([row(c * u, self.taus_min, waves.period_min) for u in sources])
-
-    def named(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, float]:
-        """Return how much the gain at rest changes over the channel's span, as a share of it."""
-        count, gain = len(self.taus_min), math.fsum(self.function[0]) / math.fsum(self.function[1])
-        return {"change": math.fsum(amplitudes[:count]) / gain + math.fsum(amplitudes[count:])}
-
-    def table(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, Any]:
-        """Return the table that the engine runs."""
-        return {
-            "path": self.path,
-            "channel": self.channel,
-            "form": "row",
-            "origin": self.origin,
-            "span": self.span,
-            "tau_min": list(self.taus_min),
-            "gain": list(amplitudes[: len(self.taus_min)]),
-            "gain_share": list(amplitudes[len(self.taus_min) :]),
-        }
-
-
-@proposes
-def propose(setting: Setting) -> Iterator[Hypothesis]:
-    """Propose every channel that moves on every path."""
-    for channel in setting.channels:
-        for path in setting.paths:
-            origin = "zero" if channel in setting.zeroed else "start"
-            span, function = setting.spans.get(channel, 1.0), setting.functions.get(path, ((), ()))
-            if setting.rough:
-                taus = setting.row_min
-                yield RowScheduled(
-                    path=path,
-                    channel=channel,
-                    form="row",
-                    law="row",
-                    origin=origin,
-                    span=span,
-                    function=function,
-                    taus_min=taus,
-                    amplitudes=tuple(f"{name}_{i}" for name in ("gain", "gain_share") for i in range(1, len(taus) + 1)),
-                )
-            for law in ("share", "drive", "speed"):
-                yield ScheduledHypothesis(
-                    path=path,
-                    channel=channel,
-                    form=law,
-                    law=law,
-                    origin=origin,
-                    span=span,
-                    function=function,
-                    free=(setting.tau(),) if law == "speed" else (),
-                    amplitudes=("change",),
-                )
+    def named(self, given: dict[str, float]) -> dict[str, float]:
+        """Return the change of the gain at rest over the channel's span, as a share of it."""
+        return {"change": math.fsum(self.gain) / self.dc_gain + math.fsum(self.gain_share)}

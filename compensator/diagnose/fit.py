@@ -1,8 +1,9 @@
-"""Several effects fitted at once: free parameters searched together, amplitudes projected."""
+"""Several effects fitted together: free parameters searched, amplitudes projected."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -11,11 +12,14 @@ from scipy.optimize import least_squares
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
+from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis
+
+Start = tuple[Hypothesis, Sequence[float]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
+class Term:
     """A hypothesis with values.
 
     Parameters
@@ -27,7 +31,7 @@ class Part:
     amplitudes : tuple of float
         Its linear parameters.
     companion : bool
-        Whether it only rounds off what the others leave: it is deployed with them and not named beside them.
+        Whether it only absorbs what the other terms leave: it is deployed with them and not named beside them.
     """
 
     hypothesis: Hypothesis
@@ -36,18 +40,28 @@ class Part:
     companion: bool = False
 
     @property
+    def effect(self) -> Effect:
+        """The effect with its parameters."""
+        return self.hypothesis.with_values(self.values, self.amplitudes)
+
+    @property
     def named(self) -> dict[str, float]:
         """Every parameter by name."""
         return self.hypothesis.named(self.values, self.amplitudes)
 
+    @property
+    def start(self) -> Start:
+        """Where another fit of it begins."""
+        return self.hypothesis, self.values
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Joint:
+class Fit:
     """Effects fitted together.
 
     Parameters
     ----------
-    parts : tuple of Part
+    terms : tuple of Term
         Effects with their values.
     residual : numpy.ndarray, shape (n,)
         What is left, nuisances taken out; 0 where samples are not used.
@@ -55,64 +69,53 @@ class Joint:
         Its sum of squares, µm².
     """
 
-    parts: tuple[Part, ...]
+    terms: tuple[Term, ...]
     residual: Vector
     cost: float
 
     @property
     def parameters(self) -> int:
         """Number of parameters of all effects."""
-        return sum(part.hypothesis.parameters for part in self.parts)
+        return sum(term.hypothesis.parameters for term in self.terms)
+
+    def starts(self, without: int | None = None) -> list[Start]:
+        """Return where another fit begins, with all terms or all but one."""
+        return [term.start for i, term in enumerate(self.terms) if i != without]
 
 
-def response(evidence: Evidence, part: Part) -> Vector:
+def response(evidence: Evidence, term: Term) -> Vector:
     """Return what an effect adds to y on every sample, µm, also on those that are not used."""
-    pieces = []
-    for wave in evidence.waves:
-        total = part.hypothesis.columns(wave, part.values) @ np.array(part.amplitudes)
-        fixed = part.hypothesis.fixed(wave, part.values)
-        pieces.append(total if fixed is None else total + fixed)
-    return np.concatenate(pieces)
+    columns = np.concatenate([term.hypothesis.columns(record, term.values) for record in evidence.signals])
+    return np.asarray(columns @ np.array(term.amplitudes) if term.amplitudes else columns[:, 0])
 
 
-def summed(evidence: Evidence, joint: Joint) -> Vector:
-    """Return what all effects add to y on every sample, µm."""
-    total = np.zeros(evidence.used.size)
-    for part in joint.parts:
-        total += response(evidence, part)
-    return total
+def summed(evidence: Evidence, terms: Sequence[Term]) -> Vector:
+    """Return what some effects add to y on every sample, µm."""
+    return np.asarray(sum((response(evidence, term) for term in terms), np.zeros(evidence.used.size)))
 
 
 def columns_of(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> tuple[Matrix, Vector | None]:
     """Return columns and fixed part on the samples used, nuisances taken out."""
-    columns = np.concatenate([hypothesis.columns(wave, values) for wave in evidence.waves])
+    columns = np.concatenate([hypothesis.columns(record, values) for record in evidence.signals])
     columns[~evidence.used] = 0.0
-    fixed = [hypothesis.fixed(wave, values) for wave in evidence.waves]
-    still = None
-    if fixed[0] is not None:
-        whole = np.concatenate([f for f in fixed if f is not None])
-        whole[~evidence.used] = 0.0
-        still = evidence.without_nuisances(whole)
-    return evidence.without_nuisances(columns), still
+    if hypothesis.amplitudes:
+        return evidence.without_nuisances(columns), None
+    return columns[:, :0], evidence.without_nuisances(columns[:, 0])
 
 
 class _Problem:
-    """The projected problem of some hypotheses; remembers the columns of the last values of each."""
+    """The projected problem of some hypotheses; keeps the columns of the last values of each."""
 
     def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis]) -> None:
         self.evidence, self.hypotheses = evidence, hypotheses
         self.y = evidence.without_nuisances(evidence.residual)
         self.free = [free for hypothesis in hypotheses for free in hypothesis.free]
-        self.ridge = np.array([h.ridge for h in hypotheses for _ in h.amplitudes])
+        self.ridge = np.array([h.effect.ridge for h in hypotheses for _ in h.amplitudes])
         self._known: list[tuple[tuple[float, ...], tuple[Matrix, Vector | None]] | None] = [None] * len(hypotheses)
 
     def values(self, x: Vector) -> list[tuple[float, ...]]:
-        natural = [from_search(free, float(v)) for free, v in zip(self.free, x, strict=True)]
-        result, at = [], 0
-        for hypothesis in self.hypotheses:
-            result.append(tuple(natural[at : at + len(hypothesis.free)]))
-            at += len(hypothesis.free)
-        return result
+        natural = iter([from_search(free, float(v)) for free, v in zip(self.free, x, strict=True)])
+        return [tuple(itertools.islice(natural, len(hypothesis.free))) for hypothesis in self.hypotheses]
 
     def solve(self, x: Vector) -> tuple[Vector, Vector]:
         """Return residual and amplitudes."""
@@ -153,9 +156,7 @@ def from_search(free: Free, x: float) -> float:
     return float(np.exp(x)) if free.log else x * (free.high - free.low)
 
 
-def fit_joint(
-    evidence: Evidence, starts: Sequence[tuple[Hypothesis, Sequence[float]]], *, evaluations: int = 25
-) -> Joint:
+def fit_terms(evidence: Evidence, starts: Sequence[Start], *, evaluations: int = 25) -> Fit:
     """Fit effects together.
 
     Parameters
@@ -171,10 +172,8 @@ def fit_joint(
     begin = [v for _, values in starts for v in values]
     x = np.array([to_search(free, v) for free, v in zip(problem.free, begin, strict=True)])
     if x.size:
-        low, high = (
-            np.array([to_search(free, bound) for free, bound in ((f, getattr(f, side)) for f in problem.free)])
-            for side in ("low", "high")
-        )
+        low = np.array([to_search(free, free.low) for free in problem.free])
+        high = np.array([to_search(free, free.high) for free in problem.free])
         inside = np.clip(x, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
         found = least_squares(
             problem.fun, inside, bounds=(low, high), diff_step=1e-4, xtol=1e-6, ftol=1e-7, max_nfev=evaluations
@@ -182,39 +181,39 @@ def fit_joint(
         x = np.asarray(found.x)
     residual, amplitudes = problem.solve(x)
     residual = np.where(evidence.used, residual, 0.0)
-    parts, at = [], 0
-    for (hypothesis, _), values in zip(starts, problem.values(x), strict=True):
-        width = len(hypothesis.amplitudes)
-        parts.append(Part(hypothesis=hypothesis, values=values, amplitudes=tuple(amplitudes[at : at + width].tolist())))
-        at += width
-    return Joint(parts=tuple(parts), residual=residual, cost=float(residual @ residual))
+    rest = iter(amplitudes.tolist())
+    terms = [
+        Term(hypothesis=hypothesis, values=values, amplitudes=tuple(itertools.islice(rest, len(hypothesis.amplitudes))))
+        for hypothesis, values in zip(problem.hypotheses, problem.values(x), strict=True)
+    ]
+    return Fit(terms=tuple(terms), residual=residual, cost=float(residual @ residual))
 
 
-def standard_errors(evidence: Evidence, joint: Joint, colour: float) -> list[dict[str, float]]:
-    """Return the standard error of everything that each effect is named by, the residual's colour counted in."""
-    natural = np.array([v for part in joint.parts for v in (*part.values, *part.amplitudes)])
+def standard_errors(evidence: Evidence, fit: Fit, variance_inflation: float) -> list[dict[str, float]]:
+    """Return the standard error of everything that each effect is named by, for the effective number of samples."""
+    natural = np.array([v for term in fit.terms for v in (*term.values, *term.amplitudes)])
     if natural.size == 0:
         return []
-    ridge = np.array([r for part in joint.parts for r in _ridges(part)])
+    ridge = np.array([r for term in fit.terms for r in _ridges(term)])
 
-    def moved(values: Vector) -> list[Part]:
-        result, at = [], 0
-        for part in joint.parts:
-            n, m = len(part.values), len(part.amplitudes)
-            own = values[at : at + n + m].tolist()
-            result.append(dataclasses.replace(part, values=tuple(own[:n]), amplitudes=tuple(own[n:])))
-            at += n + m
-        return result
+    def moved(values: Vector) -> list[Term]:
+        rest = iter(values.tolist())
+        return [
+            dataclasses.replace(
+                term,
+                values=tuple(itertools.islice(rest, len(term.values))),
+                amplitudes=tuple(itertools.islice(rest, len(term.amplitudes))),
+            )
+            for term in fit.terms
+        ]
 
     def predicted(values: Vector) -> Vector:
-        total = np.zeros(evidence.used.size)
-        for part in moved(values):
-            total += response(evidence, part)
+        total = summed(evidence, moved(values))
         total[~evidence.used] = 0.0
         return evidence.without_nuisances(total)
 
     def named(values: Vector) -> Vector:
-        return np.array([v for part in moved(values) for v in part.named.values()])
+        return np.array([v for term in moved(values) for v in term.named.values()])
 
     steps = 1e-3 * np.abs(natural) + 1e-9
     jacobian = _slopes(predicted, natural, steps)
@@ -222,19 +221,14 @@ def standard_errors(evidence: Evidence, joint: Joint, colour: float) -> list[dic
     scale[scale == 0.0] = 1.0
     _, s, vt = np.linalg.svd(np.concatenate([jacobian / scale, np.diag(np.sqrt(ridge))]), full_matrices=False)
     inverse = vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None]
-    sigma2 = joint.cost / max(evidence.count - natural.size, 1) * colour
+    sigma2 = fit.cost / max(evidence.count - natural.size, 1) * variance_inflation
     spread = _slopes(named, natural, steps) @ inverse
-    errors = np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread) * sigma2, 0.0)).tolist()
-    result, at = [], 0
-    for part in joint.parts:
-        names = list(part.named)
-        result.append(dict(zip(names, errors[at : at + len(names)], strict=True)))
-        at += len(names)
-    return result
+    errors = iter(np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread) * sigma2, 0.0)).tolist())
+    return [dict(zip(term.named, errors, strict=False)) for term in fit.terms]
 
 
-def _ridges(part: Part) -> list[float]:
-    return [*(0.0 for _ in part.values), *(part.hypothesis.ridge for _ in part.amplitudes)]
+def _ridges(term: Term) -> list[float]:
+    return [*(0.0 for _ in term.values), *(term.hypothesis.effect.ridge for _ in term.amplitudes)]
 
 
 def _slopes(function: Callable[[Vector], Vector], at: Vector, steps: Vector) -> Matrix:

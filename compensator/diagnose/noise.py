@@ -1,0 +1,109 @@
+"""Is what is left noise? The levels, the thresholds, and the one place that compares them.
+
+Two levels are known: what the sensors' noise alone makes of the residual, and the base model's own error from its
+calibration. The thresholds differ by the question that is asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from compensator.arrays import Vector
+from compensator.data.runs import Run, noise_std
+from compensator.model.thermal_model import ThermalModel
+
+#: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
+OWN_SHARE = 0.02
+#: No effect is looked for below this many times the base model's own error.
+OWN_TIMES = 1.3
+#: A residual up to this many times the base model's own error may come by itself on another day.
+EXPECTED_TIMES = 1.4
+#: In a search, a sum of squares up to this many times that of noise and own error is noise.
+SEARCH_TIMES = 1.3
+#: For the verdict, what is left counts as noise up to this many times its level (rms).
+VERDICT_TIMES = 1.5
+#: A residual whose variance inflation is below this is white.
+WHITE_BELOW = 1.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoiseTest:
+    """What noise and the base model's own error may leave.
+
+    Parameters
+    ----------
+    count : int
+        Number of samples used.
+    noise_um : float
+        What the sensors' noise alone makes of the residual, µm rms.
+    own_error_um : float
+        The base model's own error as its calibration states it, µm rms; 0 where none is stated.
+    """
+
+    count: int
+    noise_um: float
+    own_error_um: float
+
+    @property
+    def allowance(self) -> float:
+        """Sum of squares that the own error may leave, µm²: nothing is looked for below it."""
+        return self.count * (OWN_TIMES * self.own_error_um) ** 2
+
+    def is_expected(self, cost: float) -> bool:
+        """Tell whether a residual, before any search, may come by itself on another day."""
+        return cost < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
+
+    def is_noise(self, cost: float) -> bool:
+        """Tell whether a search has nothing left to find in a sum of squares."""
+        return cost < SEARCH_TIMES * (self.count * self.noise_um**2 + self.allowance)
+
+    def is_bare_noise(self, cost: float) -> bool:
+        """Tell the same with the own error as it is stated, without a margin."""
+        return cost < SEARCH_TIMES * self.count * (self.noise_um**2 + self.own_error_um**2)
+
+    def is_explained(self, cost: float) -> bool:
+        """Tell whether the verdict may say that what is left is noise."""
+        return cost < VERDICT_TIMES**2 * (self.count * self.noise_um**2 + self.allowance)
+
+    def is_explained_held_out(self, rms_um: float) -> bool:
+        """Tell the same of a held-out error of a refitted base, whose own error is not known beforehand."""
+        return rms_um < VERDICT_TIMES * self.noise_um
+
+    @staticmethod
+    def is_white(variance_inflation: float) -> bool:
+        """Tell whether a residual has no structure in time."""
+        return variance_inflation < WHITE_BELOW
+
+
+def own_error(model: ThermalModel, noise_um: float, spread_um: float) -> float:
+    """Return the base model's own error from its calibration, the noise taken off, µm rms.
+
+    A calibration that misses by more than a share of the spread of the deformation lacks something.
+    """
+    own = float(np.sqrt(max((model.held_out_rms_um or 0.0) ** 2 - noise_um**2, 0.0)))
+    return min(own, OWN_SHARE * spread_um)
+
+
+def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:
+    """Return what the sensors' noise alone makes of the residual, µm.
+
+    White noise of the probe, and that of both thermocouples through the model.
+    """
+    noise = {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc", "y_um")}
+    impulse = np.zeros(3000)
+    impulse[0] = 1.0
+    by_t_q = model.dtf.sampled.response(drive_of(model, impulse))
+    by_at = -by_t_q + (model.tdtf.sampled.response(impulse) if model.tdtf else 0.0)
+    parts = (noise["y_um"], noise["t_q_degc"] * np.linalg.norm(by_t_q), noise["at_degc"] * np.linalg.norm(by_at))
+    return float(np.sqrt(sum(part**2 for part in parts)))
+
+
+def drive_of(model: ThermalModel, difference_k: Vector) -> Vector:
+    """Return what drives the DTF: the heat by the plain inverse, or T_Q − AT itself in a direct model."""
+    if model.ttf is None:
+        return difference_k
+    return np.asarray(lfilter(model.ttf.sampled.a, model.ttf.sampled.b, difference_k))

@@ -1,0 +1,216 @@
+"""Blocks that the laws of effects are composed of.
+
+A block advances by one sample (`step`) or returns its response to a whole record from rest (`filter`). A law is given
+the one or the other of its blocks, so that the same law serves the engine and the fit.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from compensator.arrays import Matrix, Vector
+from compensator.errors import ModelError
+from compensator.model.transfer_function import SampledTransferFunction
+
+NAN = float("nan")
+#: One sample (float) or a whole record (`Vector`): arithmetic of a law is the same for both.
+Signal = Any
+
+
+class Block:
+    """One input, one output, and a state of floats."""
+
+    #: Everything that it must remember to go on with the same bits.
+    state: tuple[float, ...] = ()
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        raise NotImplementedError
+
+    def filter(self, u: Vector) -> Vector:
+        """Return the response to a whole record from rest; the state stays as it is."""
+        raise NotImplementedError
+
+
+class FromStart(Block):
+    """The change from the first sample, or from a given zero."""
+
+    def __init__(self, zero: float = NAN) -> None:
+        self._zero = zero
+        self.state = (zero,)
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        if math.isnan(self.state[0]):
+            self.state = (u,)
+        return u - self.state[0]
+
+    def filter(self, u: Vector) -> Vector:
+        """Return the change over a record."""
+        return np.asarray(u - (u[0] if math.isnan(self._zero) else self._zero))
+
+
+class Lag(Block):
+    """A first-order lag of gain 1 by Tustin's rule, its pole not below 0, at rest at its first input.
+
+    Examples
+    --------
+    >>> Lag(5.0, 1.0).filter(np.array([1.0, 1.0, 2.0])).round(3)
+    array([1.   , 1.   , 1.091])
+    """
+
+    def __init__(self, tau_min: float, period_min: float) -> None:
+        self.pole = max((2.0 * tau_min - period_min) / (2.0 * tau_min + period_min), 0.0)
+        self._half = (1.0 - self.pole) / 2.0
+        self.state = (NAN, 0.0)
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        before, y = self.state
+        y = u if math.isnan(before) else self.pole * y + self._half * (u + before)
+        self.state = (u, y)
+        return y
+
+    def filter(self, u: Vector) -> Vector:
+        """Return the response to a record."""
+        from scipy.signal import lfilter  # here, because the service never needs it and it costs 40 MB
+
+        return np.asarray(lfilter([self._half, self._half], [1.0, -self.pole], u - u[0]) + u[0])
+
+
+class FilterBank:
+    """First-order lags of one or more inputs, weighted and summed.
+
+    Parameters
+    ----------
+    taus_min : sequence of float
+        Time constants of the lags, min: the same for every input.
+    gains : sequence of sequence of float
+        For each input, the weight of each lag.
+    period_min : float
+        Sample period, min.
+
+    Raises
+    ------
+    ModelError
+        If there are not as many weights as lags.
+    """
+
+    def __init__(self, taus_min: Sequence[float], gains: Sequence[Sequence[float]], period_min: float) -> None:
+        for row in gains:
+            if len(taus_min) != len(row):
+                raise ModelError(f"a filter bank: {len(taus_min)} tau_min for {len(row)} gain, expected as many")
+        self._rows = [[(gain, Lag(tau, period_min)) for gain, tau in zip(row, taus_min, strict=True)] for row in gains]
+        self._lags = [lag for row in self._rows for _, lag in row]
+
+    @property
+    def state(self) -> tuple[float, ...]:
+        """The states of all lags, input by input."""
+        return tuple(value for lag in self._lags for value in lag.state)
+
+    @state.setter
+    def state(self, values: tuple[float, ...]) -> None:
+        for i, lag in enumerate(self._lags):
+            lag.state = tuple(values[2 * i : 2 * i + 2])
+
+    def step(self, *inputs: float) -> float:
+        """Advance by one sample."""
+        sums = []
+        for u, row in zip(inputs, self._rows, strict=True):
+            total = 0.0
+            for gain, lag in row:
+                total += gain * lag.step(u)
+            sums.append(total)
+        result = sums[0]
+        for total in sums[1:]:  # not sum(): newer Pythons compensate it, and the bits would depend on the version
+            result += total
+        return result
+
+    def filter(self, *inputs: Vector) -> Vector:
+        """Return the response to records from rest; the state stays as it is."""
+        return np.asarray(self.columns(*inputs) @ np.array([gain for row in self._rows for gain, _ in row]))
+
+    def columns(self, *inputs: Vector) -> Matrix:
+        """Return each input behind each lag, unweighted, shape (n, inputs · lags)."""
+        return np.column_stack([lag.filter(u) for u, row in zip(inputs, self._rows, strict=True) for _, lag in row])
+
+
+class Delay(Block):
+    """A delay of any number of samples, between two of them by a straight line; the ends of a record hold."""
+
+    def __init__(self, delay_min: float, period_min: float) -> None:
+        self._samples = delay_min / period_min
+        self._length = math.ceil(self._samples) + 1
+        self.state = (NAN,) * self._length
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        kept = (u, *self.state[:-1]) if not math.isnan(self.state[0]) else (u,) * self._length
+        self.state = kept
+        whole = min(int(self._samples), self._length - 1)
+        part = self._samples - whole
+        return kept[whole] if part == 0.0 else kept[whole] + part * (kept[whole + 1] - kept[whole])
+
+    def filter(self, u: Vector) -> Vector:
+        """Return a record that comes later."""
+        return shifted(u, self._samples)
+
+
+def shifted(u: Vector, samples: float) -> Vector:
+    """Return a record that comes later by a number of samples (earlier, if negative); the ends hold."""
+    k = np.arange(u.size, dtype=np.float64)
+    return np.interp(k - samples, k, u)
+
+
+class Function(Block):
+    """A sampled transfer function from rest, transposed direct form II."""
+
+    def __init__(self, function: SampledTransferFunction) -> None:
+        n = function.order
+        self._function = function
+        self._b = (*function.b, *([0.0] * (n + 1 - len(function.b))))
+        self._a = (*function.a, *([0.0] * (n + 1 - len(function.a))))
+        self.state = (0.0,) * n
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        w = (*self.state, 0.0)
+        y = self._b[0] * u + w[0]
+        self.state = tuple(w[i + 1] + self._b[i + 1] * u - self._a[i + 1] * y for i in range(len(self.state)))
+        return y
+
+    def filter(self, u: Vector) -> Vector:
+        """Return the response to a record."""
+        return self._function.response(u)
+
+
+class Play(Block):
+    """Play: the output follows once the play of a half-width is taken up."""
+
+    def __init__(self, half_width: float) -> None:
+        self._half = half_width
+        self.state = (0.0,)
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        self.state = (self._follow(self.state[0], u),)
+        return self.state[0]
+
+    def filter(self, u: Vector) -> Vector:
+        """Return the response to a record."""
+        return np.array(list(itertools.accumulate(u.tolist(), self._follow, initial=0.0))[1:])
+
+    def _follow(self, at: float, wanted: float) -> float:
+        return min(max(at, wanted - self._half), wanted + self._half)
+
+
+class Stick(Play):
+    """Stick-slip: the output jumps all the way once its input is off by more than a half-width."""
+
+    def _follow(self, at: float, wanted: float) -> float:
+        return wanted if abs(wanted - at) > self._half else at

@@ -1,0 +1,79 @@
+"""Signals of the base model that effects may use: of one sample, and over a whole record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from compensator.arrays import Vector
+from compensator.model.effects.blocks import Signal
+from compensator.model.transfer_function import SampledTransferFunction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Signals:
+    """Signals of one sample.
+
+    Parameters
+    ----------
+    drive : float
+        Estimated heat, W (T_Q − AT, K, in a direct model).
+    ambient_k : float
+        AT as a change from the reference, K.
+    y_dtf_um, y_tdtf_um : float
+        Share of each path, µm.
+    channels : mapping of str to float
+        Auxiliary channels, in their own units; the last good value where one is missing.
+    """
+
+    drive: Signal = 0.0
+    ambient_k: Signal = 0.0
+    y_dtf_um: Signal = 0.0
+    y_tdtf_um: Signal = 0.0
+    channels: Mapping[str, Signal] = field(default_factory=dict)
+
+    def share(self, path: str) -> Signal:
+        """Return the share of a path in y, µm (`all`: of both); the TTF's is the DTF's, which it drives."""
+        if path == "all":
+            return self.y_dtf_um + self.y_tdtf_um
+        return self.y_tdtf_um if path == "TDTF" else self.y_dtf_um
+
+    def source(self, path: str) -> Signal:
+        """Return what drives a path: heat, W (or T_Q − AT, K), or the change of the ambient, K."""
+        return self.ambient_k if path == "TDTF" else self.drive
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordSignals(Signals):
+    """Signals over a whole record: each an array, shape (n,), channels with gaps bridged.
+
+    Parameters
+    ----------
+    period_min : float
+        Sample period, min.
+    dtf, tdtf : SampledTransferFunction
+        Paths of the base model.
+    number : int
+        Which of several records this is.
+    """
+
+    period_min: float
+    dtf: SampledTransferFunction
+    tdtf: SampledTransferFunction
+    number: int = 0
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return int(self.drive.size)
+
+    @property
+    def minutes(self) -> Vector:
+        """Time from the start of the record, shape (n,), min."""
+        return np.asarray(np.arange(self.size) * self.period_min)
+
+    def function(self, path: str) -> SampledTransferFunction:
+        """Return the transfer function of a path."""
+        return self.tdtf if path == "TDTF" else self.dtf

@@ -1,0 +1,79 @@
+"""A table of the model file, which names file place, key and value in every refusal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from compensator.errors import ModelError
+
+#: No coefficient, gain or noise is as large: its powers would not be finite.
+LARGEST = 1e30
+
+
+class Table:
+    """Typed access to a table of the model file.
+
+    Parameters
+    ----------
+    where : str
+        Place in the file, for messages.
+    table : object
+        What the file holds there.
+    known : sequence of str, optional
+        Keys that it may have; any where it is left out.
+
+    Raises
+    ------
+    ModelError
+        If it is no table, or has an unknown key.
+    """
+
+    def __init__(self, where: str, table: object, known: Sequence[str] | None = None) -> None:
+        if not isinstance(table, Mapping):
+            raise ModelError(f"{where}: expected a table, got {table!r}")
+        self.where, self.table = where, table
+        unknown = [key for key in table if known is not None and key not in known]
+        if unknown:
+            raise ModelError(f"{where}: unknown key {unknown[0]!r}, expected one of: {', '.join(known or ())}")
+
+    def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
+        """Return a finite number between two bounds (inclusive)."""
+        value = self.table.get(key)
+        if not _is_number(value, low, high):
+            raise ModelError(f"{self.where}: {key} = {shown(value)}, expected a number{_bounds(low, high)}")
+        return float(value)  # type: ignore[arg-type]
+
+    def numbers(
+        self, key: str, low: float = -math.inf, high: float = math.inf, *, length: int | None = None
+    ) -> tuple[float, ...]:
+        """Return a list of finite numbers between two bounds (inclusive)."""
+        values = self.table.get(key)
+        ok = isinstance(values, list) and values and all(_is_number(v, low, high) for v in values)
+        if not ok or (length is not None and len(values) != length):  # type: ignore[arg-type]
+            count = f"{length} " if length else ""
+            expected = f"a list of {count}numbers{_bounds(low, high)}"
+            raise ModelError(f"{self.where}: {key} = {shown(values)}, expected {expected}")
+        return tuple(float(v) for v in values)  # type: ignore[union-attr]
+
+    def text(self, key: str, choices: Sequence[str] = (), default: str | None = None) -> str:
+        """Return a string, one of the choices where there are any."""
+        value = self.table.get(key, default)
+        if not isinstance(value, str) or (choices and value not in choices):
+            expected = "one of: " + ", ".join(choices) if choices else "a string"
+            raise ModelError(f"{self.where}: {key} = {shown(value)}, expected {expected}")
+        return value
+
+
+def shown(value: object) -> str:
+    """Return a value as a message quotes it."""
+    return "missing" if value is None else repr(value)[:60]
+
+
+def _is_number(value: object, low: float, high: float) -> bool:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and -LARGEST < value < LARGEST and low <= value <= high  # type: ignore[operator]
+
+
+def _bounds(low: float, high: float) -> str:
+    return "" if low == -math.inf and high == math.inf else f" from {low:g} to {high:g}"
