@@ -1,4 +1,4 @@
-"""Pictures of a page, as what is to be drawn: curves with bands, points, stems, shaded spans, strips of time."""
+"""Figures of a page as data: curves with bands, points, stems, shaded spans, strips of time."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from compensator.arrays import Indices, Vector
 
-#: Buckets that a longer curve is thinned to; each keeps its lowest and highest point.
+#: Buckets to which a long curve is thinned; each keeps its lowest and highest point.
 _BUCKETS = 700
-#: Gaps up to which each is shown, however narrow.
+#: Up to this number of gaps each one is shown, however narrow.
 _GAPS = 100
 
 
@@ -22,11 +22,11 @@ class Line:
     Parameters
     ----------
     name : str
-        Stands in the legend.
+        Entry of the legend.
     x, y : numpy.ndarray, shape (n,)
         Points; a value that is not finite leaves a gap.
     band : tuple of numpy.ndarray, optional
-        What its uncertainty spans, lower and upper, each of shape (n,).
+        Lower and upper limit of its uncertainty, each of shape (n,).
     """
 
     name: str
@@ -65,16 +65,16 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """A row of time: when a state stood, when something happened.
+    """A row of time: when a state was active, when something happened.
 
     Parameters
     ----------
     name : str
-        Stands at the row's left end.
+        Label at the left.
     spans : tuple of (float, float)
         First and last x of each piece.
     line : int
-        Which of the line colours.
+        Index of the line colour.
     """
 
     name: str
@@ -84,28 +84,28 @@ class Strip:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figure:
-    """A picture with units on both axes.
+    """A figure with units on both axes.
 
     Parameters
     ----------
     title, x_label, y_label : str
-        Words; the labels name the unit.
+        The labels name the unit.
     lines, marks, stems, spans, strips : tuple
-        What is drawn; strips stand alone.
+        Content; strips are drawn alone.
     limits : tuple of float
         Dashed horizontal lines.
     x_log, y_log : bool
         Logarithmic axes.
     unit_circle : bool
-        Draw it, with equal axes.
+        Draw the unit circle, with equal axes.
     clock : bool
-        x is a time of day, in seconds since 1970 UTC.
+        x is a time, s since 1970 UTC.
     x_limits : tuple of float, optional
-        Ends of the x axis, so that pictures below each other go together.
+        Ends of the x axis, the same for figures below each other.
     note : str
         A sentence below.
     height : float
-        In inches, at a width of 9.
+        Height at a width of 9, inches.
     """
 
     title: str
@@ -127,17 +127,17 @@ class Figure:
 
 
 def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> Indices:
-    """Return the indices that keep a curve's look: lowest and highest of each bucket, its ends, and its gaps.
+    """Return the indices that preserve a curve's shape: extremes of each bucket, both ends, and gaps.
 
-    A gap narrower than a bucket is narrower than the line that is drawn. Where there are many such, they are left
-    out: samples lost here and there would otherwise leave nothing of the curve but lone points.
+    A gap narrower than a bucket is narrower than the line drawn. Where there are many such gaps they are omitted:
+    scattered lost samples would otherwise reduce the curve to isolated points.
 
     Parameters
     ----------
     x, y : numpy.ndarray, shape (n,)
         The curve.
     x_log : bool
-        Whether buckets are equally wide in the logarithm of x; else they hold equally many samples.
+        Buckets of equal width in the logarithm of x; otherwise of equal numbers of samples.
 
     Examples
     --------
@@ -168,7 +168,7 @@ def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> Indices:
 
 
 def described(figure: Figure) -> str:
-    """Put into words what is drawn, for those who do not see it: axes, and where each curve lies.
+    """Describe a figure for screen readers: its axes and the range of each curve.
 
     Examples
     --------
