@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from compensator.reasons import Caution, explain
 from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
+from compensator.report.notation import plain, signed
 from compensator.report.page import (
     Block,
     Cell,
@@ -128,7 +129,7 @@ def verdict(history: History) -> str:
             f"the correction{_against_stated(whole)}"
         )
     elif whole.offset.samples:
-        words += f"; it reached {_um(whole.offset.peak, 1)} µm"
+        words += f"; it reached {signed(whole.offset.peak, 1)} µm"
     return f"{words}."
 
 
@@ -202,7 +203,7 @@ def _offset(history: History) -> Figure:
         for piece in history.states[state].pieces
     ]
     curves = {"offset": "offset"}
-    words = f"Largest offset {_um(history.whole.offset.peak, 1)} µm."
+    words = f"Largest offset {signed(history.whole.offset.peak, 1)} µm."
     if history.whole.left.samples:
         curves = {"measured": "measured", "remaining (measured + offset)": "left"} | curves
         words += f" Remaining error: {history.whole.left.rms:.2f} µm rms."
@@ -241,7 +242,7 @@ def _residual(history: History) -> list[Block]:
     residual = history.whole.residual
     if not residual.samples:
         return [Words(title="Residual", lines=["Y was not measured: there is no residual."])]
-    note = f"{residual.rms:.2f} µm rms; the largest is {_um(residual.peak, 1)} µm, {_utc(residual.at_s)}."
+    note = f"{residual.rms:.2f} µm rms; the largest is {signed(residual.peak, 1)} µm, {_utc(residual.at_s)}."
     return [_curves(history, "Residual, measured − predicted", "residual, µm", {"residual": "residual"}, note)]
 
 
@@ -279,12 +280,12 @@ def _other_channels(history: History) -> list[Block]:
 def _figures(history: History) -> Table:
     whole = history.whole
     rows = [
-        ["largest offset", _um(whole.offset.peak, 1), "µm", _at(whole.offset)],
-        ["largest standard deviation of the offset", _plain(whole.std.peak, 2), "µm", _at(whole.std)],
-        ["measured error in Y, rms", _plain(whole.measured.rms, 2), "µm", ""],
-        ["remaining error, rms", _plain(whole.left.rms, 2), "µm", ""],
-        ["largest remaining error", _um(whole.left.peak, 1), "µm", _at(whole.left)],
-        ["residual, rms", _plain(whole.residual.rms, 2), "µm", ""],
+        ["largest offset", signed(whole.offset.peak, 1), "µm", _at(whole.offset)],
+        ["largest standard deviation of the offset", plain(whole.std.peak, 2), "µm", _at(whole.std)],
+        ["measured error in Y, rms", plain(whole.measured.rms, 2), "µm", ""],
+        ["remaining error, rms", plain(whole.left.rms, 2), "µm", ""],
+        ["largest remaining error", signed(whole.left.peak, 1), "µm", _at(whole.left)],
+        ["residual, rms", plain(whole.residual.rms, 2), "µm", ""],
         ["samples", str(whole.samples), "", ""],
     ]
     note = "" if whole.measured.samples else "Y was not measured: –."
@@ -359,9 +360,9 @@ def _day(name: str, period: Period) -> list[Cell]:
         name,
         str(period.samples),
         *map(_minutes, times),
-        _um(period.offset.peak, 1),
-        _plain(period.left.rms, 2),
-        _plain(period.residual.rms, 2),
+        signed(period.offset.peak, 1),
+        plain(period.left.rms, 2),
+        plain(period.residual.rms, 2),
     ]
 
 
@@ -440,14 +441,6 @@ def _utc(t_s: float) -> str:
 
 def _at(spread: Spread) -> str:
     return "" if math.isnan(spread.at_s) else _utc(spread.at_s)
-
-
-def _um(value: float, digits: int) -> str:
-    return "–" if math.isnan(value) else f"{value:+.{digits}f}".replace("-", "−")
-
-
-def _plain(value: float, digits: int) -> str:
-    return "–" if math.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
 def _minutes(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""The pages that demo, identify and diagnose left in a folder, and one page that leads to them."""
+"""The pages that demo, identify and diagnose wrote to a folder, and an overview that links to them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from compensator.report.page import Block, Cell, Link, Page, Table, Tone
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
-    """A page of ours.
+    """A page of the compensator.
 
     Parameters
     ----------
     path : pathlib.Path
         The file.
     title, verdict, tone : str
-        As it says of itself.
+        Read from it.
     """
 
     path: Path
@@ -59,12 +59,12 @@ class _Parser(HTMLParser):
 
 
 def pages_in(folder: Path) -> list[Found]:
-    """Return the pages of a folder and of those in it, the uppermost first.
+    """Return the pages of a folder and its subfolders, the uppermost first.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Where to look; other HTML files are left alone.
+        Where to look; other HTML files are ignored.
     """
     found = []
     for path in sorted(folder.rglob("report.html"), key=lambda path: (len(path.parts), path)):
@@ -77,16 +77,16 @@ def pages_in(folder: Path) -> list[Found]:
 
 
 def overview(folder: Path, pages: Sequence[Found], *, beside: Path) -> Page:
-    """Make one page that leads to others, and to where recordings lie.
+    """Make a page that links to others and lists folders of recordings.
 
     Parameters
     ----------
     folder : pathlib.Path
-        What it is about.
+        The folder of the results.
     pages : sequence of Found
         The pages, the most important first.
     beside : pathlib.Path
-        Folder that the page itself goes into: links are relative to it.
+        Folder of the overview itself: links are relative to it.
     """
 
     def link(path: Path) -> Link:
@@ -94,7 +94,7 @@ def overview(folder: Path, pages: Sequence[Found], *, beside: Path) -> Page:
 
     first = pages[0]
     rows: list[list[Cell]] = [[link(page.path), page.title, page.verdict] for page in pages]
-    blocks: list[Block] = [Table(title="Pages", head=["page", "about", "says"], rows=rows)]
+    blocks: list[Block] = [Table(title="Pages", head=["page", "subject", "result"], rows=rows)]
     folders = sorted({path.parent for path in folder.rglob("*.mcap")})
     if folders:
         blocks.append(
@@ -102,7 +102,7 @@ def overview(folder: Path, pages: Sequence[Found], *, beside: Path) -> Page:
                 title="Recordings",
                 head=["folder", "files"],
                 rows=[[str(path.relative_to(folder)), str(len(list(path.glob("*.mcap"))))] for path in folders],
-                note="compensator report FOLDER makes a page of each.",
+                note="compensator report FOLDER makes a page of one.",
             )
         )
     return Page(title=f"{folder.resolve().name}: {first.title}", verdict=first.verdict, tone=first.tone, blocks=blocks)

@@ -1,4 +1,4 @@
-"""The last day of a machine in letters: curves of bars, a strip of states, and the states in words."""
+"""The last day of a machine in the terminal: sparklines, a strip of states, and the states in words."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from compensator.clock import NS
-from compensator.watch.words import TONES, age, here, plain
+from compensator.report.notation import plain
+from compensator.watch.words import TONES, age, here
 
 _BARS = "▁▂▃▄▅▆▇█"
-#: What a state is drawn as; higher is worse, so that colour is not needed.
+#: Bar of each severity: higher is worse, for readers without colour.
 _STRIP = {"good": "▁", "warn": "▄", "bad": "█"}
-#: How each tone is coloured.
+#: Colour of each severity.
 STYLES = {"good": "green", "warn": "yellow", "bad": "bold red"}
-#: What is drawn of the history: name, column, unit.
+#: Rows: name, column of the history, unit.
 _ROWS = (
     ("offset", "y_offset_um", "µm"),
     ("DTF", "y_dtf_um", "µm"),
@@ -28,25 +29,25 @@ _ROWS = (
     ("AT", "at_degc", "°C"),
 )
 _SHORT = ("offset", "residual")
-#: Room beside the bars: name before, range behind.
+#: Width of the name before and the range after the bars.
 _BESIDE = 38
-#: Points farther apart than this do not belong to one spell, s.
+#: Longest distance of two points in one spell, s.
 GAP_S = 150.0
-#: One point of the history stands for so long, s.
+#: Length of one point of the history, s.
 _POINT_S = 60.0
 
 
 class Spell(NamedTuple):
-    """A time in one state for the same reasons.
+    """An interval in one state with the same reasons.
 
     Parameters
     ----------
     begin_s, end_s : float
         First and last point, s since 1970.
     state : str
-        What the service said of itself.
+        State of the service.
     reasons : str
-        Codes, with blanks between.
+        Codes, separated by spaces.
     """
 
     begin_s: float
@@ -60,7 +61,7 @@ class Spell(NamedTuple):
         Parameters
         ----------
         now_s : float
-            The day of today is left out, s since 1970.
+            Now, s since 1970; the date of today is omitted.
         """
         begin, today = (here(round(t * NS)) for t in (self.begin_s, now_s))
         when = f"{begin:%H:%M}" if begin.date() == today.date() else f"{begin:%m-%d %H:%M}"
@@ -69,7 +70,7 @@ class Spell(NamedTuple):
 
 
 def spells(history: Mapping[str, Sequence[Any]]) -> list[Spell]:
-    """Return the states of a history, the newest first.
+    """Return the intervals of a history, the newest first.
 
     Examples
     --------
@@ -91,14 +92,14 @@ def spells(history: Mapping[str, Sequence[Any]]) -> list[Spell]:
 
 
 def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = False) -> list[RenderableType]:
-    """Return the last day as lines of bars, each with its range and unit, over a strip of states.
+    """Return the last day as sparklines with range and unit, and a strip of states.
 
     Parameters
     ----------
     history : mapping of str to sequence
         Columns as of `History`.
     width : int
-        Of what may be filled, letters.
+        Available width, characters.
     short : bool
         Offset, residual and states only.
     """
@@ -112,9 +113,9 @@ def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = Fal
         values = [value for value in series if value is not None]
         if len(values) < 2:
             continue
-        said = f"{plain(min(values), 1)} to {plain(max(values), 1)} {unit}"
+        extent = f"{plain(min(values), 1)} to {plain(max(values), 1)} {unit}"
         bars = sparkline(evenly(t_s, series, count), count)
-        lines.append(Text.assemble((f"{name:<9}", "dim"), f"{bars:<{count}}", f" {said}"))
+        lines.append(Text.assemble((f"{name:<9}", "dim"), f"{bars:<{count}}", f" {extent}"))
     if lines:
         wide = min(count, len(t_s))
         lines += [_strip(t_s, history["state"], wide), _axis(t_s, wide)]
@@ -126,7 +127,7 @@ def _summed(effects: Sequence[Sequence[float | None]]) -> list[float | None]:
 
 
 def _strip(t_s: Sequence[float], states: Sequence[str | None], count: int) -> Text:
-    """Draw the worst state of each part; a part in which nothing was heard is a blank."""
+    """Draw the worst state of each part; a part without messages is blank."""
     order = ("good", "warn", "bad")
     worst = [-1] * count
     span = max(t_s[-1] - t_s[0], 1e-9)
@@ -137,7 +138,7 @@ def _strip(t_s: Sequence[float], states: Sequence[str | None], count: int) -> Te
     text = Text.assemble(("state    ", "dim"))
     for level in worst:
         text.append(" " if level < 0 else _STRIP[order[level]], style="" if level < 0 else STYLES[order[level]])
-    return text.append(" ▁ ok ▄ mind █ hold, fault", style="dim")
+    return text.append(" ▁ ok ▄ caution █ hold, fault", style="dim")
 
 
 def _axis(t_s: Sequence[float], count: int) -> Text:
@@ -147,7 +148,7 @@ def _axis(t_s: Sequence[float], count: int) -> Text:
 
 
 def evenly(t_s: Sequence[float], values: Sequence[float | None], width: int) -> list[float | None]:
-    """Return the values at even steps of time, None where nothing was heard."""
+    """Return the values at even steps of time, None where there are none."""
     if len(t_s) < 2 or t_s[-1] <= t_s[0]:
         return list(values)
     count = min(width, len(t_s))
@@ -159,7 +160,7 @@ def evenly(t_s: Sequence[float], values: Sequence[float | None], width: int) -> 
 
 
 def sparkline(values: Sequence[float | None], width: int) -> str:
-    """Draw values as a line of bars, the mean of each part; a part without any is a blank.
+    """Draw values as a line of bars, the mean of each part; a part without values is blank.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The last day of a machine as far as it was seen: one point a minute."""
+"""The last day of a machine as received: one point per minute."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ from typing import Any
 from compensator.clock import NS
 from compensator.messages import EstimateMessage, Offset, Sample
 
-#: Length of what is kept and of what one point stands for, ns.
+#: Length of the history and of one point, ns.
 SPAN_NS = 24 * 3600 * NS
 STEP_NS = 60 * NS
-#: What a point has of the estimate and of the offset.
+#: Values of a point from the estimate and from the offset.
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_base_um", "y_pred_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_std_um", "state")
-#: Names of a point's values beside its time, number and effects.
+#: Columns of the history in addition to time and effects.
 COLUMNS = (*_OFFSET, "reasons", *_ESTIMATE, "t_q_degc", "at_degc")
 
 
 class History:
-    """Points of the last day, whatever order the messages come in.
+    """Points of the last day; messages may arrive in any order.
 
-    The newest sample of a minute is its point; one of a faster model that was followed by another in the same minute
-    is left out. Values of one sample come in several messages and belong together by its number. A value that did not
-    arrive is None.
+    The newest sample of a minute is its point. The values of one sample come in several messages with the same number.
+    A value that did not arrive is None.
     """
 
     def __init__(self) -> None:
@@ -34,7 +33,7 @@ class History:
         return len(self._points)
 
     def add(self, message: Sample | EstimateMessage | Offset) -> None:
-        """Take one message in."""
+        """Add a message."""
         bucket = message.time_utc_ns // STEP_NS
         point = self._points.get(bucket)
         if point is None or message.seq > point["seq"]:
@@ -52,25 +51,25 @@ class History:
             point["reasons"] = " ".join(message.reasons)
 
     def prune(self, now_ns: int) -> None:
-        """Forget what is older than a day."""
+        """Remove points older than a day."""
         oldest = (now_ns - SPAN_NS) // STEP_NS
         for bucket in [bucket for bucket in self._points if bucket < oldest]:
             del self._points[bucket]
 
     def misfit(self, now_ns: int, minutes: int) -> tuple[float, float, int]:
-        """Return how far measured and predicted Y are apart, what the service states, and of how many points that is.
+        """Return the medians of |residual| and of the stated standard deviation over the last minutes.
 
         Parameters
         ----------
         now_ns : int
             Now, ns since 1970 UTC.
         minutes : int
-            How far to look back, min.
+            Length of the interval, min.
 
         Returns
         -------
         (float, float, int)
-            Medians of |residual| and of the offset's standard deviation, µm; NaN without any point that has both.
+            Both medians, µm (NaN without any point that has both values), and the number of such points.
         """
         last = now_ns // STEP_NS
         points = [self._points[bucket] for bucket in range(last - minutes, last + 1) if bucket in self._points]
@@ -81,7 +80,7 @@ class History:
         return median(residual for residual, _ in both), median(std for _, std in both), len(both)
 
     def columns(self, since_ns: int = 0) -> dict[str, list[Any]]:
-        """Return the points from a time on, column by column.
+        """Return the points since a time, by columns.
 
         Parameters
         ----------
@@ -103,11 +102,11 @@ class History:
 
 
 def usable(sample: Sample, name: str) -> float | None:
-    """Return the mean of a channel, None where it is missing or was refused."""
+    """Return the mean of a channel; None if it is missing or refused."""
     channel = sample.channels.get(name)
     return channel.mean if channel is not None and channel.quality == "good" else None
 
 
 def _short(value: Any) -> Any:
-    """Leave out digits that no picture shows."""
+    """Round to the digits that a figure can show."""
     return round(value, 4) if isinstance(value, float) else value
