@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from compensator.arrays import Indices, Vector
-from compensator.report.figure import Line
+from compensator.arrays import Vector
+from compensator.report.figure import Line, extremes
 
 #: Least number of columns of a curve; each keeps its lowest and its highest point.
 COLUMNS = 1000
@@ -113,7 +113,7 @@ class Envelope:
             span_s = max(float(t[-1] - t[0]), 1.0)
             self._width_s = max(self._width_s, 2.0 ** math.floor(math.log2(span_s / COLUMNS)))
             self._add_up()
-            keep = _extremes(np.floor(t / self._width_s), y)
+            keep = extremes(np.floor(t / self._width_s), y)
             t, y = t[keep], y[keep]
         self._t, self._y, self._size = [t], [y], t.size
 
@@ -131,14 +131,6 @@ class Envelope:
         both = np.concatenate([old[1:], fresh[1:]], axis=1)
         sums = [np.bincount(place, weights=weights, minlength=number.size) for weights in both]
         self._sums, self._new, self._summed_s = np.array([number, *sums]), [], self._width_s
-
-
-def _extremes(column: Vector, y: Vector) -> Indices:
-    """Return the indices of the lowest and highest value of each column; of its first point if it has no value."""
-    order = np.lexsort((y, column))
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(column[order])) + 1])
-    known = np.add.reduceat(np.isfinite(y[order]).astype(np.int_), starts)
-    return np.unique(np.concatenate([order[starts], order[starts + np.maximum(known - 1, 0)]]))
 
 
 def line_of(name: str, curve: Envelope) -> Line:

@@ -152,19 +152,29 @@ def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> Indices:
     place = np.arange(x.size) * (_BUCKETS / x.size)
     if x_log and x[0] > 0.0 and bool(np.all(np.diff(x) > 0.0)):
         place = np.log(x / x[0]) / np.log(x[-1] / x[0]) * _BUCKETS
-    finite = np.isfinite(y)
-    keep = {0, x.size - 1}
-    for bucket in np.split(np.arange(x.size), np.flatnonzero(np.diff(np.floor(place))) + 1):
-        seen = bucket[finite[bucket]]
-        if seen.size:
-            keep |= {int(seen[np.argmin(y[seen])]), int(seen[np.argmax(y[seen])])}
-    known = np.flatnonzero(finite)
+    keep = {0, x.size - 1, *extremes(np.floor(place), y).tolist()}
+    known = np.flatnonzero(np.isfinite(y))
     gaps = np.diff(known) > 1
     if np.count_nonzero(gaps) > _GAPS:
         gaps &= np.diff(place[known]) >= 1.0
     for i in np.flatnonzero(gaps).tolist():
         keep |= {int(known[i]), int(known[i]) + 1, int(known[i + 1])}
     return np.array(sorted(keep))
+
+
+def extremes(column: Vector, y: Vector) -> Indices:
+    """Return the indices of the lowest and highest finite value of each column; of its first point if it has none.
+
+    Examples
+    --------
+    >>> extremes(np.array([0.0, 0.0, 0.0, 1.0]), np.array([2.0, np.nan, 1.0, np.inf]))
+    array([0, 2, 3])
+    """
+    finite = np.isfinite(y)
+    order = np.lexsort((np.where(finite, y, np.inf), column))
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(column[order])) + 1])
+    known = np.add.reduceat(finite[order].astype(np.int_), starts)
+    return np.unique(np.concatenate([order[starts], order[starts + np.maximum(known - 1, 0)]]))
 
 
 def described(figure: Figure) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -211,81 +212,44 @@ def _parameters(calibration: Calibration, criticism: Criticism) -> list[Block]:
 def _path_section(view: PathView) -> Block:
     unit = view.unit.replace("um", "µm")
     hours = view.t_min / 60.0
+
+    def plot(name: str, x_label: str, y_label: str, *lines: Line, **options: Any) -> Figure:
+        title = f"{view.name}: {name}"
+        return Figure(title=title, x_label=x_label, y_label=y_label, lines=lines, height=3.2, **options)
+
     band = (view.step - 2 * view.step_std, view.step + 2 * view.step_std)
-    zeros = tuple([Marks("zeros", view.zeros.real, view.zeros.imag, marker="o")] if view.zeros.size else [])
-    step = Figure(
-        title=f"{view.name}: step response",
-        x_label="time, h",
-        y_label=unit,
-        lines=(Line("step, ± 2 standard errors", hours, view.step, band=band),),
-        limits=(view.gain,),
-        height=3.2,
-        note=f"Settles at {with_std(view.gain, view.gain_std)} {unit} (dashed).",
+    step = Line("step, ± 2 standard errors", hours, view.step, band=band)
+    settles = f"Settles at {with_std(view.gain, view.gain_std)} {unit} (dashed)."
+    zeros = [Marks("zeros", view.zeros.real, view.zeros.imag, marker="o")] if view.zeros.size else []
+    poles = (Marks("poles", view.poles.real, view.poles.imag), *zeros)
+    impulse = Line("impulse", hours, view.impulse)
+    magnitude = Line("magnitude", view.frequency_per_h, view.magnitude)
+    phase = Line("phase", view.frequency_per_h, view.phase_deg)
+    shown = (
+        plot("step response", "time, h", unit, step, limits=(view.gain,), note=settles),
+        plot("poles and zeros, z plane", "real part", "imaginary part", unit_circle=True, marks=poles),
     )
-    impulse = Figure(
-        title=f"{view.name}: impulse response",
-        x_label="time, h",
-        y_label=f"{unit} per sample",
-        lines=(Line("impulse", hours, view.impulse),),
-        height=3.2,
+    folded = (
+        plot("impulse response", "time, h", f"{unit} per sample", impulse),
+        plot("magnitude", "frequency, 1/h", unit, magnitude, x_log=True, y_log=True),
+        plot("phase", "frequency, 1/h", "degrees", phase, x_log=True),
     )
-    bode = (
-        Figure(
-            title=f"{view.name}: magnitude",
-            x_label="frequency, 1/h",
-            y_label=unit,
-            x_log=True,
-            y_log=True,
-            lines=(Line("magnitude", view.frequency_per_h, view.magnitude),),
-            height=3.2,
-        ),
-        Figure(
-            title=f"{view.name}: phase",
-            x_label="frequency, 1/h",
-            y_label="degrees",
-            x_log=True,
-            lines=(Line("phase", view.frequency_per_h, view.phase_deg),),
-            height=3.2,
-        ),
-    )
-    plane = Figure(
-        title=f"{view.name}: poles and zeros, z plane",
-        x_label="real part",
-        y_label="imaginary part",
-        unit_circle=True,
-        marks=(Marks("poles", view.poles.real, view.poles.imag), *zeros),
-        height=3.2,
-    )
-    return Section(
-        title=f"{view.name}",
-        blocks=[
-            Row(figures=(step, plane)),
-            Details(title=f"{view.name}: impulse response and Bode diagram", blocks=[Row(figures=(impulse, *bode))]),
-        ],
-    )
+    details = Details(title=f"{view.name}: impulse response and Bode diagram", blocks=[Row(figures=folded)])
+    return Section(title=view.name, blocks=[Row(figures=shown), details])
 
 
 def _correlations(view: ResidualView) -> Block:
+    def plot(name: str, stems: Stems, limit: float, note: str = "") -> Figure:
+        title, limits = f"{view.name}: {name}", (-limit, limit)
+        axes: dict[str, Any] = {"x_label": "lag, samples", "y_label": "correlation", "height": 3.0}
+        return Figure(title=title, stems=(stems,), limits=limits, note=note, **axes)
+
     lags = np.arange(1, view.autocorrelation.size + 1, dtype=np.float64)
-    own = Figure(
-        title=f"{view.name}: autocorrelation of the residual",
-        x_label="lag, samples",
-        y_label="correlation",
-        stems=(Stems("residual", lags, view.autocorrelation),),
-        limits=(-view.limit, view.limit),
-        height=3.0,
-        note=f"Dashed: 99 % limits of white noise. Whiteness test: p {_probability(view.white_chance)}.",
-    )
     both = np.arange(-LAGS, LAGS + 1, dtype=np.float64)
-    cross = tuple(
-        Figure(
-            title=f"{view.name}: correlation of the residual with {name}",
-            x_label="lag, samples",
-            y_label="correlation",
-            stems=(Stems(name, both, values),),
-            limits=(-limit, limit),
-            height=3.0,
-        )
+    note = f"Dashed: 99 % limits of white noise. Whiteness test: p {_probability(view.white_chance)}."
+    own = plot("autocorrelation of the residual", Stems("residual", lags, view.autocorrelation), view.limit, note)
+    cross = (
+        plot(f"correlation of the residual with {name}", Stems(name, both, values), limit)
         for name, (values, limit) in view.cross.items()
     )
     return Row(figures=(own, *cross))

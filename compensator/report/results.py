@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import html
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html.parser import HTMLParser
 from pathlib import Path
+from typing import cast
 from urllib.parse import quote
 
 from compensator.report.page import Block, Cell, Link, Page, Table, Tone
+
+#: Title, tone and verdict of a page, as `page.html_of` writes them.
+_HEAD = re.compile(r'<h1>([^<]*)</h1><p class="verdict (good|warn|bad)"><b>[^<]*</b>([^<]*)</p>')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,34 +35,6 @@ class Found:
     tone: Tone
 
 
-class _Parser(HTMLParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.tone: Tone | None = None
-        self.words = {"h1": "", "verdict": ""}
-        self._in = ""
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        kinds = (dict(attrs).get("class") or "").split()
-        if tag == "h1":
-            self._in = "h1"
-        elif tag == "p" and kinds[:1] == ["verdict"]:
-            self._in = "verdict"
-            self.tone = next((tone for tone in ("good", "warn", "bad") if tone in kinds), "good")
-        elif tag == "b" and self._in == "verdict":
-            self._in = "sign"
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag == "b" and self._in == "sign":
-            self._in = "verdict"
-        elif tag in ("h1", "p"):
-            self._in = ""
-
-    def handle_data(self, data: str) -> None:
-        if self._in in self.words:
-            self.words[self._in] += data
-
-
 def pages_in(folder: Path) -> list[Found]:
     """Return the pages of a folder and its subfolders, the uppermost first.
 
@@ -68,11 +45,10 @@ def pages_in(folder: Path) -> list[Found]:
     """
     found = []
     for path in sorted(folder.rglob("report.html"), key=lambda path: (len(path.parts), path)):
-        parser = _Parser()
-        parser.feed(path.read_text(encoding="utf-8", errors="replace"))
-        if parser.tone is not None:
-            words = parser.words
-            found.append(Found(path=path, title=words["h1"], verdict=words["verdict"], tone=parser.tone))
+        head = _HEAD.search(path.read_text(encoding="utf-8", errors="replace"))
+        if head is not None:
+            title, tone, verdict = map(html.unescape, head.groups())
+            found.append(Found(path=path, title=title, verdict=verdict, tone=cast(Tone, tone)))
     return found
 
 

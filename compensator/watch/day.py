@@ -114,7 +114,7 @@ def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = Fal
         if len(values) < 2:
             continue
         extent = f"{plain(min(values), 1)} to {plain(max(values), 1)} {unit}"
-        bars = sparkline(evenly(t_s, series, count), count)
+        bars = sparkline(evenly(t_s, series, count))
         lines.append(Text.assemble((f"{name:<9}", "dim"), f"{bars:<{count}}", f" {extent}"))
     if lines:
         wide = min(count, len(t_s))
@@ -148,33 +148,26 @@ def _axis(t_s: Sequence[float], count: int) -> Text:
 
 
 def evenly(t_s: Sequence[float], values: Sequence[float | None], width: int) -> list[float | None]:
-    """Return the values at even steps of time, None where there are none."""
+    """Return means over even steps of time, at most `width` of them; None where there is no value."""
     if len(t_s) < 2 or t_s[-1] <= t_s[0]:
         return list(values)
     count = min(width, len(t_s))
     parts: list[list[float]] = [[] for _ in range(count)]
     for t, value in zip(t_s, values, strict=True):
-        if value is not None:
+        if value is not None and math.isfinite(value):
             parts[min(int((t - t_s[0]) / (t_s[-1] - t_s[0]) * count), count - 1)].append(value)
     return [sum(part) / len(part) if part else None for part in parts]
 
 
-def sparkline(values: Sequence[float | None], width: int) -> str:
-    """Draw values as a line of bars, the mean of each part; a part without values is blank.
+def sparkline(values: Sequence[float | None]) -> str:
+    """Draw values as bars; a missing value is blank.
 
     Examples
     --------
-    >>> sparkline([0.0, 1.0, None, 2.0], 4)
+    >>> sparkline([0.0, 1.0, None, 2.0])
     '▁▅ █'
     """
-    if not values:
-        return ""
-    count = min(width, len(values))
-    parts = [values[i * len(values) // count : (i + 1) * len(values) // count] for i in range(count)]
-    means = [[v for v in part if v is not None and math.isfinite(v)] for part in parts]
-    known = [sum(part) / len(part) for part in means if part]
-    if not known:
-        return " " * count
-    low, high = min(known), max(known)
+    known = [value for value in values if value is not None]
+    low, high = min(known, default=0.0), max(known, default=0.0)
     scale = (len(_BARS) - 1) / (high - low) if high > low else 0.0
-    return "".join(_BARS[round((sum(p) / len(p) - low) * scale)] if p else " " for p in means)
+    return "".join(" " if value is None else _BARS[round((value - low) * scale)] for value in values)

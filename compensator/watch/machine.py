@@ -26,6 +26,10 @@ MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
 ATTENTION = {"token_gone", "malformed_messages", "misfit"}
 #: A message farther ahead of this computer's clock shows that the clocks differ, s.
 AHEAD_S = 5.0
+#: Values of a snapshot that come from the messages as they are.
+_OFFSET = ("state", "seq", "time_utc_ns", "valid_for_s", "y_offset_um", "y_offset_std_um", "model_sha256")
+_ESTIMATE = ("y_um", "y_pred_um", "residual_um", "heat_w", "heat_std_w")
+_STATUS = ("version", "model", "model_kind", "started_utc_ns", "recording", "devices")
 
 _DECODERS = {kind: msgspec.json.Decoder(MESSAGES[kind]) for kind in KINDS.values()}
 
@@ -248,19 +252,13 @@ class Machine:
             "means": in_words(shown).means,
             "do": in_words(shown).do,
             "alive": self.alive,
-            "state": offset.state if offset else None,
             "reasons": [words._asdict() for words in reasons],
             "to_do": _to_do(shown, reasons, warnings),
             "warnings": list(warnings),
             "warning_codes": [warning.code for warning in warnings],
-            "seq": offset.seq if offset else None,
-            "time_utc_ns": offset.time_utc_ns if offset else None,
             "age_s": round(old_s, 3) if old_s is not None else None,
-            "valid_for_s": offset.valid_for_s if offset else None,
-            "y_offset_um": offset.y_offset_um if offset else None,
+            **{name: getattr(offset, name, None) for name in _OFFSET},
             "y_offset_rate_um_per_min": offset.y_offset_rate_um_per_min if offset and shown != "silent" else None,
-            "y_offset_std_um": offset.y_offset_std_um if offset else None,
-            "model_sha256": offset.model_sha256 if offset else None,
             **self._estimated(now_ns),
             **self._measured(now_ns),
             "received": self.numbers.received,
@@ -270,8 +268,7 @@ class Machine:
             "last_malformed": self.last_malformed,
             "events": [self._event(event) for event in reversed(self.events)],
         }
-        names = ("version", "model", "model_kind", "started_utc_ns", "recording", "devices")
-        return found | {name: getattr(status, name) if status else None for name in names}
+        return found | {name: getattr(status, name, None) for name in _STATUS}
 
     def _fresh(self, message: Any, now_ns: int) -> bool:
         """Return whether a message is still valid by its own time."""
@@ -279,16 +276,15 @@ class Machine:
         return message is not None and (now_ns - message.time_utc_ns) / NS <= valid_s
 
     def _estimated(self, now_ns: int) -> dict[str, Any]:
-        names = ("y_um", "y_pred_um", "residual_um", "heat_w", "heat_std_w")
         estimate = self._estimate
         if estimate is None or not self._fresh(estimate, now_ns):
-            return {**dict.fromkeys(names), "shares": []}
+            return {**dict.fromkeys(_ESTIMATE), "shares": []}
         effects = [(name, value) for name, value in zip(self.effects(), estimate.y_effects_um, strict=False)]
         parts = [("DTF", estimate.y_dtf_um), ("TDTF", estimate.y_tdtf_um), *effects]
         # The prediction at the zero is subtracted from the sum.
         parts += [("at the zero", -estimate.y_base_um)] if estimate.y_base_um else []
         shares = [{"name": name, "y_um": value} for name, value in parts]
-        return {**{name: getattr(estimate, name) for name in names}, "shares": shares}
+        return {**{name: getattr(estimate, name) for name in _ESTIMATE}, "shares": shares}
 
     def effects(self) -> list[str]:
         """Return the names of the running model's effects, by number if they are unknown."""
@@ -300,22 +296,13 @@ class Machine:
         sample = self._sample
         if sample is None or not self._fresh(sample, now_ns):
             return {"t_q_degc": None, "at_degc": None, "period_s": None, "channels": {}}
-        channels = {
-            name: {
-                "mean": usable(sample, name),
-                "quality": channel.quality,
-                "errors": channel.errors,
-                "means": in_words(channel.quality).means,
-                "do": in_words(channel.quality).do,
-            }
-            for name, channel in sample.channels.items()
-        }
-        return {
-            "t_q_degc": usable(sample, "t_q_degc"),
-            "at_degc": usable(sample, "at_degc"),
-            "period_s": sample.period_s,
-            "channels": channels,
-        }
+        channels: dict[str, Any] = {}
+        for name, channel in sample.channels.items():
+            _, means, do = in_words(channel.quality)
+            values = {"mean": usable(sample, name), "quality": channel.quality, "errors": channel.errors}
+            channels[name] = values | {"means": means, "do": do}
+        temperatures = {name: usable(sample, name) for name in ("t_q_degc", "at_degc")}
+        return {**temperatures, "period_s": sample.period_s, "channels": channels}
 
     @staticmethod
     def _event(event: Event) -> dict[str, Any]:

@@ -128,7 +128,8 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
     for machine in shown:
         cells = _cells(machine)
         if "last 24 h" in names:
-            cells["last 24 h"] = Text(_offsets(shop.history(machine["prefix"]), 24))
+            history = shop.history(machine["prefix"])
+            cells["last 24 h"] = Text(sparkline(evenly(history["t_s"], history["y_offset_um"], 24)))
         table.add_row(*(cells[name] for name in names))
     left_out = machines[len(shown) :]
     if not left_out:
@@ -278,10 +279,6 @@ def _titled(title: str, lines: list[str]) -> RenderableType:
     for line in lines:
         table.add_row(Text("•"), Text(line))
     return Group(Text(f"\n{title}", style="bold"), table)
-
-
-def _offsets(history: dict[str, list[Any]], width: int) -> str:
-    return sparkline(evenly(history["t_s"], history["y_offset_um"], width), width) if history else ""
 
 
 # ---------------------------------------------------------------------------- without a terminal
