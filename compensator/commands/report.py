@@ -46,7 +46,7 @@ def _results(folder: Path, out: Path) -> Answer:
     pages = [page for page in pages_in(folder) if page.path.resolve() != out.resolve()]
     if not pages:
         raise UsageError(f"{folder}: neither recordings (*.mcap) nor pages (report.html)")
-    write(out, overview(folder, pages, beside=out.parent))
+    write(out, overview(folder, pages, relative_to=out.parent))
     result = {
         "report": str(out),
         "pages": [{"page": str(p.path), "title": p.title, "verdict": p.verdict} for p in pages],

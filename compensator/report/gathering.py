@@ -48,9 +48,9 @@ def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] 
     Raises
     ------
     DataError
-        If a file is not a recording, or there are no samples.
+        If one of them is no recording, or there are no samples.
     UsageError
-        If the recordings are of several machines.
+        If they are of several machines.
     """
     ordered = _in_order(paths)
     whole = sum(path.stat().st_size for path in ordered)
@@ -65,7 +65,7 @@ def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] 
 
 
 def _in_order(paths: Sequence[Path]) -> list[Path]:
-    """Return the files in order of their start; refuse those of several machines."""
+    """Return the files as they were begun; refuse those of several machines."""
     began: dict[Path, tuple[str, str]] = {}
     for path in dict.fromkeys(paths):
         with Container(path) as container:

@@ -52,7 +52,7 @@ def pages_in(folder: Path) -> list[Found]:
     return found
 
 
-def overview(folder: Path, pages: Sequence[Found], *, beside: Path) -> Page:
+def overview(folder: Path, pages: Sequence[Found], *, relative_to: Path) -> Page:
     """Make a page that links to others and lists folders of recordings.
 
     Parameters
@@ -61,12 +61,12 @@ def overview(folder: Path, pages: Sequence[Found], *, beside: Path) -> Page:
         The folder of the results.
     pages : sequence of Found
         The pages, the most important first.
-    beside : pathlib.Path
+    relative_to : pathlib.Path
         Folder of the overview itself: links are relative to it.
     """
 
     def link(path: Path) -> Link:
-        return Link(str(path.relative_to(folder)), quote(Path(os.path.relpath(path, beside)).as_posix()))
+        return Link(str(path.relative_to(folder)), quote(Path(os.path.relpath(path, relative_to)).as_posix()))
 
     first = pages[0]
     rows: list[list[Cell]] = [[link(page.path), page.title, page.verdict] for page in pages]

@@ -82,7 +82,7 @@ class FoxgloveServer:
                 server_listener=_Listener(self._join),
             )
         except (RuntimeError, OSError, OverflowError) as error:
-            raise ServiceError(f"--foxglove-port {self._port}: {error}; 0 takes a free one") from error
+            raise ServiceError(f"--foxglove-port {self._port}: {error}; 0 selects a free port") from error
         return self
 
     def __exit__(self, *_: object) -> None:

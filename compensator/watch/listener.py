@@ -107,7 +107,7 @@ class Listener:
         Raises
         ------
         ServiceError
-            If nobody is there, or an endpoint cannot be used.
+            If there is no answer, or an endpoint cannot be used.
         """
         config = self._source.config()
         put(config, "connect/timeout_ms", 0)

@@ -272,8 +272,8 @@ function chart(frame, title, unit, series, states) {
   const left = 52, right = 8, top = 6, strip = states ? 26 : 0, tall = width < 500 ? 170 : 210, height = tall + strip + 40;
   const caption = make("figcaption", {}, title), keys = make("ul", {class: "keys"});
   const values = series.flatMap((one) => one.y.flatMap((v, i) => known(v) ? (one.band && known(one.band[i]) ? [v - one.band[i], v + one.band[i]] : [v]) : []));
-  const said = series.map((one) => { const seen = one.y.filter(known); return seen.length ? `${one.name} last ${plain(seen[seen.length - 1])} ${unit}, from ${plain(Math.min(...seen))} to ${plain(Math.max(...seen))}` : `${one.name}: no values`; });
-  const svg = make("svg", {viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${title}. ${said.join("; ")}; in the last ${((end - from) / 3600).toFixed(1)} h.`});
+  const ranges = series.map((one) => { const seen = one.y.filter(known); return seen.length ? `${one.name} last ${plain(seen[seen.length - 1])} ${unit}, from ${plain(Math.min(...seen))} to ${plain(Math.max(...seen))}` : `${one.name}: no values`; });
+  const svg = make("svg", {viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${title}. ${ranges.join("; ")}; in the last ${((end - from) / 3600).toFixed(1)} h.`});
   const figure = make("figure", {}, caption, keys, svg);
   series.forEach((one, i) => keys.append(make("li", {}, make("svg", {viewBox: "0 0 32 12", "aria-hidden": "true"}, make("path", {d: "M0 6H32", class: `curve c${i}`})), one.name)));
   if (!values.length) { keys.replaceChildren(make("li", {}, "no values yet")); }

@@ -178,36 +178,36 @@ class Machine:
 
     def warnings(self, now_ns: int, monotonic_s: float) -> list[Caution]:
         """Return warnings about what was received."""
-        said = []
+        found = []
         offset, shown = self._offset, self.shown(now_ns, monotonic_s)
         if self.alive is False and shown not in ("silent", "unknown"):
-            said.append(
+            found.append(
                 Caution("token_gone", "Its liveliness token is gone: the service has ended or is disconnected.")
             )
         if self.alive and shown == "silent":
             figures = "Its liveliness token exists: the service is connected, but publishes nothing new."
-            said.append(Caution("alive_but_silent", figures))
+            found.append(Caution("alive_but_silent", figures))
         other, heard_s = self._other
         if offset is not None and monotonic_s - heard_s < 4.0 * offset.valid_for_s:
-            said.append(Caution("two_services", f"Two services publish below this prefix: {other} and {self.name}."))
+            found.append(Caution("two_services", f"Two services publish below this prefix: {other} and {self.name}."))
         if offset is not None and offset.time_utc_ns - now_ns > AHEAD_S * NS:
             figures = f"Its clock is ahead of this computer's by {age((offset.time_utc_ns - now_ns) / NS)}."
-            said.append(Caution("clock_ahead", figures))
+            found.append(Caution("clock_ahead", figures))
         if offset is not None and shown == "silent" and monotonic_s - self._arrived_s < offset.valid_for_s / 2.0:
             figures = "Messages arrive with old times: one of the two clocks is wrong, or messages are repeated."
-            said.append(Caution("old_messages", figures))
+            found.append(Caution("old_messages", figures))
         misfit = self._misfit(now_ns, shown)
         if misfit is not None:
-            said.append(misfit)
+            found.append(misfit)
         if self.malformed:
             figures = f"{self.malformed} malformed message(s), the last: {self.last_malformed}."
-            said.append(Caution("malformed_messages", figures))
+            found.append(Caution("malformed_messages", figures))
         if self.numbers.missed:
-            said.append(Caution("missed_messages", f"{self.numbers.missed} message(s) never arrived here."))
+            found.append(Caution("missed_messages", f"{self.numbers.missed} message(s) never arrived here."))
         if self.numbers.repeated:
             figures = f"{self.numbers.repeated} message(s) had a number that was received before."
-            said.append(Caution("repeated_numbers", figures))
-        return said
+            found.append(Caution("repeated_numbers", figures))
+        return found
 
     def _misfit(self, now_ns: int, shown: str) -> Caution | None:
         """Warn if Y differs from its prediction by more than the service states, unless the service warns of it itself.

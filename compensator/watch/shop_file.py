@@ -1,4 +1,4 @@
-"""Compacts a shop's finished recording, complete or torn, and verifies the copy before it replaces the original."""
+"""A shop's recording after it was written: made compact, whole or torn, and checked before it takes its place."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from compensator.recording.live_file import sync_folder
 
 
 def compact(path: Path) -> str:
-    """Rewrite a finished recording with chunks, compression, CRCs and index.
+    """Rewrite a recording that nobody writes to with chunks, compression, CRCs and index.
 
-    Every complete message of a torn file is kept. A kill at any time leaves a complete file under the name.
+    Every whole message of a torn file is kept. A kill at any time leaves one whole file under the name.
 
     Parameters
     ----------
     path : pathlib.Path
-        A shop's recording; one that is compact or still being written is left unchanged.
+        A shop's recording; one that is compact or is being written is left alone.
 
     Returns
     -------
     str
-        The outcome in words; empty if nothing was done.
+        What became of it, in words; empty where there was nothing to do.
 
     Raises
     ------
     OSError
-        If the copy cannot be written; the file stays as it is.
+        If the disk does not take the copy; the file stays as it is.
     DataError
-        If the file is damaged, or the copy differs from it; it stays as it is.
+        If the file is damaged, or the copy does not read back as what was copied; it stays as it is.
     """
     part = path.with_name(path.name.removesuffix(".mcap") + ".mcap.part")
     with path.open("rb") as live:
@@ -55,18 +55,18 @@ def compact(path: Path) -> str:
                 return ""
             count, digest, ended = copied
             if _read_back(part) != (count, digest):
-                raise DataError(f"{part}: differs from the original when read back")
+                raise DataError(f"{part}: does not read back as what was written")
             part.replace(path)
         except McapError as error:
             raise DataError(f"{path}: {error}") from error
         finally:
             part.unlink(missing_ok=True)
     sync_folder(path.parent)
-    return f"{count} messages, compact" + ("" if ended else "; it had no end, every complete message was kept")
+    return f"{count} messages, compact" + ("" if ended else "; it had no end, every whole message was kept")
 
 
 def _copy(path: Path, file: BinaryIO) -> tuple[int, str, bool] | None:
-    """Copy a recording; return number and hash of its messages and whether it had an end, None if it is compact."""
+    """Copy a recording; return number and hash of its messages and whether it had its end, None where it is compact."""
     writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="", library=f"compensator {__version__}")
     numbers: dict[int, int] = {}
@@ -108,7 +108,7 @@ def _register(writer: Writer, contents: Contents, number: int, schemas: dict[tup
 
 
 def _read_back(path: Path) -> tuple[int, str]:
-    """Return number and hash of the messages, read by the library's own reader."""
+    """Return number and hash of the messages as the library's seeking reader finds them."""
     digest, count = hashlib.sha256(), 0
     with path.open("rb") as file:
         for _, channel, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False):
