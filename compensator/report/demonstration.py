@@ -110,8 +110,8 @@ def _error(day: MachineDay) -> Figure:
         x_label=_TIME,
         y_label="error in Y, µm",
         lines=(Line("without", t, day.errors["without"]), Line("with", t, day.errors["followed"])),
-        note=f"{figures['without']['rms_um']:.1f} µm rms without, {figures['followed']['rms_um']:.2f} with, as the "
-        "simulated machine itself knows it.",
+        note=f"{figures['without']['rms_um']:.1f} µm rms without, {figures['followed']['rms_um']:.2f} with, against "
+        "the true deformation of the simulated machine.",
     )
 
 

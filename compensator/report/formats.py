@@ -46,6 +46,8 @@ _OPTIONS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    "--disable-crash-reporter",
+    "--disable-breakpad",
     # On paper and in a picture the light colours, whatever the desktop is set to.
     "--blink-settings=preferredColorScheme=1",
 )

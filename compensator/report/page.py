@@ -16,6 +16,7 @@ from itertools import chain, count, repeat
 from pathlib import Path
 from typing import Literal
 
+from compensator.atomic_write import whole_file
 from compensator.reasons import Caution, explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
@@ -193,7 +194,8 @@ def write_page(path: Path, page: Page) -> Path:
     pathlib.Path
         The same path.
     """
-    path.write_text(html_of(page), encoding="utf-8")
+    with whole_file(path) as file:
+        file.write(html_of(page))
     return path
 
 

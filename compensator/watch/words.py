@@ -54,7 +54,11 @@ def in_words(code: str) -> Words:
     """
     found = explain(code)
     if found is None:
-        return Words(code, "Unknown code: the service may be newer than this program.", "Install the same version.")
+        return Words(
+            code,
+            "Unknown code: the service may be newer than this program.",
+            "Install the same version on both computers.",
+        )
     return Words(code, *found)
 
 
