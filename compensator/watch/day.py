@@ -1,17 +1,17 @@
-"""The last day of a machine in the terminal: sparklines, a strip of states, and the states in words."""
+"""The last day of a machine in the terminal: sparklines and a strip of states."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from rich.console import RenderableType
 from rich.text import Text
 
 from compensator.clock import NS
 from compensator.report.notation import plain
-from compensator.watch.words import TONES, age, here
+from compensator.watch.words import TONES, here
 
 _BARS = "▁▂▃▄▅▆▇█"
 #: Bar of each severity: higher is worse, for readers without colour.
@@ -31,64 +31,6 @@ _ROWS = (
 _SHORT = ("offset", "residual")
 #: Width of the name before and the range after the bars.
 _BESIDE = 38
-#: Longest distance of two points in one spell, s.
-GAP_S = 150.0
-#: Length of one point of the history, s.
-_POINT_S = 60.0
-
-
-class Spell(NamedTuple):
-    """An interval in one state with the same reasons.
-
-    Parameters
-    ----------
-    begin_s, end_s : float
-        First and last point, s since 1970.
-    state : str
-        State of the service.
-    reasons : str
-        Codes, separated by spaces.
-    """
-
-    begin_s: float
-    end_s: float
-    state: str
-    reasons: str
-
-    def text(self, now_s: float) -> str:
-        """Return it in one line, in local time.
-
-        Parameters
-        ----------
-        now_s : float
-            Now, s since 1970; the date of today is omitted.
-        """
-        begin, today = (here(round(t * NS)) for t in (self.begin_s, now_s))
-        when = f"{begin:%H:%M}" if begin.date() == today.date() else f"{begin:%m-%d %H:%M}"
-        long = age(self.end_s - self.begin_s + _POINT_S)
-        return f"{when} {self.state} for {long}" + (f": {self.reasons}" if self.reasons else "")
-
-
-def spells(history: Mapping[str, Sequence[Any]]) -> list[Spell]:
-    """Return the intervals of a history, the newest first.
-
-    Examples
-    --------
-    >>> day = {"t_s": [0.0, 60.0, 120.0], "state": ["ok", "ok", "hold"], "reasons": ["", "", "operator_hold"]}
-    >>> [(spell.state, spell.end_s - spell.begin_s) for spell in spells(day)]
-    [('hold', 0.0), ('ok', 60.0)]
-    """
-    found: list[Spell] = []
-    columns = (history.get(name, ()) for name in ("t_s", "state", "reasons"))
-    for t, state, reasons in zip(*columns, strict=True):
-        if state is None:
-            continue
-        last = found[-1] if found else None
-        if last is not None and (last.state, last.reasons) == (state, reasons or "") and t - last.end_s < GAP_S:
-            found[-1] = last._replace(end_s=t)
-        else:
-            found.append(Spell(t, t, state, reasons or ""))
-    return found[::-1]
 
 
 def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = False) -> list[RenderableType]:

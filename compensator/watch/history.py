@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 from compensator.clock import NS
 from compensator.messages import EstimateMessage, Offset, Sample
@@ -12,11 +13,32 @@ from compensator.messages import EstimateMessage, Offset, Sample
 #: Length of the history and of one point, ns.
 SPAN_NS = 24 * 3600 * NS
 STEP_NS = 60 * NS
+#: Shortest pause that separates two intervals in the same state, s.
+LEAST_PAUSE_S = 150.0
 #: Values of a point from the estimate and from the offset.
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_base_um", "y_pred_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_std_um", "state")
 #: Columns of the history in addition to time and effects.
 COLUMNS = (*_OFFSET, "reasons", *_ESTIMATE, "t_q_degc", "at_degc")
+
+
+class Spell(NamedTuple):
+    """An interval in one state with the same reasons.
+
+    Parameters
+    ----------
+    begin_s, end_s : float
+        Its first point and the end of its last, s since 1970.
+    state : str
+        State of the service.
+    reasons : str
+        Codes, separated by spaces.
+    """
+
+    begin_s: float
+    end_s: float
+    state: str
+    reasons: str
 
 
 class History:
@@ -99,6 +121,37 @@ class History:
             found[name] = [_short(point.get(name)) for point in points]
         found["effects"] = [[_short(value) for value in point.get("effects", ())] for point in points]
         return found
+
+
+def spells(history: Mapping[str, Sequence[Any]], valid_for_s: float | None) -> list[Spell]:
+    """Return the intervals of a history, the newest first.
+
+    Parameters
+    ----------
+    history : mapping of str to sequence
+        Columns as of `History`.
+    valid_for_s : float, optional
+        Validity of an offset, s: a longer pause separates two intervals.
+
+    Examples
+    --------
+    >>> day = {"t_s": [0.0, 60.0, 120.0], "state": ["ok", "ok", "hold"], "reasons": ["", "", "operator_hold"]}
+    >>> [(spell.state, spell.end_s - spell.begin_s) for spell in spells(day, 150.0)]
+    [('hold', 60.0), ('ok', 120.0)]
+    """
+    found: list[Spell] = []
+    step_s = STEP_NS / NS
+    pause_s = max(LEAST_PAUSE_S, valid_for_s or 0.0)
+    columns = (history.get(name, ()) for name in ("t_s", "state", "reasons"))
+    for t, state, reasons in zip(*columns, strict=True):
+        last = found[-1] if found else None
+        if state is None:
+            continue
+        if last is not None and last[2:] == (state, reasons or "") and t - last.end_s + step_s < pause_s:
+            found[-1] = last._replace(end_s=t + step_s)
+        else:
+            found.append(Spell(t, t + step_s, state, reasons or ""))
+    return found[::-1]
 
 
 def usable(sample: Sample, name: str) -> float | None:

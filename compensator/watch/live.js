@@ -130,7 +130,7 @@ async function showOne(prefix, count) {
   pictures(machine, past.history, found.now_s);
   list("reasons", machine.reasons.map((reason) => [wordLink(reason.code), `: ${reason.means} `, make("b", {}, "Action: "), reason.do]), "warning");
   list("warnings", machine.warnings.map((text, i) => [text, " ", wordLink(machine.warning_codes[i])]), "warning");
-  faulty(machine); now(machine); events(machine.events); spells(past.history); channels(machine); points(past.history);
+  faulty(machine); now(machine); events(machine.events); spells(found.spells); channels(machine); points(past.history);
 }
 
 function joined(before, news, now_s) {
@@ -202,15 +202,10 @@ function events(found) {
   $("events").replaceChildren(lines.length ? make("ul", {}, ...lines) : make("p", {}, "None."));
 }
 
-function spells(history) {
-  const found = [];
-  history.t_s.forEach((t, i) => {
-    const last = found[found.length - 1], state = history.state[i] ?? "–", reasons = history.reasons[i] ?? "";
-    if (last && last.state === state && last.reasons === reasons && t - last.to < gap()) last.to = t;
-    else found.push({from: t, to: t, state, reasons});
-  });
-  fill($("spells"), found.reverse().slice(0, 30).map((one) =>
-    [day(one.from) === day(Date.now() / 1000) ? clock(one.from) : `${day(one.from).slice(5)} ${clock(one.from)}`, `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.to - one.from + 60), one.reasons]));
+function spells(found) {
+  const when = (t) => `${day(t) === day(Date.now() / 1000) ? "" : `${day(t).slice(5)} `}${clock(t)}`;
+  fill($("spells"), found.map((one) =>
+    [when(one.begin_s), `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.end_s - one.begin_s), one.reasons]));
 }
 
 function channels(machine) {

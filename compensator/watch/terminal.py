@@ -13,7 +13,8 @@ from rich.text import Text
 
 from compensator.clock import NS
 from compensator.report.notation import plain, signed
-from compensator.watch.day import STYLES, drawn, evenly, sparkline, spells
+from compensator.watch.day import STYLES, drawn, evenly, sparkline
+from compensator.watch.history import Spell, spells
 from compensator.watch.shop import Shop, headline
 from compensator.watch.words import SIGNS, age, here, zone
 
@@ -195,7 +196,9 @@ def detail(
     numbers = Table.grid(padding=(0, 2))
     for i in range(0, len(pairs), per_row):
         numbers.add_row(*(cell for name, value in pairs[i : i + per_row] for cell in (Text(name, style="dim"), value)))
-    past = [spell.text(now_ns / NS) for spell in spells(history)[: SPELLS // 2 if short else SPELLS]]
+    past = [
+        _spell(spell, now_ns) for spell in spells(history, machine["valid_for_s"])[: SPELLS // 2 if short else SPELLS]
+    ]
     lists = [(title, lines) for title, lines in _lists(machine, past, here(now_ns)) if lines]
     urgent = [(title, lines) for title, lines in lists if title in URGENT]
     parts += [_titled(title, lines) for title, lines in urgent]
@@ -272,6 +275,13 @@ def _lists(machine: dict[str, Any], past: list[str], now: datetime) -> list[tupl
 def _channel(name: str, channel: dict[str, Any]) -> str:
     errors = ", ".join(f"{count} × {code}" for code, count in channel["errors"].items())
     return f"{name}: {channel['quality']}" + (f" ({errors})" if errors else "") + f": {channel['do']}"
+
+
+def _spell(spell: Spell, now_ns: int) -> str:
+    begin = here(round(spell.begin_s * NS))
+    when = f"{begin:%H:%M}" if begin.date() == here(now_ns).date() else f"{begin:%m-%d %H:%M}"
+    text = f"{when} {spell.state} for {age(spell.end_s - spell.begin_s)}"
+    return f"{text}: {spell.reasons}" if spell.reasons else text
 
 
 def _titled(title: str, lines: list[str]) -> RenderableType:

@@ -9,6 +9,7 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import EstimateMessage, Event, Offset, Sample
+from compensator.watch.history import spells
 from compensator.watch.machine import Machine, decoded
 from compensator.watch.shop import Shop
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
@@ -279,3 +280,9 @@ def test_the_past_of_a_recording_says_nothing_of_now() -> None:
     machine.update("event", event(2, START_NS - NS), 0.0)
     machine.update("event", event(3, kind="zero", text="zero"), 0.0)  # heard again
     assert len(machine.events) == 2
+
+
+def test_samples_of_a_slow_model_are_one_interval() -> None:
+    day = {"t_s": [0.0, 300.0, 600.0, 2000.0], "state": ["ok"] * 4, "reasons": [""] * 4}
+    assert [(spell.begin_s, spell.end_s) for spell in spells(day, 750.0)] == [(2000.0, 2060.0), (0.0, 660.0)]
+    assert len(spells(day, 150.0)) == 4
