@@ -11,7 +11,12 @@ _SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (defaul
 
 
 def _page(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--page", type=Path, metavar="FILE", help="also write the page here: .html, .pdf, or .png")
+    parser.add_argument(
+        "--page",
+        type=Path,
+        metavar="FILE",
+        help="also write the page here: .html; .pdf or .png by an installed browser",
+    )
 
 
 def demo(parser: argparse.ArgumentParser) -> None:
@@ -128,7 +133,7 @@ def report(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     words = "recordings, a folder of them, or a folder with results of demo, identify or diagnose"
     add("what", type=Path, nargs="+", metavar="DIR_OR_FILE", help=words)
-    words = "the page: .html, .pdf, or .png for its first picture (default: NAME-report.html here)"
+    words = "the page: .html; .pdf or .png (its first figure) by an installed browser (default: NAME-report.html here)"
     add("--out", type=Path, metavar="FILE", help=words)
 
 

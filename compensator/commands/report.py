@@ -1,4 +1,4 @@
-"""`compensator report`: a page for people, of recordings or of a folder with results."""
+"""`compensator report`: a page of recordings, or an overview of a folder of results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     Raises
     ------
     CompensatorError
-        If there is nothing in what was given that a page could show.
+        If there are neither recordings nor pages, or the page cannot be written.
     """
     from compensator.report.formats import checked
 
@@ -45,8 +45,8 @@ def _results(folder: Path, out: Path) -> Answer:
 
     pages = [page for page in pages_in(folder) if page.path.resolve() != out.resolve()]
     if not pages:
-        raise UsageError(f"{folder}: neither recordings (*.mcap) nor pages (report.html) in it")
-    write(out, overview(folder, pages, beside=out.parent))
+        raise UsageError(f"{folder}: neither recordings (*.mcap) nor pages (report.html)")
+    write(out, overview(folder, pages, relative_to=out.parent))
     result = {
         "report": str(out),
         "pages": [{"page": str(p.path), "title": p.title, "verdict": p.verdict} for p in pages],
@@ -56,13 +56,13 @@ def _results(folder: Path, out: Path) -> Answer:
 
 
 def _files(given: Sequence[Path]) -> list[Path]:
-    """Return the recordings given; a folder stands for those in it."""
+    """Return the recordings given; a folder means all in it."""
     paths: list[Path] = []
     for path in given:
         if path.is_dir():
             inside = sorted(path.glob("*.mcap"))
             if not inside:
-                raise UsageError(f"{path}: no recordings in it, expected FILE.mcap")
+                raise UsageError(f"{path}: no recordings, expected FILE.mcap")
             paths += inside
         elif path.suffix != ".mcap":
             raise UsageError(f"{path}: expected a recording (FILE.mcap) or a folder")
@@ -72,6 +72,6 @@ def _files(given: Sequence[Path]) -> list[Path]:
 
 
 def _name(path: Path) -> str:
-    """Return what the page is called after; `recordings` alone says too little."""
+    """Return the name for the page: of the file, or of the folder."""
     whole = path.resolve()
     return whole.stem if whole.suffix == ".mcap" else whole.name or "all"

@@ -1,4 +1,4 @@
-"""`compensator watch`: live view of one machine or many, in the terminal, as a page, for Foxglove, into a recording."""
+"""`compensator watch`: live view of machines in the terminal, as a page or in Foxglove, and recorder of a shop."""
 
 from __future__ import annotations
 
@@ -27,28 +27,30 @@ from compensator.watch.terminal import line, view
 
 log = logging.getLogger("compensator")
 
-#: How often a view is drawn anew, s: ages grow also while nothing arrives.
+#: Time between two updates of the view, s: ages grow also without messages.
 REFRESH_S = 1.0
 
 
 def run(arguments: argparse.Namespace) -> Answer | None:
-    """Run the command until Ctrl-C or SIGTERM, or for one look.
+    """Run the command until Ctrl-C or SIGTERM, or once.
 
     Raises
     ------
     UsageError
-        If it is not said where to listen.
+        If the endpoint is missing or wrong.
     ServiceError
-        For one look, if nobody answers.
+        If run once and no service answers.
     """
     loaded = load_config(arguments.config) if arguments.config else None
     source = _source(arguments, loaded)
     shop = Shop(SystemClock())
     if loaded is not None:
         folder = loaded.resolve(loaded.config.recording.folder)
-        shop.past(loaded.config.zenoh.prefix, last_day(folder, loaded.config.machine.name, SystemClock().utc_ns()))
-    beside = arguments.page or arguments.record or arguments.foxglove
-    if arguments.once or (arguments.json and not beside):
+        shop.add_recorded(
+            loaded.config.zenoh.prefix, last_day(folder, loaded.config.machine.name, SystemClock().utc_ns())
+        )
+    other = arguments.page or arguments.record or arguments.foxglove
+    if arguments.once or (arguments.json and not other):
         return _once(arguments, source, shop)
     with until_stopped() as stopped, ExitStack() as stack:
         sinks: list[Sink] = [shop]
@@ -71,17 +73,17 @@ def run(arguments: argparse.Namespace) -> Answer | None:
             log.info("compensator: live page at %s (Ctrl-C ends it)", server.address)
         listener = stack.enter_context(Listener(source, *sinks, on_connection=watch.connection))
         listener.start()
-        watch.show(terminal=sys.stdout.isatty() and not beside, lines=not beside)
+        watch.show(terminal=sys.stdout.isatty() and not other, lines=not other)
     return Answer(*recorder.answer()) if recorder is not None else None
 
 
 def _source(arguments: argparse.Namespace, loaded: LoadedConfig | None) -> Source:
-    """Return where to listen, and below which prefix."""
+    """Return the endpoints and the prefix."""
     prefix = arguments.prefix
     if prefix is not None and not re.fullmatch(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*", prefix):
-        raise UsageError(f"--prefix {prefix!r}: expected words between single slashes, such as shop/vmc-07")
+        raise UsageError(f"--prefix {prefix!r}: expected names between single slashes, such as shop/vmc-07")
     if arguments.connect and arguments.zenoh:
-        raise UsageError("--connect: stands beside --zenoh, whose file has the endpoints; expected one of them")
+        raise UsageError("--connect: not together with --zenoh, whose file has the endpoints")
     if prefix is None:
         prefix = loaded.config.zenoh.prefix if loaded is not None else ""
     if arguments.zenoh:
@@ -95,17 +97,17 @@ def _source(arguments: argparse.Namespace, loaded: LoadedConfig | None) -> Sourc
 
 
 def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
-    """Look once: ask for the latest, and listen for a while where that is wanted."""
+    """Query the latest messages once, and listen for the time of --wait."""
     with Listener(source, shop) as listener:
         listener.open()
-        listener.look()
+        listener.query()
         if arguments.wait:
             with until_stopped() as stopped:
                 stopped.wait(arguments.wait)
         if not shop.overview() and not arguments.json:
             there = listener.elsewhere()
             known = f"alive there: {', '.join(there)}" if there else "no service is alive there"
-            raise ServiceError(f"nothing is heard below {source.prefix or 'any prefix'} at {source.where}; {known}")
+            raise ServiceError(f"no messages below {source.prefix or 'any prefix'} at {source.where}; {known}")
         console = Console(file=sys.stdout)
         with console.capture() as captured:
             console.print(
@@ -129,22 +131,22 @@ def until_stopped() -> Iterator[threading.Event]:
 
 
 class _Watch:
-    """What is going on, shown until it is stopped."""
+    """Shows the shop until it is stopped."""
 
     def __init__(self, shop: Shop, source: Source, stopped: threading.Event) -> None:
         self._shop, self._source, self._stopped = shop, source, stopped
         self._connected = False
 
     def connection(self, connected: bool) -> None:
-        """Hear that the connection came or went."""
+        """Follow the connection."""
         if connected != self._connected:
             log.info("compensator: %s %s", "connected to" if connected else "no connection to", self._source.where)
         self._connected = connected
         if not connected:
-            self._shop.unknown_alive()
+            self._shop.forget_alive()
 
     def status(self) -> dict[str, Any]:
-        """Return how the watch itself is."""
+        """Return the status of the watch itself."""
         return {
             "connected": self._connected,
             "where": self._source.where,
@@ -153,15 +155,15 @@ class _Watch:
         }
 
     def show(self, *, terminal: bool, lines: bool) -> None:
-        """Draw on the terminal, or write a line for each change, until it is stopped."""
+        """Draw on the terminal, or write a line per change, until stopped."""
         if terminal:
             return self._draw()
-        said: dict[str, tuple[Any, ...]] = {}
+        written: dict[str, tuple[Any, ...]] = {}
         while True:
             for machine in self._shop.overview() if lines else ():
                 now = (machine["shown"], machine["seq"], machine["alive"], machine["malformed"])
-                if said.get(machine["prefix"]) != now and (machine["seq"] is not None or machine["malformed"]):
-                    said[machine["prefix"]] = now
+                if written.get(machine["prefix"]) != now and (machine["seq"] is not None or machine["malformed"]):
+                    written[machine["prefix"]] = now
                     sys.stdout.write(line(machine) + "\n")
                     sys.stdout.flush()
             if self._stopped.wait(REFRESH_S / 2.0):
@@ -169,7 +171,7 @@ class _Watch:
 
     def _draw(self) -> None:
         console = Console()
-        # The log would tear the picture; what it says of the connection stands in the view.
+        # Log lines would disturb the screen; the view shows the connection itself.
         log.setLevel(logging.WARNING)
         with Live(console=console, screen=True, auto_refresh=False) as live:
             while True:

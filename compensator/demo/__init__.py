@@ -1,1 +1,1 @@
-"""The product on simulated hardware: days that take seconds, the loop closed, and a machine that runs on."""
+"""The product on simulated hardware: days that take seconds, the closed loop, and a machine in real time."""

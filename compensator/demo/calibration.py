@@ -1,4 +1,4 @@
-"""The demo's calibrations: of its own machines, and of the paper's case."""
+"""Calibrations of the demo's machines and of the paper's case."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 PERIOD_S = 60.0
 CALIBRATION_H = 36.0
 CALIBRATION_SEED = 1000
-#: Readings in a minute of the calibration's logger.
+#: Readings per minute of the calibration's logger.
 READINGS = 60
-#: Full deflection of the paper's calibration, K and µm.
+#: Full scale of the paper's calibration, K and µm.
 PAPER_K, PAPER_UM = 22.6, 116.0
 
 
 def calibrate(folder: Path, *, machine: str, seed: int) -> None:
-    """Run a simulated machine for a day and a half with a wattmeter at its heat source, and make its model of that.
+    """Calibrate a simulated machine from a run of 36 h with measured heat.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Where `calibration.csv`, `model.toml` and the page go.
+        Folder for `calibration/` with the run, `model.toml` and the page.
     machine : str
         `conduction` or `published`.
     seed : int
-        Seed of the demo; the calibration has a duty of its own.
+        Seed of the demo; the calibration has its own duty cycle.
     """
     folder.mkdir(parents=True, exist_ok=True)
     duty = Duty.working_day(CALIBRATION_SEED + seed, hours=CALIBRATION_H)
@@ -46,15 +46,14 @@ def calibrate(folder: Path, *, machine: str, seed: int) -> None:
 
 
 def paper_case(folder: Path, *, seed: int) -> dict[str, Any]:
-    """Make the paper's own calibration of its published equations, and put what comes out beside what is printed.
+    """Repeat the paper's calibration on its published equations and compare the result with the printed coefficients.
 
-    90 W for six of twelve hours; 95 % of the readings within 1 % of the full deflection, as the paper states its
-    measuring error.
+    90 W for six of twelve hours; 95 % of the readings within 1 % of full scale, as stated in the paper.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Where the run, the model and the page go.
+        Folder for the run, the model and the page.
     seed : int
         Seed of the noise.
 

@@ -1,4 +1,4 @@
-"""A clock that makes up for the past, and then goes with the wall."""
+"""A clock that starts in the past, catches up, and then runs in real time."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from compensator.clock import NS, Clock, SystemClock
 
 
 class LateClock:
-    """A clock that begins in the past, leaps until it has caught up with another one, and then goes with that.
+    """A clock that starts in the past, jumps until it has caught up with another clock, and then follows that.
 
-    Like `VirtualClock` it is for one task that sleeps.
+    Like `VirtualClock` it serves one sleeping task.
 
     Parameters
     ----------
     behind_s : float
-        How far in the past it begins, s.
+        How far in the past it starts, s.
     on_advance : callable
         Awaited with the seconds since the start whenever the time has moved.
     on_time : callable
-        Called once, when it has caught up.
+        Called once it has caught up.
     wall : Clock, optional
-        What it catches up with; the machine's own where none is given.
+        The clock to catch up with; the system's by default.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class LateClock:
     ) -> None:
         self._wall: Clock = wall or SystemClock()
         self._start_ns = self._now_ns = self._wall.monotonic_ns() - round(behind_s * NS)
-        # Kept, so that time stands still while work is done.
+        # Constant, so that time does not advance while work is done.
         self._utc_ns = self._wall.utc_ns() - self._wall.monotonic_ns()
         self._late = behind_s > 0
         self._on_advance = on_advance
@@ -43,7 +43,7 @@ class LateClock:
         self._woken = asyncio.Event()
 
     def utc_ns(self) -> int:
-        """Return the wall clock, or how far it has been made up for, ns since 1970 UTC."""
+        """Return the wall clock, or the simulated time until it has caught up, ns since 1970 UTC."""
         return self._utc_ns + self._now_ns if self._late else self._wall.utc_ns()
 
     def monotonic_ns(self) -> int:
@@ -51,11 +51,11 @@ class LateClock:
         return (self._now_ns if self._late else self._wall.monotonic_ns()) - self._start_ns
 
     def wake(self) -> None:
-        """End the sleep, and every later one at once: somebody wants to stop."""
+        """End the sleep, and every later one at once, to stop."""
         self._woken.set()
 
     async def sleep(self, seconds: float) -> None:
-        """Leap ahead, or wait where there is nothing left to make up for."""
+        """Jump ahead, or wait once it has caught up."""
         ahead_ns = round(max(seconds, 0.0) * NS)
         if self._late:
             now_ns = self._wall.monotonic_ns()
@@ -74,6 +74,6 @@ class LateClock:
         await self._on_advance(self.monotonic_ns() / NS)
 
     async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
-        """Wait until the tasks are done; no longer than `timeout_s` once it goes with the wall."""
+        """Wait until the tasks are done, in real time no longer than `timeout_s`."""
         if tasks:
             await asyncio.wait(tasks, timeout=None if self._late else timeout_s)

@@ -1,4 +1,4 @@
-"""`compensator demo`: the whole loop on simulated hardware, or a simulated machine that runs on."""
+"""`compensator demo`: the closed loop on simulated hardware, or a simulated machine in real time."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def run(arguments: argparse.Namespace) -> Answer:
     Raises
     ------
     CompensatorError
-        If the page cannot be made of that kind, or the machine that runs on cannot begin.
+        If the page cannot be written in that format, or the simulated machine cannot start.
     """
-    with _quietly():
+    with _warnings_only():
         return _run(arguments)
 
 
 @contextmanager
-def _quietly() -> Iterator[None]:
-    """Leave out who connects and goes: here that is everybody who looks."""
+def _warnings_only() -> Iterator[None]:
+    """Log warnings only: connections of viewers are not reported."""
     log = logging.getLogger("compensator")
     before = log.level
     log.setLevel(logging.WARNING)
@@ -48,7 +48,7 @@ def _quietly() -> Iterator[None]:
 def _run(arguments: argparse.Namespace) -> Answer:
     if arguments.live:
         recordings = run_live(arguments.out, hours=arguments.hours, seed=arguments.seed, port=arguments.port)
-        text = f"ended; the recordings: compensator replay {recordings}, compensator report {recordings}"
+        text = f"stopped; for the recordings: compensator replay {recordings}, compensator report {recordings}"
         return Answer({"recordings": str(recordings)}, text)
     also = checked(arguments.page, option="--page") if arguments.page else None
     return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed, also=also))
@@ -60,13 +60,13 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
     Parameters
     ----------
     out : pathlib.Path
-        Folder; a configuration, recordings and `report.html` of each machine come there.
+        Folder for a configuration, recordings and `report.html` of each machine.
     hours : float
         Length of the simulated run, h.
     seed : int
         Seed of the simulated day.
     also : pathlib.Path, optional
-        Another file that the page goes into, such as a PDF.
+        Another file for the page, such as a PDF.
 
     Returns
     -------
@@ -85,10 +85,10 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
     made = page_of(days, table, loop, second_day, paper_case(out / "paper", seed=seed))
     for path in (page, *([also] if also is not None else [])):
         write(path, made)
-    said = (
-        f"The loop, on the conduction machine with an effect drawn by the seed ({loop['drawn']}): found "
-        f"{', '.join(loop['found']) or 'nothing'} in the first day's recordings.\n"
-        f"Second day, {loop['second_day_rms_um']['without']:.2f} µm rms without compensation. {closed(loop)}"
+    summary = (
+        f"Closed loop on the conduction machine, effect drawn by the seed: {loop['drawn']}; found in the recordings of "
+        f"the first day: {', '.join(loop['found']) or 'nothing'}.\n"
+        f"Second day: {loop['second_day_rms_um']['without']:.2f} µm rms without compensation. {closed(loop)}"
     )
     result = {"machines": results, "loop": loop, "report": str(page)}
-    return result, f"{as_text(table)}\n\n{verdict(days)}\n{said}\npage: {page}"
+    return result, f"{as_text(table)}\n\n{verdict(days)}\n{summary}\npage: {page}"

@@ -1,7 +1,6 @@
-"""One simulated day: a machine through its devices, the service, disk and Zenoh, in seconds.
+"""One simulated day in seconds: machine, devices, service, disk and Zenoh.
 
-The simulated machine, its sensors and its devices come from `sim_hardware` and share nothing with the
-service. Time is handed in.
+Machine, sensors and devices come from `sim_hardware` and share no code with the service.
 """
 
 from __future__ import annotations
@@ -37,26 +36,26 @@ from sim_hardware.physics.effects.base import Effect
 
 #: 2026-01-05 06:00 UTC, a Monday's early shift.
 START_NS = 1_767_592_800 * NS
-#: When the second day's service is asked to adopt the extended model, and what a poll then waits for it, s.
+#: When the service of the second day is sent the extended model, and how long each poll then waits for it, s.
 ADOPT_AFTER_S, ADOPT_PATIENCE_S = 3600.0, 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Day:
-    """What came of one simulated run.
+    """Result of a simulated run.
 
     Parameters
     ----------
     outcomes : list of Outcome
-        One for each sample.
+        One per sample.
     received : list of Offset
-        What a separate Zenoh subscriber got.
+        Offsets received by a separate Zenoh subscriber.
     truth : dict of str to numpy.ndarray
-        The simulated machine's own history.
+        True history of the simulated machine.
     seconds : float
-        How long it took, s.
+        Computing time, s.
     adopted_at : int
-        Sample from which the offset is wholly that of the adopted model; 0 where none was to be adopted.
+        First sample with the full offset of the adopted model; 0 if none was adopted.
     """
 
     outcomes: list[Outcome]
@@ -81,7 +80,7 @@ def run_day(
     Parameters
     ----------
     folder : pathlib.Path
-        Where the configuration and the recordings go.
+        Folder for the configuration and the recordings.
     machine : str
         `conduction` or `published`.
     hours : float
@@ -91,19 +90,19 @@ def run_day(
     model : str
         Name of a model, or path of its file from the folder.
     effects : sequence of Effect
-        What acts in the machine that its calibration never saw.
+        Effects in the machine that are absent from its calibration.
     adopt : pathlib.Path, optional
-        A model that the running service is asked to take over after `ADOPT_AFTER_S`.
+        A model that the running service adopts after `ADOPT_AFTER_S`.
 
     Raises
     ------
     ServiceError
-        If the service did not take it over before the end.
+        If the service does not adopt it before the end.
     """
     duty = Duty.working_day(seed, hours=hours + 0.1)
     world = World(MACHINES[machine](effects=effects), duty, usual_sensors(duty.extra_names), seed)
     folder.mkdir(parents=True, exist_ok=True)
-    # A day of its own, not the continuation of the one that an earlier demo left here.
+    # Without the recordings of an earlier demo, which the service would continue.
     shutil.rmtree(folder / "recordings", ignore_errors=True)
     began = time.perf_counter()
     with hardware(world) as devices:
@@ -120,7 +119,7 @@ def run_day(
                 if not asked:
                     asked.append(asyncio.ensure_future(asyncio.to_thread(_ask_to_adopt, config, adopt)))
                 if not asked[0].done():
-                    # Simulated time waits a little for what takes its own time.
+                    # Simulated time waits a little for a command that takes real time.
                     await asyncio.sleep(ADOPT_PATIENCE_S)
 
         outcomes: list[Outcome] = []
@@ -130,11 +129,11 @@ def run_day(
         with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
             bar = progress.add_task(f"simulated machine {machine}", total=samples)
 
-            def took(outcome: Outcome) -> None:
+            def append(outcome: Outcome) -> None:
                 outcomes.append(outcome)
                 progress.advance(bar)
 
-            asyncio.run(_serve(config, clock, samples, took, received, port))
+            asyncio.run(_serve(config, clock, samples, append, received, port))
     return Day(
         outcomes=outcomes,
         received=received,
@@ -145,7 +144,7 @@ def run_day(
 
 
 def _ask_to_adopt(config: Path, model: Path) -> dict[str, Any] | None:
-    """Ask the running service as `compensator adopt` does."""
+    """Send the command adopt, as `compensator adopt` does."""
     wanted = json.dumps({"model": model.read_text(encoding="utf-8")}).encode()
     return ask(load_config(config).config.zenoh, "adopt", wanted, timeout_s=60.0)
 
@@ -155,14 +154,14 @@ def _adopted_at(outcomes: Sequence[Outcome]) -> int:
     for i, outcome in enumerate(outcomes):
         if outcome.offset.model_sha256 != first and "model_changed" not in outcome.offset.reasons:
             return i
-    raise ServiceError("the service did not take the model over before the simulated day ended")
+    raise ServiceError("the service did not adopt the model before the end of the simulated day")
 
 
 async def _serve(
     config: Path,
     clock: VirtualClock,
     samples: int,
-    took: Callable[[Outcome], None],
+    on_sample: Callable[[Outcome], None],
     received: list[Offset],
     port: int,
 ) -> None:
@@ -187,7 +186,7 @@ async def _serve(
             clock=clock,
             samples=samples,
             on_ready=lambda _: ready.set(),
-            on_sample=took,
+            on_sample=on_sample,
         )
         await task
     finally:

@@ -1,4 +1,4 @@
-"""Figures of a simulated day, judged by what the simulated machine itself knows."""
+"""Figures of a simulated day, against the true deformation of the simulated machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from compensator.report.demonstration import MachineDay
 
 
 def errors_of(day: Day) -> dict[str, Vector]:
-    """Return true deformation and what is left of it with the offset held and with its rate followed, µm."""
+    """Return the error in Y without compensation, with the offset held, and with its rate followed, µm."""
     t = day.truth["t_s"]
     y = day.truth["y_um"]
     offsets = [(o.offset.time_utc_ns - START_NS) / NS for o in day.outcomes]
@@ -34,10 +34,10 @@ def errors_of(day: Day) -> dict[str, Vector]:
 
 
 def figures_of(day: Day, errors: Mapping[str, Vector]) -> dict[str, Any]:
-    """Return errors without and with compensation, fit, and what else the table shows of a day."""
+    """Return errors without and with compensation, fit, and the other figures of a day."""
     estimate = [outcome.estimate for outcome in day.outcomes]
     fit = scores(np.array([number(e.y_um) for e in estimate]), np.array([number(e.y_pred_um) for e in estimate]))
-    still = errors["followed"]
+    remaining = errors["followed"]
     part: dict[str, Any] = {
         name: {
             "rms_um": float(np.sqrt(np.mean(errors[name] ** 2))),
@@ -50,14 +50,14 @@ def figures_of(day: Day, errors: Mapping[str, Vector]) -> dict[str, Any]:
         "received": len(day.received),
         "seconds": round(day.seconds, 1),
         "fit_pct": fit.fit_pct,
-        "removed_pct": 100.0 * (1.0 - float(np.std(still)) / float(np.std(errors["without"]))),
+        "removed_pct": 100.0 * (1.0 - float(np.std(remaining)) / float(np.std(errors["without"]))),
         "states": {s: sum(o.offset.state == s for o in day.outcomes) for s in {o.offset.state for o in day.outcomes}},
     }
     return part
 
 
 def shown(name: str, day: Day) -> MachineDay:
-    """Return what the page shows of a day."""
+    """Return the content of the page for a day."""
     hours = [(o.estimate.time_utc_ns - START_NS) / NS / 3600 for o in day.outcomes]
     heat = [number(o.estimate.heat_w) for o in day.outcomes]
     errors = errors_of(day)
@@ -70,7 +70,7 @@ def shown(name: str, day: Day) -> MachineDay:
 
 
 def table(results: Mapping[str, Any]) -> list[list[str]]:
-    """Return the table of errors of all machines, the head first."""
+    """Return the table of errors of all machines, with its head."""
     rows = [["simulated machine", "", "rms µm", "peak-to-peak µm", "fit %", "samples", "seconds"]]
     for machine, figures in results.items():
         for key, words in (
@@ -94,6 +94,6 @@ def table(results: Mapping[str, Any]) -> list[list[str]]:
 
 
 def as_text(rows: list[list[str]]) -> str:
-    """Return a table with its columns one below the other."""
+    """Return a table as aligned text."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return "\n".join("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)

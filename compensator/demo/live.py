@@ -1,7 +1,7 @@
-"""A simulated machine that runs on: a day of it on record, then the real service in real time, to try things on.
+"""A simulated machine for trials: a recorded day, then the real service in real time.
 
-What a person at the machine, a control's program or an auditor would meet is all there: devices behind their
-protocols, the service on loopback, recordings that grow. Sensors are broken by typing.
+Devices behind their protocols, the service on loopback and growing recordings behave as at a real machine. Typed
+commands break its sensors.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from compensator.service.presence import sole_user
 from sim_hardware.physics import Duty, World, draw_effect, usual_sensors
 from sim_hardware.wire import Faults
 
-#: What can be broken, by the name that is typed: the faults of its device, and its input there.
+#: Sensors that can be broken, by their typed name: faults of the device, and input number.
 Breakable = Mapping[str, tuple[Faults, int]]
 
 MACHINE, PREFIX = "vmc-07", "shop/vmc-07"
-#: Length of the duty after the history; then its last inputs go on, h.
+#: Length of the duty cycle after the history, h; then its last inputs remain.
 AFTER_H = 7 * 24.0
-#: The checks between the sensors: what acts undeclared in this machine is noticed, and leads to `diagnose`.
+#: Plausibility checks, which notice the undeclared effect of this machine.
 CHECKS = """
 [plausibility]
 t_q_below_at_after_min = 15.0
 false_alarm_days = 30.0
 """
-#: What is typed, and the fault of an input or of a whole device that it stands for.
+#: Faults of an input by typed command, and faults of a whole device by sensor.
 INPUT_FAULTS = {"break": "open", "freeze": "frozen"}
 UNPLUG = {"t_q": "silence", "at": "silence", "y": "disconnect"}
 
@@ -52,16 +52,16 @@ def run_live(out: Path, *, hours: float, seed: int, port: int, typed: IO[str] | 
     Parameters
     ----------
     out : pathlib.Path
-        Folder of the demo. The machine's own files come to `live` in it; its model is the one of `conduction`, which
-        is calibrated first where it is not there yet.
+        Folder of the demo. The files of this machine are in its folder `live`; the model is that of `conduction`, which
+        is calibrated first if it does not exist.
     hours : float
-        How much of the past is simulated before real time begins, h.
+        Length of the simulated past before real time starts, h.
     seed : int
-        Seed of duty, sensors and the undeclared effect: the effect of the demo with the same seed.
+        Seed of duty cycle, sensors and undeclared effect; the effect is that of the demo with the same seed.
     port : int
-        TCP port of loopback on which the service listens.
+        TCP port of the service on loopback.
     typed : file, optional
-        Where what is typed comes from; stdin where none is given.
+        Source of the typed commands; stdin by default.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def run_live(out: Path, *, hours: float, seed: int, port: int, typed: IO[str] | 
     UsageError
         If the length is negative.
     ServiceError
-        If one of these runs already, or the port is taken.
+        If such a machine runs already, or the port is in use.
     """
     if hours < 0:
         raise UsageError(f"--hours {hours:g}: expected 0 or more")
@@ -83,7 +83,7 @@ def run_live(out: Path, *, hours: float, seed: int, port: int, typed: IO[str] | 
     with sole_user(recordings, MACHINE):
         _clear(recordings)
     if not (out / "conduction" / "calibration" / "model.toml").exists():
-        sys.stderr.write("calibrates the machine first\n")
+        sys.stderr.write("calibrating the machine first\n")
         calibrate(out / "conduction", machine="conduction", seed=seed)
     duty = Duty.working_day(seed + 3, hours=hours + AFTER_H)
     effect = draw_effect(seed, EFFECT_UM, hours or 24.0)
@@ -98,7 +98,7 @@ def run_live(out: Path, *, hours: float, seed: int, port: int, typed: IO[str] | 
 
 
 def _clear(recordings: Path) -> None:
-    """Remove what an earlier machine left: this one's day ends now, and is not the continuation of that."""
+    """Remove the recordings of an earlier machine, which the service would continue."""
     for path in recordings.iterdir():
         if path.suffix != ".lock":
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -109,7 +109,7 @@ async def _serve(
 ) -> None:
     loop = asyncio.get_running_loop()
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
-        bar = progress.add_task("the hours before now", total=hours * 3600.0)
+        bar = progress.add_task("simulated past", total=hours * 3600.0)
 
         async def advance(t_s: float) -> None:
             world.advance_to(t_s)
@@ -119,7 +119,7 @@ async def _serve(
         def on_time() -> None:
             progress.stop()
             explain()
-            threading.Thread(target=_obey, args=(typed, devices.faults), daemon=True).start()
+            threading.Thread(target=_read_commands, args=(typed, devices.faults), daemon=True).start()
 
         clock = LateClock(hours * 3600.0, advance, on_time)
 
@@ -136,49 +136,49 @@ async def _serve(
 
 def _explain(out: Path, config: Path, port: int) -> None:
     sys.stderr.write(f"""
-{MACHINE} runs, and its hours before now are on record. An offset goes out every minute. In another terminal:
+{MACHINE} is running with its past on record, and publishes an offset every minute. In another terminal:
   compensator watch --config {config}              with --page: a live page
   python deploy/examples/subscriber.py tcp/127.0.0.1:{port} {PREFIX}              a line each minute
   compensator hold --config {config}               and: resume, zero
-Something acts in it that its model lacks. What, and without it:
+An effect acts in it that its model lacks. To find it and extend the model:
   compensator diagnose {config.parent}/recordings/*.mcap --model {out}/conduction/calibration/model.toml --out diagnosis
   compensator adopt diagnosis/model.toml --config {config}              and back
-Type here:  break t_q | at | y    its wire is broken        freeze …    its value stands still
-            unplug t_q | at | y   its device is gone        mend        all is well again
+Type here:  break t_q | at | y    wire broken            freeze …    value frozen
+            unplug t_q | at | y   device disconnected    mend        repair all
 Ctrl-C ends it.
 """)
     sys.stderr.flush()
 
 
-def _obey(typed: IO[str], faults: Breakable) -> None:
-    """Do what is typed, until there is no more."""
+def _read_commands(typed: IO[str], faults: Breakable) -> None:
+    """Carry out typed commands until the end of the input."""
     for line in typed:
-        sys.stderr.write(obey(line, faults) + "\n")
+        sys.stderr.write(apply_fault(line, faults) + "\n")
         sys.stderr.flush()
 
 
-def obey(line: str, breakable: Breakable) -> str:
-    """Break a sensor or mend all, as a typed line says, and return what was done.
+def apply_fault(line: str, breakable: Breakable) -> str:
+    """Break a sensor or repair all by a typed command; return what was done.
 
     Parameters
     ----------
     line : str
         Such as `break t_q`.
     breakable : mapping of str to (Faults, int)
-        What there is to break, as in `Hardware`.
+        The sensors, as in `Hardware`.
     """
     word, _, name = line.strip().partition(" ")
     if line.strip() == "mend":
         for faults, number in breakable.values():
             faults.clear()
             faults.clear(input=number)
-        return "all is well again"
+        return "all sensors repaired"
     if name in breakable and (word in INPUT_FAULTS or word == "unplug"):
         faults, number = breakable[name]
         if word == "unplug":
             faults.set(UNPLUG[name])
         else:
             faults.set(INPUT_FAULTS[word], input=number)
-        return f"{word} {name}: done; shows within two minutes"
+        return f"{word} {name}: done; visible within two minutes"
     words = ", ".join([*INPUT_FAULTS, "unplug"])
     return f"{line.strip()!r}: expected one of {words} with one of {', '.join(breakable)}; or mend"

@@ -1,4 +1,4 @@
-"""The loop closed: an effect that the calibration never saw, found in the service's own recordings, taken over."""
+"""The closed loop: an effect absent from the calibration is found in the recordings, and the service adopts it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from compensator.model.model_file import load_model
 from compensator.model.model_writer import dump_model
 from sim_hardware.physics import draw_effect
 
-#: About how much the undeclared effect moves Y, µm standard deviation.
+#: Approximate standard deviation of the undeclared effect in Y, µm.
 EFFECT_UM = 5.0
 
 
 def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], dict[str, tuple[Vector, Vector]]]:
-    """Let an effect act that the calibration never saw, find it in the service's own recordings, and run with it.
+    """Run a day with an undeclared effect, diagnose its recordings, and run a second day with the extended model.
 
-    The effect is drawn by the seed and sealed: nothing here knows what it is until the table is written.
+    The effect is drawn by the seed and sealed: nothing here knows it until the results are written.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, 
     Returns
     -------
     (dict, dict)
-        What was drawn, what was found, and the error on the second day; that error over time, h and µm.
+        Effect drawn, effects found, and the error on the second day; that error over time, h and µm.
     """
     effect = draw_effect(seed, EFFECT_UM, hours)
     first = "../calibration/model.toml"
@@ -47,8 +47,8 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, 
     recordings = sorted((before / "recordings").glob("*.mcap"))
     first_model, extended = folder / "calibration" / "model.toml", folder / "diagnosis" / "model.toml"
     found = diagnose_files(recordings, first_model, extended.parent).result
-    # A model that was left as it was: there is nothing to take over.
-    adopt = extended if _acting(extended) != _acting(first_model) else None
+    # An unchanged model is not adopted.
+    adopt = extended if _dynamics(extended) != _dynamics(first_model) else None
     days = {
         name: run_day(
             folder / f"second-day-{name}",
@@ -66,8 +66,8 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, 
     for name, day in days.items():
         values = errors_of(day)
         curves[name] = (values["t_h"], values["followed"])
-        judged = values["t_h"] >= adopted_h + values["t_h"][0]
-        errors[name], errors["without"] = values["followed"][judged], values["without"][judged]
+        counted = values["t_h"] >= adopted_h + values["t_h"][0]
+        errors[name], errors["without"] = values["followed"][counted], values["without"][counted]
     drawn = effect.reveal().describe()
     return {
         "drawn": " ".join(str(drawn[key]) for key in ("kind", "path", "channel") if drawn.get(key)),
@@ -82,6 +82,6 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, 
     }, curves
 
 
-def _acting(model: Path) -> str:
-    """Return what a model file says without where it comes from."""
+def _dynamics(model: Path) -> str:
+    """Return the content of a model file without its provenance."""
     return dump_model(dataclasses.replace(load_model(model), provenance={}))

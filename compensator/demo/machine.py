@@ -34,7 +34,7 @@ class Hardware(NamedTuple):
     capa : CapaNcdt
         The displacement controller, whose stream the clock drives.
     faults : dict of str to (Faults, int)
-        What can be made to fail: for each channel the faults of its device, and its input there.
+        For each channel the faults of its device, and its input number.
     """
 
     lines: dict[str, Any]
@@ -44,12 +44,12 @@ class Hardware(NamedTuple):
 
 @contextmanager
 def hardware(world: World) -> Iterator[Hardware]:
-    """Put the simulated machine's sensors on simulated devices, one for each protocol.
+    """Connect the sensors of a simulated machine to simulated devices, one for each protocol.
 
     Yields
     ------
     Hardware
-        The devices; they are there until the block ends.
+        The devices, until the block ends.
     """
     source = world.source
     with Rack() as rack:
@@ -86,7 +86,7 @@ def hardware(world: World) -> Iterator[Hardware]:
 def configuration(
     machine: str, lines: Mapping[str, Any], zenoh_port: int, model: str = "quill", *, prefix: str = "shop/sim"
 ) -> str:
-    """Write the configuration of the simulated machine, as an engineer would write it."""
+    """Return the configuration of the simulated machine."""
     return f"""# Configuration of a simulated machine.
 [machine]
 name = "{machine}"

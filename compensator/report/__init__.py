@@ -1,1 +1,1 @@
-"""Pages for people."""
+"""Pages: HTML, PDF and PNG."""

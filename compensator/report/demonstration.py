@@ -1,4 +1,4 @@
-"""The page of the demo: a simulated day with and without compensation, and the loop closed."""
+"""The page of the demo: a simulated day with and without compensation, and the closed loop."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from compensator.arrays import Vector
 from compensator.report.page import Block, Cell, Details, Figure, Line, Link, Page, Section, Table
 
-#: What a machine is called in a sentence.
+#: Names of the machines in text.
 _KINDS = {"conduction": "heat-conduction machine", "published": "machine of the published equations"}
 _TIME = "time, h"
 
@@ -27,7 +27,7 @@ class MachineDay:
     errors : dict of str to numpy.ndarray
         `t_h`, and `without` and `followed`, µm.
     heat : tuple of numpy.ndarray
-        Time in h and heat in W: the machine's own, and as estimated.
+        Time in h and heat in W: true, then estimated.
     """
 
     name: str
@@ -50,13 +50,13 @@ def page_of(
     days : sequence of MachineDay
         One for each machine.
     table : sequence of sequence of str
-        Errors of all of them, the first row being the head.
+        Errors of all machines; the first row is the head.
     loop : dict
-        What was drawn, found and left.
+        Effect drawn, effects found, remaining errors.
     second_day : dict of str to (numpy.ndarray, numpy.ndarray)
-        Time in h and error in µm of the second day, by what compensated it.
+        Time in h and error in µm of the second day, by model.
     paper : dict
-        The paper's own case as `identify` gave it.
+        The paper's case, the result of `identify`.
     """
     blocks: list[Block] = [_error(day) for day in days]
     blocks += [
@@ -68,38 +68,38 @@ def page_of(
         ),
         _loop(loop, second_day),
         _pages(days),
-        Details(title="Heat, as it was and as it was estimated", blocks=[_heat(day) for day in days]),
-        Details(title="The paper's own case, beside what is printed", blocks=[_beside_the_print(paper)]),
+        Details(title="Heat, true and estimated", blocks=[_heat(day) for day in days]),
+        Details(title="The paper's case, compared with the printed coefficients", blocks=[_comparison(paper)]),
     ]
     return Page(title="A simulated day, compensated", verdict=f"{verdict(days)} {closed(loop)}", blocks=blocks)
 
 
 def verdict(days: Sequence[MachineDay]) -> str:
-    """Return one sentence: how much of the error is left."""
+    """Return the result of the days in one sentence."""
     hours = max(float(day.errors["t_h"][-1]) for day in days)
     parts = [
-        f"{day.figures['without']['peak_to_peak_um']:.0f} µm become "
+        f"from {day.figures['without']['peak_to_peak_um']:.0f} to "
         f"{day.figures['followed']['peak_to_peak_um']:.1f} µm ({_KINDS.get(day.name, day.name)})"
         for day in days
     ]
-    return f"Thermal error in Y over {hours:.0f} simulated hours, peak to peak: {', '.join(parts)}."
+    return f"Thermal error in Y over {hours:.0f} simulated hours, peak to peak, reduced {', '.join(parts)}."
 
 
 def closed(loop: Mapping[str, Any]) -> str:
-    """Return one sentence: what closing the loop has brought.
+    """Return the result of the closed loop in one sentence.
 
     Parameters
     ----------
     loop : dict
-        What was drawn, found and left.
+        Effect drawn, effects found, remaining errors.
     """
     rms = loop["second_day_rms_um"]
-    left = f"An effect that the calibration never saw leaves {rms['first']:.2f} µm rms"
+    left = f"An effect absent from the calibration leaves {rms['first']:.2f} µm rms"
     if loop["adopted"]:
-        return f"{left}; with what the diagnosis found in the recordings, {rms['extended']:.2f}."
+        return f"{left}; with the effects that the diagnosis found in the recordings, {rms['extended']:.2f}."
     return (
-        f"{left}; what the diagnosis found in the recordings ({', '.join(loop['found']) or 'nothing'}) cannot run in "
-        "the service, or does not hold on blocks of time that it did not see, so the model was left as it was."
+        f"{left}; what the diagnosis found in the recordings ({', '.join(loop['found']) or 'nothing'}) is not "
+        "deployable, or does not hold on held-out blocks, so the model was not changed."
     )
 
 
@@ -110,8 +110,8 @@ def _error(day: MachineDay) -> Figure:
         x_label=_TIME,
         y_label="error in Y, µm",
         lines=(Line("without", t, day.errors["without"]), Line("with", t, day.errors["followed"])),
-        note=f"{figures['without']['rms_um']:.1f} µm rms without, {figures['followed']['rms_um']:.2f} with, as the "
-        "simulated machine itself knows it.",
+        note=f"{figures['without']['rms_um']:.1f} µm rms without, {figures['followed']['rms_um']:.2f} with, against "
+        "the true deformation of the simulated machine.",
     )
 
 
@@ -130,13 +130,13 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
     names = {"without": "without compensation", "first": "first model", "extended": "extended model"}
     rows = [[words, f"{rms[key]:.2f}"] for key, words in names.items()]
     lines = tuple(Line(names[key], *second_day[key]) for key in ("first", "extended"))
-    taken = (
-        f"The running service took the extended model over; judged from {loop['adopted_after_h']:.1f} h on."
+    adopted = (
+        f"The running service adopted the extended model; errors from {loop['adopted_after_h']:.1f} h on."
         if loop["adopted"]
-        else "The model was left as it was: both days are the same."
+        else "The model was not changed: both days are the same."
     )
     return Section(
-        title="The loop closed: an effect the calibration never saw, on a second day with another duty",
+        title="Closed loop: an effect absent from the calibration, on a second day with another duty",
         blocks=[
             Figure(
                 title="Second day, error in Y with each model",
@@ -150,8 +150,7 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
                 head=["conduction machine", "rms µm"],
                 rows=rows,
                 note=f"Found in the recordings of the first day: {', '.join(loop['found']) or 'nothing'} "
-                f"({str(loop['verdict']).replace('_', ' ')}). Drawn by the seed and not passed on: {loop['drawn']}. "
-                + taken,
+                f"({str(loop['verdict']).replace('_', ' ')}). Drawn by the seed: {loop['drawn']}. {adopted}",
             ),
         ],
     )
@@ -161,16 +160,21 @@ def _pages(days: Sequence[MachineDay]) -> Table:
     rows: list[list[Cell]] = [
         [
             Link(f"{day.name}/calibration/report.html", f"{day.name}/calibration/report.html"),
-            f"how the model of the {_KINDS.get(day.name, day.name)} was made",
+            f"calibration of the {_KINDS.get(day.name, day.name)}",
         ]
         for day in days
     ]
-    rows.append([Link("conduction/diagnosis/report.html", "conduction/diagnosis/report.html"), "what the model lacked"])
-    rows.append([Link("paper/report.html", "paper/report.html"), "the paper's own case"])
-    return Table(title="Pages of this demo", head=["page", "about"], rows=rows)
+    rows.append(
+        [
+            Link("conduction/diagnosis/report.html", "conduction/diagnosis/report.html"),
+            "diagnosis of the conduction machine",
+        ]
+    )
+    rows.append([Link("paper/report.html", "paper/report.html"), "calibration of the paper's case"])
+    return Table(title="Pages of this demo", head=["page", "subject"], rows=rows)
 
 
-def _beside_the_print(paper: Mapping[str, Any]) -> Table:
+def _comparison(paper: Mapping[str, Any]) -> Table:
     rows = [
         [f"{r['path']}: {r['figure']}", f"{r['found']:.4g}", f"{r['std']:.2g}", f"{r['reference']:.4g}"]
         for r in paper["comparison"]
@@ -178,6 +182,6 @@ def _beside_the_print(paper: Mapping[str, Any]) -> Table:
     return Table(
         head=["path and figure", "identified", "standard error", "printed"],
         rows=rows,
-        note="Identified from a run with 1 % measuring error. One step of 90 W in quiet air: the TTF comes back, the "
-        "slow part of DTF and TDTF only within its errors.",
+        note="Identified from a run with 1 % measuring error and one step of 90 W in still air: the TTF is recovered, "
+        "the slow part of DTF and TDTF only within its standard errors.",
     )

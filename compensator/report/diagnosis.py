@@ -1,4 +1,4 @@
-"""The page of a diagnosis: what the model lacks, in one picture, and what it is worth."""
+"""The page of a diagnosis: what the model lacks, and the error before and after."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from compensator.report.page import (
     write_page,
 )
 
-#: Parameters of an effect that are shown at once; the others are there to open.
+#: Parameters of an effect that are shown unfolded.
 SHOWN = 6
 
-#: Units as they stand in the names of parameters, and on a page.
+#: Units in the names of parameters, and on the page.
 _UNITS = {
     "um": "µm",
     "k": "K",
@@ -55,13 +55,13 @@ def write_report(
     Parameters
     ----------
     path, also : pathlib.Path
-        The HTML file, and another file that it goes into, of any of `formats.SUFFIXES`.
+        The HTML file, and another file for the same page, with any suffix of `formats.SUFFIXES`.
     diagnosis : Diagnosis
-        What was found.
+        The diagnosis.
     model : ThermalModel
         As written, with its hash.
     remarks : sequence of str
-        What reading the data had to put right.
+        Corrections made while reading the data.
     """
     t = _hours(diagnosis)
     blocks: list[Block] = [_before_and_after(t, diagnosis), _errors(diagnosis)]
@@ -88,41 +88,41 @@ def _before_and_after(t: Vector, diagnosis: Diagnosis) -> Figure:
     count = len(diagnosis.effects)
     found = name(diagnosis.effects[0]) if count == 1 else f"all {count} effects" if count else "nothing to add"
     return Figure(
-        title="Error that the compensation leaves, before and after",
+        title="Residual before and after the extension",
         x_label="time, h",
         y_label="residual, µm",
         lines=(
             Line("before", t, diagnosis.held_out_before),
             Line(f"after: {found}", t, diagnosis.held_out_after),
         ),
-        note="Measured − predicted, on the same scale. Every block is shown by a search that did not see it.",
+        note="Measured − predicted on held-out data: each block was left out of the search that predicts it.",
     )
 
 
 def _errors(diagnosis: Diagnosis) -> Table:
     rows = [
         [label, f"{s.rms_um:.2f}", f"{s.peak_to_peak_um:.1f}", f"{s.fit_pct:.2f}"]
-        for label, s in (("first model", diagnosis.before), ("extended model", diagnosis.after))
+        for label, s in (("base model", diagnosis.before), ("extended model", diagnosis.after))
     ]
     rows.append(["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""])
     return Table(
         title="Errors on held-out data",
         head=["", "rms µm", "peak to peak µm", "fit %"],
         rows=rows,
-        note=f"Measured so: {diagnosis.held_out}.",
+        note=f"Held-out data: {diagnosis.held_out}.",
     )
 
 
 def _effect(t: Vector, effect: Effect) -> Section:
     parameters = [[in_words(key), with_std(value, effect.std[key])] for key, value in effect.named.items()]
     rows = parameters[:SHOWN]
-    rows.append(["residual of the fit without it, µm rms", f"{effect.rms_before_um:.2f}"])
-    rows.append(["residual of the fit with it, µm rms", f"{effect.rms_after_um:.2f}"])
-    deploy = "Runs in the service." if effect.deployable else "Cannot be deployed; the extended model leaves it out."
+    rows.append(["residual of the fit without the effect, µm rms", f"{effect.rms_before_um:.2f}"])
+    rows.append(["residual of the fit with the effect, µm rms", f"{effect.rms_after_um:.2f}"])
+    deploy = "Deployed in the extended model." if effect.deployable else "Not deployable: not in the extended model."
     blocks: list[Block] = [
-        Words(title="In words", lines=[effect.explanation, deploy]),
+        Words(title="Explanation", lines=[effect.explanation, deploy]),
         Figure(
-            title=f"What it adds: {name(effect)}",
+            title=f"Contribution: {name(effect)}",
             x_label="time, h",
             y_label="Y, µm",
             lines=(Line("effect", t, effect.signal),),
@@ -136,15 +136,15 @@ def _effect(t: Vector, effect: Effect) -> Section:
     if effect.rivals:
         blocks.append(
             Words(
-                title="Nearly as good",
-                lines=[f"{r.label}: leaves {r.rms_after_um:.2f} µm rms. {r.how_to_tell_apart}" for r in effect.rivals],
+                title="Rival explanations",
+                lines=[f"{r.label}: {r.rms_after_um:.2f} µm rms remain. {r.how_to_tell_apart}" for r in effect.rivals],
             )
         )
     return Section(title=name(effect), blocks=blocks)
 
 
 def in_words(key: str) -> str:
-    """Return the name of a parameter with its unit as people write it.
+    """Return the name of a parameter with its unit in the usual notation.
 
     Examples
     --------
@@ -164,8 +164,8 @@ def _ranking(diagnosis: Diagnosis) -> Details:
     rows = [[name(chosen), f"{chosen.rms_after_um:.2f}", "chosen"]]
     rows += [[label, f"{rms:.2f}", ""] for label, rms in diagnosis.tried]
     return Details(
-        title="What was tried in place of the largest effect, and how it ranked",
-        blocks=[Table(head=["explanation", "leaves µm rms", ""], rows=rows)],
+        title="Candidates for the largest effect, ranked",
+        blocks=[Table(head=["candidate", "remaining µm rms", ""], rows=rows)],
     )
 
 
@@ -173,7 +173,7 @@ def _details(t: Vector, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequ
     rows = [["extended model, SHA-256", model.sha256]]
     rows += [[f"data: {d['file']}", d["sha256"]] for d in model.provenance.get("diagnosis", {}).get("data", [])]
     figure = Figure(
-        title="Residual of the fit to everything",
+        title="Residual of the fit to all data",
         x_label="time, h",
         y_label="residual, µm",
         lines=(Line("before", t, diagnosis.residual_before), Line("after", t, diagnosis.residual_after)),

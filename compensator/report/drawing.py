@@ -1,4 +1,4 @@
-"""Draws the pictures of a page with matplotlib: as SVG in CSS variables, or in the colours of paper."""
+"""Draws figures with matplotlib as SVG in CSS variables, so that one file serves light and dark screens and paper."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import html
 import io
 import re
 import textwrap
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib as mpl
@@ -14,41 +13,33 @@ import matplotlib.dates as mdates
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
-from matplotlib.figure import SubFigure
 
 from compensator.report.figure import Figure, Line, described, thinned
 
-
-@dataclass(frozen=True, slots=True)
-class Palette:
-    """Colours of a picture.
-
-    Parameters
-    ----------
-    ink, grid : str
-        Of letters and axes, and of the grid and shaded spans.
-    lines : tuple of str
-        Of what is drawn.
-    """
-
-    ink: str
-    grid: str
-    lines: tuple[str, ...]
-
-
-#: Placeholder colours that are drawn → CSS variables that stand in the page.
+#: Placeholder colours of text and axes, of grid and spans, and of curves; the page's CSS variables replace them.
 INK, GRID = "#010101", "#020202"
 LINES = ("#030303", "#040404", "#050505", "#060606", "#070707")
 COLOURS = {INK: "--ink", GRID: "--grid"} | {colour: f"--line-{i}" for i, colour in enumerate(LINES)}
-ON_PAGE = Palette(INK, GRID, LINES)
-#: The same as the page's own where it is printed.
-ON_PAPER = Palette("#000000", "#d0d0d0", ("#d55e00", "#0072b2", "#009e73", "#a3487f", "#8a7400"))
+_STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "grid.color": GRID,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "legend.framealpha": 0.0,
+    "svg.fonttype": "none",
+}
 _DASHES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)))
 #: Seconds of a day, matplotlib's unit of time.
 _DAY_S = 86400.0
-#: Narrowest piece of a strip, as a share of the picture: an event of one minute in a year is seen.
+#: Narrowest piece of a strip, as a share of the figure: an event of one minute in a year remains visible.
 _NARROWEST = 1.0 / 500.0
-#: What a letter and what the sample of a legend's entry take, and what stands left of the axes, inches.
+#: Width of a letter, of a legend's sample line, and of the margin left of the axes, inches.
 _LETTER_IN, _SAMPLE_IN, _LEFT_IN = 0.09, 0.65, 0.8
 
 
@@ -60,13 +51,17 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
     figure : Figure
         What to draw.
     prefix : str
-        Makes its identifiers different from those of other pictures on the page.
+        Keeps its identifiers apart from those of other figures on the page.
     width : float
-        In inches: less where several stand side by side, so that the text stays readable.
+        Width, inches; smaller for figures side by side, so that the text stays readable.
     """
-    with mpl.rc_context(style(ON_PAGE) | {"svg.fonttype": "none", "svg.hashsalt": figure.title}):
+    with mpl.rc_context(_STYLE | {"svg.hashsalt": figure.title}):
         canvas = Canvas(figsize=(width, figure.height), layout="constrained")
-        draw(canvas, figure, width, ON_PAGE)
+        axes = canvas.subplots()
+        _draw(axes, figure)
+        if figure.strips:
+            _strips(axes, figure)
+        _legend(axes, width)
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
@@ -80,72 +75,33 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
     return f"{opening}><desc>{html.escape(described(figure))}</desc>{rest}"
 
 
-def style(palette: Palette) -> dict[Any, Any]:
-    """Return matplotlib's settings for pictures in some colours."""
-    ink = palette.ink
-    return {
-        "font.family": "sans-serif",
-        "font.size": 10,
-        "text.color": ink,
-        "axes.labelcolor": ink,
-        "axes.edgecolor": ink,
-        "xtick.color": ink,
-        "ytick.color": ink,
-        "grid.color": palette.grid,
-        "figure.facecolor": "none",
-        "axes.facecolor": "none",
-        "legend.framealpha": 0.0,
-    }
-
-
-def draw(canvas: Canvas | SubFigure, figure: Figure, width: float, palette: Palette) -> None:
-    """Draw a figure onto a canvas.
-
-    Parameters
-    ----------
-    canvas : matplotlib.figure.Figure or SubFigure
-        Where, laid out by "constrained".
-    figure : Figure
-        What.
-    width : float
-        Of the canvas, inches: so much room there is for the legend.
-    palette : Palette
-        Its colours.
-    """
-    axes = canvas.subplots()
-    _draw(axes, figure, palette)
-    if figure.strips:
-        _strips(axes, figure, palette)
-    _legend(axes, width)
-
-
-def _draw(axes: Axes, figure: Figure, palette: Palette) -> None:
+def _draw(axes: Axes, figure: Figure) -> None:
     named: set[str] = set()
-    lines, unit = palette.lines, _DAY_S if figure.clock else 1.0
+    unit = _DAY_S if figure.clock else 1.0
     for span in figure.spans:
         label = "" if span.name in named else _plain(span.name)
-        axes.axvspan(span.first / unit, span.last / unit, color=palette.grid, alpha=0.35, linewidth=0, label=label)
+        axes.axvspan(span.first / unit, span.last / unit, color=GRID, alpha=0.35, linewidth=0, label=label)
         named.add(span.name)
     if figure.unit_circle:
         angle = np.linspace(0.0, 2.0 * np.pi, 200)
-        axes.plot(np.cos(angle), np.sin(angle), color=palette.ink, linewidth=0.8)
+        axes.plot(np.cos(angle), np.sin(angle), color=INK, linewidth=0.8)
         axes.set_aspect("equal", adjustable="datalim")
     for i, line in enumerate(figure.lines):
-        _curve(axes, line, i, figure, lines)
+        _curve(axes, line, i, figure)
     drawn = len(figure.lines)
     for marks in figure.marks:
         hollow: dict[str, Any] = {"markerfacecolor": "none"} if marks.marker == "o" else {}
-        colour = lines[drawn % len(lines)]
+        colour = LINES[drawn % len(LINES)]
         axes.plot(marks.x / unit, marks.y, marks.marker, color=colour, label=_plain(marks.name), **hollow)
         drawn += 1
     for stems in figure.stems:
-        colour = lines[drawn % len(lines)]
+        colour = LINES[drawn % len(LINES)]
         axes.vlines(stems.x, 0.0, stems.y, color=colour, label=_plain(stems.name), linewidth=2.0)
         drawn += 1
     if figure.stems:
-        axes.axhline(0.0, color=palette.ink, linewidth=0.8)
+        axes.axhline(0.0, color=INK, linewidth=0.8)
     for limit in figure.limits:
-        axes.axhline(limit, color=palette.ink, linewidth=0.8, linestyle="--")
+        axes.axhline(limit, color=INK, linewidth=0.8, linestyle="--")
     # A logarithmic axis without a positive value cannot be drawn.
     if figure.x_log and np.isfinite(axes.dataLim.minposx):
         axes.set_xscale("log")
@@ -167,8 +123,8 @@ def _axes(axes: Axes, figure: Figure, unit: float) -> None:
     axes.grid(visible=True)
 
 
-def _strips(axes: Axes, figure: Figure, palette: Palette) -> None:
-    """Draw rows of time, the first on top; a piece too narrow to be seen is drawn as wide as one that is."""
+def _strips(axes: Axes, figure: Figure) -> None:
+    """Draw rows of time, the first on top; each piece has a least width, so that it remains visible."""
     unit = _DAY_S if figure.clock else 1.0
     first, last = figure.x_limits or (
         min((a for s in figure.strips for a, _ in s.spans), default=0.0),
@@ -177,15 +133,15 @@ def _strips(axes: Axes, figure: Figure, palette: Palette) -> None:
     least = (last - first) * _NARROWEST
     for row, strip in enumerate(figure.strips):
         pieces = [(a / unit, max(b - a, least) / unit) for a, b in strip.spans]
-        axes.broken_barh(pieces, (row - 0.35, 0.7), color=palette.lines[strip.line % len(palette.lines)], linewidth=0)
+        axes.broken_barh(pieces, (row - 0.35, 0.7), color=LINES[strip.line % len(LINES)], linewidth=0)
     axes.set_yticks(range(len(figure.strips)), [_plain(strip.name) for strip in figure.strips])
     axes.set_ylim(len(figure.strips) - 0.5, -0.5)
 
 
-def _curve(axes: Axes, line: Line, i: int, figure: Figure, lines: tuple[str, ...]) -> None:
-    colour = lines[i % len(lines)]
-    # The sixth curve has the first one's colour, but another dash.
-    dash = _DASHES[(i + i // len(lines)) % len(_DASHES)]
+def _curve(axes: Axes, line: Line, i: int, figure: Figure) -> None:
+    colour = LINES[i % len(LINES)]
+    # The sixth curve has the colour of the first, but another dash.
+    dash = _DASHES[(i + i // len(LINES)) % len(_DASHES)]
     x = line.x / _DAY_S if figure.clock else line.x
     keep = thinned(line.x, line.y, x_log=figure.x_log)
     axes.plot(x[keep], line.y[keep], linestyle=dash, color=colour, label=_plain(line.name), linewidth=1.5)
@@ -197,7 +153,7 @@ def _curve(axes: Axes, line: Line, i: int, figure: Figure, lines: tuple[str, ...
 
 
 def _legend(axes: Axes, width: float) -> None:
-    """Put the names above the axes, in as many columns as there is room for."""
+    """Place the legend above the axes, in as many columns as fit."""
     handles, names = axes.get_legend_handles_labels()
     if not names:
         return
@@ -209,5 +165,5 @@ def _legend(axes: Axes, width: float) -> None:
 
 
 def _plain(words: str) -> str:
-    """Keep matplotlib from reading what stands between two dollar signs as a formula."""
+    """Escape dollar signs, which matplotlib reads as mathematics."""
     return words.replace("$", r"\$")

@@ -1,4 +1,4 @@
-"""Curves and strips of any length in little memory: no more is kept than a picture can show."""
+"""Curves and strips of any length in bounded memory: only what a figure can show is kept."""
 
 from __future__ import annotations
 
@@ -6,31 +6,30 @@ import math
 
 import numpy as np
 
-from compensator.arrays import Indices, Vector
-from compensator.report.figure import Line
+from compensator.arrays import Vector
+from compensator.report.figure import Line, extremes
 
-#: Columns of pixels that a curve has at least; each keeps its lowest and its highest point.
+#: Least number of columns of a curve; each keeps its lowest and its highest point.
 COLUMNS = 1000
-#: Points that are kept before a curve is thinned again.
+#: Number of points at which a curve is thinned again.
 _MOST = 8 * COLUMNS
-#: From this width of a column on, a curve of a working machine fills its picture, s.
+#: From this column width on, the raw curve of a working machine would fill the figure; means are drawn instead, s.
 _WIDE_S = 2048.0
-#: Pieces of a strip that are told apart.
+#: Largest number of pieces of a strip.
 _PIECES = 1000
-#: A distance of so many periods or columns between two points is a gap.
+#: Points farther apart than this number of periods or columns have a gap between them.
 _GAP = 2.5
 
 
 class Envelope:
-    """A curve that grows: of each column of pixels its lowest and its highest point, with their own times.
+    """A growing curve, reduced to the lowest and the highest point of each column, with their own times.
 
-    Columns are a power of two of a second wide and only become wider, so that what is thinned twice loses nothing more
-    than what is thinned once.
+    Column widths are powers of two of a second and only grow, so thinning twice loses no more than thinning once.
 
     Parameters
     ----------
     period_s : float
-        Distance of its points where none is missing, s.
+        Sampling period, s.
 
     Examples
     --------
@@ -45,7 +44,7 @@ class Envelope:
     def __init__(self, *, period_s: float = 60.0) -> None:
         self._period_s = period_s
         self._width_s = 0.0
-        #: Of each column its number, sum and count; what came since it was last thinned is not in them.
+        #: Number, sum and count of each column, without the points since the last thinning.
         self._sums = np.empty((3, 0))
         self._summed_s = 0.0
         self._new: list[tuple[Vector, Vector]] = []
@@ -54,14 +53,14 @@ class Envelope:
         self._size = 0
 
     def add(self, t_s: Vector, y: Vector) -> None:
-        """Take points in.
+        """Add points.
 
         Parameters
         ----------
         t_s : numpy.ndarray, shape (n,)
             Times, s.
         y : numpy.ndarray, shape (n,)
-            Values; NaN where one is missing.
+            Values; NaN where missing.
         """
         self._new.append((t_s, y))
         self._t.append(t_s)
@@ -76,7 +75,7 @@ class Envelope:
         return any(bool(np.isfinite(y).any()) for y in self._y)
 
     def columns(self) -> tuple[Vector, Vector, Vector, Vector] | None:
-        """Return time, mean, lowest and highest of each column; None where columns are narrow and a curve says more.
+        """Return time, mean, lowest and highest of each column; None if columns are narrow enough to draw the points.
 
         Returns
         -------
@@ -100,7 +99,7 @@ class Envelope:
         return np.insert(at, gaps, between), mean, low, high
 
     def points(self) -> tuple[Vector, Vector]:
-        """Return the curve in the order of time, with a NaN wherever nothing is known for longer than a column."""
+        """Return the curve in order of time, with a NaN in each gap longer than a column."""
         self._thin()
         t, y = self._t[0], self._y[0]
         gaps = np.flatnonzero(np.diff(t) > _GAP * max(self._period_s, self._width_s))
@@ -114,12 +113,12 @@ class Envelope:
             span_s = max(float(t[-1] - t[0]), 1.0)
             self._width_s = max(self._width_s, 2.0 ** math.floor(math.log2(span_s / COLUMNS)))
             self._add_up()
-            keep = _extremes(np.floor(t / self._width_s), y)
+            keep = extremes(np.floor(t / self._width_s), y)
             t, y = t[keep], y[keep]
         self._t, self._y, self._size = [t], [y], t.size
 
     def _add_up(self) -> None:
-        """Bring the sums to the columns as they are now."""
+        """Add the new points to the sums, at the present column width."""
         if not self._new:
             return
         times = (np.concatenate([t for t, _ in self._new]), np.concatenate([y for _, y in self._new]))
@@ -134,16 +133,8 @@ class Envelope:
         self._sums, self._new, self._summed_s = np.array([number, *sums]), [], self._width_s
 
 
-def _extremes(column: Vector, y: Vector) -> Indices:
-    """Return where the lowest and the highest value of each column stand; of one without any, its first."""
-    order = np.lexsort((y, column))
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(column[order])) + 1])
-    known = np.add.reduceat(np.isfinite(y[order]).astype(np.int_), starts)
-    return np.unique(np.concatenate([order[starts], order[starts + np.maximum(known - 1, 0)]]))
-
-
 def line_of(name: str, curve: Envelope) -> Line:
-    """Return a curve to draw: its points, or, over a long time, its means and what they lie between."""
+    """Return a curve to draw: its points, or, over a long time, its means with the range as a band."""
     columns = curve.columns()
     if columns is None:
         return Line(name, *curve.points())
@@ -152,7 +143,7 @@ def line_of(name: str, curve: Envelope) -> Line:
 
 
 class Stretches:
-    """When something stood, as pieces of time; where they are too many, the nearest are joined.
+    """When something was active, as intervals of time; the nearest are joined when there are too many.
 
     Examples
     --------
@@ -165,12 +156,12 @@ class Stretches:
 
     def __init__(self) -> None:
         self.pieces: list[tuple[float, float]] = []
-        #: How often it began.
+        #: Number of starts.
         self.count = 0
         self._distance_s = 1.0
 
     def add(self, first_s: float, last_s: float) -> None:
-        """Take a piece in, s; one that goes on from the last makes it longer."""
+        """Add an interval, s; one that continues the last extends it."""
         if self.pieces and 0.0 <= first_s - self.pieces[-1][1] <= 1.0:
             self.pieces[-1] = (self.pieces[-1][0], last_s)
             return

@@ -1,4 +1,4 @@
-"""Pictures of a page, as what is to be drawn: curves with bands, points, stems, shaded spans, strips of time."""
+"""Figures of a page as data: curves with bands, points, stems, shaded spans, strips of time."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from compensator.arrays import Indices, Vector
 
-#: Buckets that a longer curve is thinned to; each keeps its lowest and highest point.
+#: Buckets to which a long curve is thinned; each keeps its lowest and highest point.
 _BUCKETS = 700
-#: Gaps up to which each is shown, however narrow.
+#: Up to this number of gaps each one is shown, however narrow.
 _GAPS = 100
 
 
@@ -22,11 +22,11 @@ class Line:
     Parameters
     ----------
     name : str
-        Stands in the legend.
+        Entry of the legend.
     x, y : numpy.ndarray, shape (n,)
         Points; a value that is not finite leaves a gap.
     band : tuple of numpy.ndarray, optional
-        What its uncertainty spans, lower and upper, each of shape (n,).
+        Lower and upper limit of its uncertainty, each of shape (n,).
     """
 
     name: str
@@ -65,16 +65,16 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """A row of time: when a state stood, when something happened.
+    """A row of time: when a state was active, when something happened.
 
     Parameters
     ----------
     name : str
-        Stands at the row's left end.
+        Label at the left.
     spans : tuple of (float, float)
         First and last x of each piece.
     line : int
-        Which of the line colours.
+        Index of the line colour.
     """
 
     name: str
@@ -84,28 +84,28 @@ class Strip:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figure:
-    """A picture with units on both axes.
+    """A figure with units on both axes.
 
     Parameters
     ----------
     title, x_label, y_label : str
-        Words; the labels name the unit.
+        The labels name the unit.
     lines, marks, stems, spans, strips : tuple
-        What is drawn; strips stand alone.
+        Content; strips are drawn alone.
     limits : tuple of float
         Dashed horizontal lines.
     x_log, y_log : bool
         Logarithmic axes.
     unit_circle : bool
-        Draw it, with equal axes.
+        Draw the unit circle, with equal axes.
     clock : bool
-        x is a time of day, in seconds since 1970 UTC.
+        x is a time, s since 1970 UTC.
     x_limits : tuple of float, optional
-        Ends of the x axis, so that pictures below each other go together.
+        Ends of the x axis, the same for figures below each other.
     note : str
         A sentence below.
     height : float
-        In inches, at a width of 9.
+        Height at a width of 9, inches.
     """
 
     title: str
@@ -127,17 +127,17 @@ class Figure:
 
 
 def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> Indices:
-    """Return the indices that keep a curve's look: lowest and highest of each bucket, its ends, and its gaps.
+    """Return the indices that preserve a curve's shape: extremes of each bucket, both ends, and gaps.
 
-    A gap narrower than a bucket is narrower than the line that is drawn. Where there are many such, they are left
-    out: samples lost here and there would otherwise leave nothing of the curve but lone points.
+    A gap narrower than a bucket is narrower than the line drawn. Where there are many such gaps they are omitted:
+    scattered lost samples would otherwise reduce the curve to isolated points.
 
     Parameters
     ----------
     x, y : numpy.ndarray, shape (n,)
         The curve.
     x_log : bool
-        Whether buckets are equally wide in the logarithm of x; else they hold equally many samples.
+        Buckets of equal width in the logarithm of x; otherwise of equal numbers of samples.
 
     Examples
     --------
@@ -152,13 +152,8 @@ def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> Indices:
     place = np.arange(x.size) * (_BUCKETS / x.size)
     if x_log and x[0] > 0.0 and bool(np.all(np.diff(x) > 0.0)):
         place = np.log(x / x[0]) / np.log(x[-1] / x[0]) * _BUCKETS
-    finite = np.isfinite(y)
-    keep = {0, x.size - 1}
-    for bucket in np.split(np.arange(x.size), np.flatnonzero(np.diff(np.floor(place))) + 1):
-        seen = bucket[finite[bucket]]
-        if seen.size:
-            keep |= {int(seen[np.argmin(y[seen])]), int(seen[np.argmax(y[seen])])}
-    known = np.flatnonzero(finite)
+    keep = {0, x.size - 1, *extremes(np.floor(place), y).tolist()}
+    known = np.flatnonzero(np.isfinite(y))
     gaps = np.diff(known) > 1
     if np.count_nonzero(gaps) > _GAPS:
         gaps &= np.diff(place[known]) >= 1.0
@@ -167,8 +162,23 @@ def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> Indices:
     return np.array(sorted(keep))
 
 
+def extremes(column: Vector, y: Vector) -> Indices:
+    """Return the indices of the lowest and highest finite value of each column; of its first point if it has none.
+
+    Examples
+    --------
+    >>> extremes(np.array([0.0, 0.0, 0.0, 1.0]), np.array([2.0, np.nan, 1.0, np.inf]))
+    array([0, 2, 3])
+    """
+    finite = np.isfinite(y)
+    order = np.lexsort((np.where(finite, y, np.inf), column))
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(column[order])) + 1])
+    known = np.add.reduceat(finite[order].astype(np.int_), starts)
+    return np.unique(np.concatenate([order[starts], order[starts + np.maximum(known - 1, 0)]]))
+
+
 def described(figure: Figure) -> str:
-    """Put into words what is drawn, for those who do not see it: axes, and where each curve lies.
+    """Describe a figure for screen readers: its axes and the range of each curve.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Reads recordings of a machine in one pass: what they tell, and no more of it than a page can show."""
+"""Reads recordings of a machine in one pass into a history of bounded size."""
 
 from __future__ import annotations
 
@@ -16,65 +16,22 @@ import msgspec
 import numpy as np
 
 from compensator.errors import DataError, UsageError
-from compensator.messages import number
+from compensator.messages import MESSAGES, EstimateMessage, Event, Offset, Sample, number
 from compensator.recording.container import PAYLOAD, Container, Contents, Damaged, Torn
 from compensator.report.envelope import Envelope, Stretches
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, File, History, Missed, Period
 
 _NS = 1e-9
 _DAY_S = 86400.0
-#: Values of a curve that are brought to it together.
+#: Values that are added to a curve in one call.
 _TOGETHER = 5000
-#: A distance of more periods between two samples is time without a recording.
+#: Samples farther apart than this number of periods have time without a recording between them.
 _GAP = 1.5
 _UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 
 
-class _Channel(msgspec.Struct):
-    mean: float | None
-    quality: str
-    errors: dict[str, int] = {}
-
-
-class _Sample(msgspec.Struct):
-    seq: int
-    time_utc_ns: int
-    period_s: float
-    channels: dict[str, _Channel]
-
-
-class _Estimate(msgspec.Struct):
-    seq: int
-    time_utc_ns: int
-    heat_w: float | None
-    y_dtf_um: float | None
-    y_tdtf_um: float | None
-    y_effects_um: list[float]
-    y_base_um: float
-    y_pred_um: float | None
-    y_um: float | None
-    residual_um: float | None
-
-
-class _Offset(msgspec.Struct):
-    seq: int
-    time_utc_ns: int
-    y_offset_um: float | None
-    y_offset_std_um: float | None
-    state: str
-    reasons: list[str]
-    model_sha256: str
-
-
-class _Event(msgspec.Struct):
-    time_utc_ns: int
-    kind: str
-    text: str
-
-
 _DECODERS: dict[str, msgspec.json.Decoder[Any]] = {
-    name: msgspec.json.Decoder(kind)
-    for name, kind in (("sample", _Sample), ("estimate", _Estimate), ("offset", _Offset), ("event", _Event))
+    name: msgspec.json.Decoder(MESSAGES[name]) for name in ("sample", "estimate", "offset", "event")
 }
 
 
@@ -86,7 +43,7 @@ def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] 
     paths : sequence of pathlib.Path
         In any order.
     progress : callable, optional
-        Called with the number of bytes read, and of all.
+        Called with the number of bytes read and their total.
 
     Raises
     ------
@@ -121,11 +78,11 @@ def _in_order(paths: Sequence[Path]) -> list[Path]:
 
 
 class _Reader:
-    """Takes messages in, one after the other."""
+    """Builds a history from messages in order."""
 
     def __init__(self) -> None:
         self.history = History()
-        self._take: dict[str, Callable[[Any], None]] = {
+        self._add: dict[str, Callable[[Any], None]] = {
             "sample": self._sample,
             "estimate": self._estimate,
             "offset": self._offset,
@@ -133,7 +90,7 @@ class _Reader:
         }
         self._buffers: dict[str, tuple[list[float], list[float]]] = {}
         self._period_s = 60.0
-        #: End of the last offset's sample; number of the last estimate, and what it measured.
+        #: End of the last offset's sample; number and measured Y of the last estimate.
         self._last_s = math.nan
         self._measured = (-1, math.nan)
         self._episode: Episode | None = None
@@ -143,7 +100,7 @@ class _Reader:
         self._days: dict[int, Period] = {}
 
     def file(self, name: str, container: Container) -> Iterator[int]:
-        """Take a file in, message by message."""
+        """Add a file, message by message."""
         file = File(name)
         self.history.files.append(file)
         topics: dict[int, str] = {}
@@ -161,7 +118,7 @@ class _Reader:
                         raise DataError(f"{name}: /{topic} record {sequence}: {error}") from error
                     if topic == "sample":
                         file.add(message.time_utc_ns * _NS)
-                    self._take[topic](message)
+                    self._add[topic](message)
                 yield i
             file.end = "finished" if container.contents.ended else "no end"
         except Torn:
@@ -170,21 +127,21 @@ class _Reader:
             file.end = f"damaged from byte {damage.offset} on"
 
     def result(self) -> History:
-        """Return what was gathered."""
+        """Return the history."""
         for name in self._buffers:
             self._flush(name)
         self._close()
         history = self.history
         if not history.whole.samples or not history.states:
             names = ", ".join(file.name for file in history.files[:3])
-            raise DataError(f"{names}: no samples in it, expected recordings of a machine's service")
+            raise DataError(f"{names}: no samples; expected recordings of a machine's service")
         history.episodes.sort(key=lambda episode: episode.number)
         return history
 
     # ------------------------------------------------------------------ messages
 
     def _opening(self, contents: Contents) -> None:
-        """Learn the machine's name, and those of the model and its effects."""
+        """Read the names of the machine, the model and its effects."""
         self.history.machine = contents.metadata.get("run", {}).get("machine", "") or self.history.machine
         part = contents.attachments.get("model.toml")
         try:
@@ -197,14 +154,14 @@ class _Reader:
             for effect in table.get("effect", [])
         ]
 
-    def _sample(self, sample: _Sample) -> None:
+    def _sample(self, sample: Sample) -> None:
         t = sample.time_utc_ns * _NS
         self._period_s = sample.period_s
         self.history.whole.samples += 1
         self._day(t).samples += 1
         for name, channel in sample.channels.items():
             good = channel.quality == "good"
-            self._put(f"channel {name}", t, number(channel.mean) if good else math.nan)
+            self._append(f"channel {name}", t, number(channel.mean) if good else math.nan)
             missed = self.history.channels.get(name)
             if missed is None:
                 missed = self.history.channels[name] = Missed()
@@ -215,15 +172,15 @@ class _Reader:
             if channel.errors:
                 missed.errors.update(channel.errors)
 
-    def _estimate(self, estimate: _Estimate) -> None:
+    def _estimate(self, estimate: EstimateMessage) -> None:
         t = estimate.time_utc_ns * _NS
         shares = {"DTF": number(estimate.y_dtf_um), "TDTF": number(estimate.y_tdtf_um)}
         for i, value in enumerate(estimate.y_effects_um):
             shares[self._effects[i] if i < len(self._effects) else f"effect {i + 1}"] = value
-        if estimate.y_base_um or "share zero on a warm machine" in self._buffers:
-            shares["zero on a warm machine"] = -estimate.y_base_um
+        if estimate.y_base_um or "share at the zero" in self._buffers:
+            shares["at the zero"] = -estimate.y_base_um
         for name, value in shares.items():
-            self._put(f"share {name}", t, value)
+            self._append(f"share {name}", t, value)
         y, residual = number(estimate.y_um), number(estimate.residual_um)
         for name, value in (
             ("heat", number(estimate.heat_w)),
@@ -231,26 +188,26 @@ class _Reader:
             ("measured", y),
             ("residual", residual),
         ):
-            self._put(name, t, value)
+            self._append(name, t, value)
         for period in (self.history.whole, self._day(t)):
             period.residual.add(residual, t)
             period.measured.add(y, t)
         self._measured = (estimate.seq, y)
 
-    def _offset(self, offset: _Offset) -> None:
+    def _offset(self, offset: Offset) -> None:
         t, history = offset.time_utc_ns * _NS, self.history
         y_offset, std = number(offset.y_offset_um), number(offset.y_offset_std_um)
         y = self._measured[1] if self._measured[0] == offset.seq else math.nan
-        self._put("offset", t, y_offset)
-        self._put("left", t, y + y_offset)
+        self._append("offset", t, y_offset)
+        self._append("left", t, y + y_offset)
         if offset.model_sha256 not in history.models:
             history.models[offset.model_sha256] = (self._model, t)
         first = t - self._period_s
         if abs(first - self._last_s) <= (_GAP - 1.0) * self._period_s:
             first = self._last_s
         elif first > self._last_s:
-            self._stood("", (), self._last_s, first)
-        self._stood(offset.state, tuple(offset.reasons), first, t)
+            self._extend("", (), self._last_s, first)
+        self._extend(offset.state, tuple(offset.reasons), first, t)
         self._last_s = t
         for period in (history.whole, self._day(t)):
             period.seconds[offset.state] += t - first
@@ -258,14 +215,14 @@ class _Reader:
             period.left.add(y + y_offset, t)
             period.std.add(std, t)
 
-    def _event(self, event: _Event) -> None:
+    def _event(self, event: Event) -> None:
         self.history.events_count += 1
         self.history.events = [*self.history.events[1 - EVENTS :], (event.time_utc_ns * _NS, event.kind, event.text)]
 
     # ------------------------------------------------------------------ gathering
 
-    def _stood(self, state: str, reasons: tuple[str, ...], first: float, last: float) -> None:
-        """Take in that a state stood, or that nothing was recorded."""
+    def _extend(self, state: str, reasons: tuple[str, ...], first: float, last: float) -> None:
+        """Add an interval in a state, or without a recording."""
         history = self.history
         if not state:
             history.whole.seconds[NO_RECORDING] += last - first
@@ -283,7 +240,7 @@ class _Reader:
             self._episode = Episode(last - first, next(self._numbers), first, last, state, reasons)
 
     def _close(self) -> None:
-        """Keep the episode that is over, where it is one of the longest."""
+        """End the current episode and keep it if it is one of the longest."""
         if self._episode is None:
             return
         self.history.episodes_count += 1
@@ -292,7 +249,7 @@ class _Reader:
             heapq.heappop(self.history.episodes)
         self._episode = None
 
-    def _put(self, name: str, t: float, value: float) -> None:
+    def _append(self, name: str, t: float, value: float) -> None:
         buffer = self._buffers.get(name)
         if buffer is None:
             buffer = self._buffers[name] = ([], [])
@@ -310,7 +267,7 @@ class _Reader:
         values.clear()
 
     def _day(self, t: float) -> Period:
-        # The sample that ends at midnight is the last of the day before.
+        # The sample that ends at midnight belongs to the day before.
         number_of_day = int((t - 1e-3) // _DAY_S)
         day = self._days.get(number_of_day)
         if day is None:

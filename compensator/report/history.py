@@ -1,4 +1,4 @@
-"""What recordings tell, gathered in little memory: a day as well as a year."""
+"""The history of a machine as its recordings show it: figures, curves and episodes in bounded memory."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from dataclasses import dataclass, field
 
 from compensator.report.envelope import Envelope, Stretches
 
-#: Events and episodes that are kept; the rest is counted.
+#: Numbers of events and episodes that are kept; the others are only counted.
 EVENTS, EPISODES = 500, 200
-#: A state of its own: the service was away.
+#: Shown as a state: the service did not run.
 NO_RECORDING = "no recording"
 
 
 @dataclass(slots=True)
 class Spread:
-    """Root mean square and largest amount of a quantity, with its sign and time.
+    """Root mean square and largest magnitude of a quantity, with its sign and time.
 
     Parameters
     ----------
     samples : int
         Number of values.
     peak, at_s : float
-        The value of the largest amount, and its time, s since 1970 UTC; NaN where there is none.
+        The value of largest magnitude and its time, s since 1970 UTC; NaN without any value.
     """
 
     samples: int = 0
@@ -32,7 +32,7 @@ class Spread:
     _squares: float = 0.0
 
     def add(self, value: float, at_s: float) -> None:
-        """Take a value in; one that is missing counts nowhere."""
+        """Add a value; NaN is ignored."""
         if math.isnan(value):
             return
         self.samples += 1
@@ -41,7 +41,7 @@ class Spread:
             self.peak, self.at_s = value, at_s
 
     def join(self, other: Spread) -> None:
-        """Take in what another one holds."""
+        """Add the values of another spread."""
         self.samples += other.samples
         self._squares += other._squares
         if not abs(other.peak) <= abs(self.peak) and other.samples:
@@ -49,13 +49,13 @@ class Spread:
 
     @property
     def rms(self) -> float:
-        """Root mean square; NaN where there is nothing."""
+        """Root mean square; NaN without any value."""
         return math.sqrt(self._squares / self.samples) if self.samples else math.nan
 
 
 @dataclass(slots=True)
 class Period:
-    """Figures of a stretch of time: a day, a month, or all of it.
+    """Figures of a day, a month, or the whole history.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Period:
     seconds : dict of str to float
         Time in each state, s.
     offset, residual, measured, left, std : Spread
-        The offset; measured − predicted; measured deformation, alone and with the offset; the standard deviation. µm.
+        Offset; measured − predicted; measured deformation; measured + offset; standard deviation of the offset. µm.
     """
 
     samples: int = 0
@@ -76,7 +76,7 @@ class Period:
     std: Spread = field(default_factory=Spread)
 
     def join(self, other: Period) -> None:
-        """Take in what another one holds."""
+        """Add the figures of another period."""
         self.samples += other.samples
         for state, seconds in other.seconds.items():
             self.seconds[state] += seconds
@@ -86,14 +86,14 @@ class Period:
 
 @dataclass(slots=True)
 class Missed:
-    """What was missed of a channel.
+    """Missing values of a channel.
 
     Parameters
     ----------
     samples, missing : int
         Samples, and those without a usable value.
     qualities, errors : collections.Counter
-        Why samples had none; single readings that were bad, by code.
+        Qualities of the missing values; codes of single bad readings.
     """
 
     samples: int = 0
@@ -104,7 +104,7 @@ class Missed:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Episode:
-    """A stretch in one state that is not `ok`, with its reasons; `state` is empty where nothing was recorded."""
+    """An interval in one state other than `ok` with its reasons; `state` is empty where nothing was recorded."""
 
     seconds: float
     number: int
@@ -121,13 +121,13 @@ class File:
     Parameters
     ----------
     name : str
-        Of the file.
+        File name.
     samples : int
         Number of samples in it.
     first_s, last_s : float
-        Times of the first and last, s since 1970 UTC; NaN where there is none.
+        Times of the first and last sample, s since 1970 UTC; NaN without any.
     end : str
-        How it ends: `finished`, `no end`, or where it is damaged.
+        `finished`, `no end`, or where it is damaged.
     """
 
     name: str
@@ -145,34 +145,32 @@ class File:
 
 @dataclass(slots=True)
 class History:
-    """What the recordings of a machine tell.
+    """The history of a machine.
 
     Parameters
     ----------
     machine : str
         Its name.
     files : list of File
-        In the order in which they were begun.
+        In order of their start.
     curves : dict of str to Envelope
         `offset`, `predicted`, `measured`, `left`, `residual`, `heat`, `share …` and `channel …`.
     states, reasons : dict of str to Stretches
-        When each stood; `no recording` is a state here.
+        When each was active; `no recording` counts as a state.
     reason_seconds : dict of str to float
         Time with each reason, s.
     whole : Period
-        Figures of all of it.
+        Figures of the whole history.
     days : dict of str to Period
-        By date, UTC.
+        Figures by date, UTC.
     channels : dict of str to Missed
-        By name.
+        By channel name.
     events : list of (float, str, str)
         Time, kind and text of the last events.
-    events_count : int
-        How many there were.
+    events_count, episodes_count : int
+        Numbers of all events and episodes.
     episodes : list of Episode
         The longest.
-    episodes_count : int
-        How many there were.
     models : dict of str to (str, float)
         Name and first time of each model, by its SHA-256.
     """
@@ -194,13 +192,10 @@ class History:
 
     @property
     def first_s(self) -> float:
-        """Begin of the first sample, s since 1970 UTC."""
+        """Start of the first sample, s since 1970 UTC."""
         return min(a for s in self.states.values() for a, _ in s.pieces)
 
     @property
     def last_s(self) -> float:
         """End of the last sample, s since 1970 UTC."""
         return max(b for s in self.states.values() for _, b in s.pieces)
-
-
-NO_RECORDING = "no recording"

@@ -1,9 +1,10 @@
-"""The page of a calibration: for the engineer who has to sign it."""
+"""The page of a calibration, for the engineer who approves it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,15 +49,15 @@ def write_report(
     Parameters
     ----------
     path, also : pathlib.Path
-        The HTML file, and another file that it goes into, of any of `formats.SUFFIXES`.
+        The HTML file, and another file for the same page, with any suffix of `formats.SUFFIXES`.
     calibration : Calibration
-        What came out.
+        The calibration.
     criticism : Criticism
-        The critical view of it.
+        Its diagnostics.
     model : ThermalModel
         As written, with its hash.
     comparison : sequence of Comparison
-        Coefficients beside another model's; may be empty.
+        Coefficients compared with those of another model; may be empty.
     """
     blocks: list[Block] = [_prediction(calibration), _residuals(calibration), _errors(calibration)]
     if criticism.warnings:
@@ -64,7 +65,7 @@ def write_report(
     if comparison:
         blocks.append(_compared(comparison))
     blocks += [*_parameters(calibration, criticism), *(_path_section(view) for view in criticism.paths)]
-    blocks.append(Section(title="What the residual still knows", blocks=[_still(view) for view in criticism.residuals]))
+    blocks.append(Section(title="Residual analysis", blocks=[_correlations(view) for view in criticism.residuals]))
     blocks.append(_choice(calibration))
     blocks.append(_provenance(calibration, model))
     page = Page(
@@ -84,7 +85,7 @@ def _tone(calibration: Calibration) -> Tone:
 
 
 def _joined(parts: Sequence[Part]) -> tuple[Vector, Vector, Vector, tuple[Span, ...]]:
-    """Lay the parts one after another on a time axis in hours, with a gap between files, and mark what was held out."""
+    """Join the parts on one time axis in hours, with a gap between files and a span for each held-out part."""
     t: list[Vector] = []
     y: list[Vector] = []
     predicted: list[Vector] = []
@@ -115,7 +116,7 @@ def _prediction(calibration: Calibration) -> Figure:
         y_label="Y, µm",
         lines=(Line("measured", t, y), Line("predicted", t, predicted)),
         spans=spans,
-        note="Nothing measured of Y is fed back." + (" Shaded: took no part in fitting or choosing." if spans else ""),
+        note="Measured Y is not fed back." + (" Shaded: held out from fit and selection." if spans else ""),
     )
 
 
@@ -147,17 +148,26 @@ def _errors(calibration: Calibration) -> Table:
         for part in calibration.parts
     ]
     rows.append(
-        ["blocks of the fitted data, in turn", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""]
+        [
+            "cross-validation over blocks of the fitted data",
+            "held out",
+            "",
+            "",
+            f"{calibration.folds_rms_um:.2f}",
+            "",
+            "",
+            "",
+        ]
     )
     arx = calibration.arx_rms_um
     left = f"{arx:.2f}" if np.isfinite(arx) else "unstable"
-    rows.append(["ARX of the same structure, to compare", "fitted", "", "", left, "", "", ""])
+    rows.append(["ARX of the same structure, for comparison", "fitted", "", "", left, "", "", ""])
     return Table(
         title="Errors in free run",
         head=["data", "part", "h", "fit %", "rms µm", "peak to peak µm", "uncompensated µm", "persistence µm"],
         rows=rows,
-        note="Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖). Persistence holds the last value before the part. A run "
-        "that was not fitted is zeroed on its first hour.",
+        note="Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖). Persistence: the last value before the part is held. "
+        "Runs that were not fitted are zeroed on their first hour.",
     )
 
 
@@ -165,7 +175,7 @@ def _parameters(calibration: Calibration, criticism: Criticism) -> list[Block]:
     main, coefficients = [], []
     for view, path in zip(criticism.paths, calibration.paths, strict=True):
         unit = view.unit.replace("um", "µm")
-        main.append([f"{view.name}: gain at rest", with_std(view.gain, view.gain_std), unit])
+        main.append([f"{view.name}: static gain", with_std(view.gain, view.gain_std), unit])
         main += [
             [f"{view.name}: time constant", with_std(t, s), "min"]
             for t, s in zip(view.taus_min, view.taus_std_min, strict=True)
@@ -180,14 +190,20 @@ def _parameters(calibration: Calibration, criticism: Criticism) -> list[Block]:
             for name, value, std in zip(names, values, stds.tolist(), strict=True)
         ]
     if calibration.temperature is not None:
-        main.append(["inverse TTF: noise of 1 K becomes", f"{calibration.temperature.noise_gain_w_per_k:.1f}", "W"])
-        main.append(["TTF: fit in free run from the known heat", f"{calibration.ttf_fit_pct:.2f}", "%"])
+        main.append(
+            [
+                "inverse TTF: heat noise for 1 K of temperature noise",
+                f"{calibration.temperature.noise_gain_w_per_k:.1f}",
+                "W",
+            ]
+        )
+        main.append(["TTF: fit in free run with known heat", f"{calibration.ttf_fit_pct:.2f}", "%"])
     return [
         Table(
             title="Parameters and their standard errors",
             head=["parameter", "value", "unit"],
             rows=main,
-            note="One standard error. Where the residual is not white, its low-frequency power is counted in.",
+            note="± one standard error, which includes the low-frequency power of a residual that is not white.",
         ),
         Details(title="Coefficients of 1/z", blocks=[Table(head=["coefficient", "value"], rows=coefficients)]),
     ]
@@ -196,88 +212,51 @@ def _parameters(calibration: Calibration, criticism: Criticism) -> list[Block]:
 def _path_section(view: PathView) -> Block:
     unit = view.unit.replace("um", "µm")
     hours = view.t_min / 60.0
+
+    def plot(name: str, x_label: str, y_label: str, *lines: Line, **options: Any) -> Figure:
+        title = f"{view.name}: {name}"
+        return Figure(title=title, x_label=x_label, y_label=y_label, lines=lines, height=3.2, **options)
+
     band = (view.step - 2 * view.step_std, view.step + 2 * view.step_std)
-    zeros = tuple([Marks("zeros", view.zeros.real, view.zeros.imag, marker="o")] if view.zeros.size else [])
-    step = Figure(
-        title=f"{view.name}: step response",
-        x_label="time, h",
-        y_label=unit,
-        lines=(Line("step, ± 2 standard errors", hours, view.step, band=band),),
-        limits=(view.gain,),
-        height=3.2,
-        note=f"Settles at {with_std(view.gain, view.gain_std)} {unit} (dashed).",
+    step = Line("step, ± 2 standard errors", hours, view.step, band=band)
+    settles = f"Settles at {with_std(view.gain, view.gain_std)} {unit} (dashed)."
+    zeros = [Marks("zeros", view.zeros.real, view.zeros.imag, marker="o")] if view.zeros.size else []
+    poles = (Marks("poles", view.poles.real, view.poles.imag), *zeros)
+    impulse = Line("impulse", hours, view.impulse)
+    magnitude = Line("magnitude", view.frequency_per_h, view.magnitude)
+    phase = Line("phase", view.frequency_per_h, view.phase_deg)
+    shown = (
+        plot("step response", "time, h", unit, step, limits=(view.gain,), note=settles),
+        plot("poles and zeros, z plane", "real part", "imaginary part", unit_circle=True, marks=poles),
     )
-    impulse = Figure(
-        title=f"{view.name}: impulse response",
-        x_label="time, h",
-        y_label=f"{unit} per sample",
-        lines=(Line("impulse", hours, view.impulse),),
-        height=3.2,
+    folded = (
+        plot("impulse response", "time, h", f"{unit} per sample", impulse),
+        plot("magnitude", "frequency, 1/h", unit, magnitude, x_log=True, y_log=True),
+        plot("phase", "frequency, 1/h", "degrees", phase, x_log=True),
     )
-    bode = (
-        Figure(
-            title=f"{view.name}: magnitude",
-            x_label="frequency, 1/h",
-            y_label=unit,
-            x_log=True,
-            y_log=True,
-            lines=(Line("magnitude", view.frequency_per_h, view.magnitude),),
-            height=3.2,
-        ),
-        Figure(
-            title=f"{view.name}: phase",
-            x_label="frequency, 1/h",
-            y_label="degrees",
-            x_log=True,
-            lines=(Line("phase", view.frequency_per_h, view.phase_deg),),
-            height=3.2,
-        ),
-    )
-    plane = Figure(
-        title=f"{view.name}: poles and zeros, z plane",
-        x_label="real part",
-        y_label="imaginary part",
-        unit_circle=True,
-        marks=(Marks("poles", view.poles.real, view.poles.imag), *zeros),
-        height=3.2,
-    )
-    return Section(
-        title=f"{view.name}",
-        blocks=[
-            Row(figures=(step, plane)),
-            Details(title=f"{view.name}: impulse response and Bode diagram", blocks=[Row(figures=(impulse, *bode))]),
-        ],
-    )
+    details = Details(title=f"{view.name}: impulse response and Bode diagram", blocks=[Row(figures=folded)])
+    return Section(title=view.name, blocks=[Row(figures=shown), details])
 
 
-def _still(view: ResidualView) -> Block:
+def _correlations(view: ResidualView) -> Block:
+    def plot(name: str, stems: Stems, limit: float, note: str = "") -> Figure:
+        title, limits = f"{view.name}: {name}", (-limit, limit)
+        axes: dict[str, Any] = {"x_label": "lag, samples", "y_label": "correlation", "height": 3.0}
+        return Figure(title=title, stems=(stems,), limits=limits, note=note, **axes)
+
     lags = np.arange(1, view.autocorrelation.size + 1, dtype=np.float64)
-    own = Figure(
-        title=f"{view.name}: autocorrelation of the residual",
-        x_label="lag, samples",
-        y_label="correlation",
-        stems=(Stems("residual", lags, view.autocorrelation),),
-        limits=(-view.limit, view.limit),
-        height=3.0,
-        note=f"Dashed: 99 % of white noise. Chance of so much in white noise: {_chance(view.white_chance)}.",
-    )
     both = np.arange(-LAGS, LAGS + 1, dtype=np.float64)
-    cross = tuple(
-        Figure(
-            title=f"{view.name}: correlation of the residual with {name}",
-            x_label="lag, samples",
-            y_label="correlation",
-            stems=(Stems(name, both, values),),
-            limits=(-limit, limit),
-            height=3.0,
-        )
+    note = f"Dashed: 99 % limits of white noise. Whiteness test: p {_probability(view.white_chance)}."
+    own = plot("autocorrelation of the residual", Stems("residual", lags, view.autocorrelation), view.limit, note)
+    cross = (
+        plot(f"correlation of the residual with {name}", Stems(name, both, values), limit)
         for name, (values, limit) in view.cross.items()
     )
     return Row(figures=(own, *cross))
 
 
-def _chance(share: float) -> str:
-    return f"{share:.2g}" if share >= 0.001 else "under 0.001"
+def _probability(p: float) -> str:
+    return f"= {p:.2g}" if p >= 0.001 else "< 0.001"
 
 
 def _choice(calibration: Calibration) -> Block:
@@ -290,11 +269,11 @@ def _choice(calibration: Calibration) -> Block:
                     str(c.structure),
                     f"{c.rms:.3f}",
                     f"{max(c.fold_rms):.3f}",
-                    "chosen" if c.chosen else "" if c.supported else "not determined by the data",
+                    "chosen" if c.chosen else "" if c.supported else "not supported by the data",
                 ]
                 for c in candidates
             ],
-            note="The simplest whose held-out error is not worse than the best one's by more than its standard error.",
+            note="Chosen: the simplest structure whose held-out error is within one standard error of the best.",
         )
 
     blocks = [
@@ -302,12 +281,12 @@ def _choice(calibration: Calibration) -> Block:
     ]
     if calibration.deformation.etve_candidates:
         blocks.append(table("TDTF, on the ETVE", calibration.deformation.etve_candidates))
-    return Details(title="How the order was chosen", blocks=blocks)
+    return Details(title="Order selection", blocks=blocks)
 
 
 def _compared(rows: Sequence[Comparison]) -> Table:
     return Table(
-        title="Beside the reference model",
+        title="Comparison with the reference model",
         head=["path and figure", "identified", "standard error", "reference", "difference / standard error"],
         rows=[
             [f"{r.path}: {r.figure}", f"{r.found:.4g}", f"{r.std:.2g}", f"{r.reference:.4g}", f"{r.deviations:+.1f}"]
@@ -335,4 +314,4 @@ def _provenance(calibration: Calibration, model: ThermalModel) -> Block:
     blocks: list[Block] = [Table(head=["", ""], rows=rows)]
     if calibration.remarks:
         blocks.append(Words(title="Remarks on the data", lines=calibration.remarks))
-    return Details(title="Data, ranges, provenance", blocks=blocks)
+    return Details(title="Data, validity, provenance", blocks=blocks)

@@ -1,44 +1,43 @@
-"""A self-contained HTML page: verdict first, then the picture that carries it, then tables, then details to open.
+"""A self-contained HTML page: the verdict, the figure that supports it, tables, and details to open.
 
-Nothing is loaded from anywhere, no script runs. Pictures are SVG whose colours are CSS variables, so that one
-page serves a light and a dark screen and paper. What a code means and what to do stands at the end of each page that
-shows one, and every code leads there.
+A page loads nothing and runs no script; its content security policy enforces both. Figures are SVG whose colours are
+CSS variables, so that one page serves light and dark screens and paper. Each code on a page links to its meaning and
+action at the end of the page.
 """
 
 from __future__ import annotations
 
 import html
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from itertools import count
+from itertools import chain, count, repeat
 from pathlib import Path
 from typing import Literal
 
+from compensator.atomic_write import whole_file
 from compensator.reasons import Caution, explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 
 Tone = Literal["good", "warn", "bad"]
-#: Widths of a picture alone and of one in a row, inches: the text of each stays readable in its place.
+#: Widths of a figure alone and of one in a row, inches: the text of both stays readable.
 _WIDE_IN, _NARROW_IN = 9.0, 4.8
-#: What a cell of a column of numbers looks like: digits, signs, errors, percent; a value that is missing.
+#: Cells of a column of numbers: digits, signs, errors, percent, and dashes for missing values.
 _NUMBER = re.compile(
     r"[-+−±–]?\s*\d[\d.,\s]*([eE][-+−]?\d+)?(\s*±\s*\d[\d.,eE+−-]*)?\s*%?(\s*\(.*\))?|nan|[-+−]?(inf|∞)|[-–—]"
 )
-#: Longest cell that stays on one line, letters.
-_SENTENCE = 36
-#: Longest name of a file, or hash, that stays on one line, letters.
-_UNBROKEN = 24
-#: Heading of what the codes on a page mean.
-GLOSSARY = "What the words mean, and what to do"
-TONE_WORDS: dict[Tone, str] = {"good": "✓ good", "warn": "⚠ mind", "bad": "✗ no"}
+#: Longest cell that stays on one line, and longest word (a file name, a hash) that is not broken, letters.
+_LONGEST_CELL, _LONGEST_WORD = 36, 24
+TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "bad": "✗ Failed"}
+#: Inline styles are all that a page needs.
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """A state, reason, quality or warning; leads to its sentences at the end of the page.
+    """A state, reason, quality or warning; links to its meaning and action at the end of the page.
 
     Parameters
     ----------
@@ -50,47 +49,47 @@ class Code:
 
     @property
     def word(self) -> str:
-        """The code without what it applies to."""
+        """The code without its subject."""
         return self.code.split(":", maxsplit=1)[0]
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Leads to another page.
+    """A link to another page.
 
     Parameters
     ----------
     text, href : str
-        What is read, and a relative address.
+        Its text and a relative address.
     """
 
     text: str
     href: str
 
 
-#: What stands in a cell or a line: words, or words with codes and links between them.
+#: Content of a cell or line: text, codes and links.
 Cell = str | Code | Link | tuple[str | Code | Link, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """Pictures side by side where there is room."""
+    """Figures side by side where the page is wide enough."""
 
     figures: tuple[Figure, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """A table, which scrolls in its own box where it is too wide.
+    """A table; it scrolls in its own box where it is too wide.
 
     Parameters
     ----------
     title : str
         A heading; may be empty.
     head : sequence of str
-        Names of the columns; without any, there is no header row.
+        Names of the columns; if all are empty, there is no header row.
     rows : sequence of sequence of Cell
-        The first cell names the row. Columns of numbers stand right, others left.
+        The first cell names the row. Columns of numbers are aligned right, others left.
     note : str
         A sentence below.
     """
@@ -103,7 +102,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Words:
-    """Sentences; a `warning` is marked as one."""
+    """A list of sentences, plain or as a warning."""
 
     title: str
     lines: Sequence[Cell]
@@ -111,18 +110,18 @@ class Words:
 
 
 def warnings_of(cautions: Iterable[Caution]) -> Words:
-    """Return warnings as a block; each leads to its sentences at the end of the page."""
-    return Words(title="Warnings", lines=[sentence_of(said) for said in cautions], kind="warning")
+    """Return warnings as a block with links to their codes."""
+    return Words(title="Warnings", lines=[sentence_of(caution) for caution in cautions], kind="warning")
 
 
 def sentence_of(caution: Caution) -> Cell:
-    """Return a warning or remark as a line; its code leads to its sentences at the end of the page."""
+    """Return a warning or remark as a line with a link to its code."""
     return (str(caution), " ", Code(caution.code))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Details:
-    """Something to open."""
+    """Blocks that are folded on a screen and open on paper."""
 
     title: str
     blocks: Sequence[Block]
@@ -146,11 +145,11 @@ class Page:
     Parameters
     ----------
     title, verdict : str
-        What it is about, and the one sentence to take away.
+        The subject, and the result in one sentence.
     blocks : sequence of Block
-        What follows, in order.
+        The content, in order.
     tone : {"good", "warn", "bad"}
-        Shown beside the verdict as colour and as a word.
+        Shown with the verdict as a sign, a word and a colour.
     """
 
     title: str
@@ -165,7 +164,7 @@ def html_of(page: Page) -> str:
     Parameters
     ----------
     page : Page
-        What stands on it.
+        Its content.
     """
     style = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
     title = html.escape(page.title)
@@ -173,6 +172,7 @@ def html_of(page: Page) -> str:
     body = "".join(_block(block, numbers, 2) for block in page.blocks)
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style></head><body>'
         f'<main><h1>{title}</h1><p class="verdict {page.tone}"><b>{TONE_WORDS[page.tone]}</b>'
         f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}</main></body></html>"
@@ -180,26 +180,27 @@ def html_of(page: Page) -> str:
 
 
 def write_page(path: Path, page: Page) -> Path:
-    """Write a page.
+    """Write a page as HTML.
 
     Parameters
     ----------
     path : pathlib.Path
         The HTML file.
     page : Page
-        What stands on it.
+        Its content.
 
     Returns
     -------
     pathlib.Path
         The same path.
     """
-    path.write_text(html_of(page), encoding="utf-8")
+    with whole_file(path) as file:
+        file.write(html_of(page))
     return path
 
 
 def codes_of(blocks: Iterable[Block]) -> list[str]:
-    """Return the words of all codes in blocks that have an explanation, in the order in which they come."""
+    """Return all codes in blocks that have an explanation, in order of appearance."""
     words: dict[str, None] = {}
     for block in blocks:
         for cell in _cells(block):
@@ -209,10 +210,10 @@ def codes_of(blocks: Iterable[Block]) -> list[str]:
     return list(words)
 
 
-def text_of(cell: Cell) -> str:
-    """Return a cell as words."""
+def _text(cell: Cell) -> str:
+    """Return the text of a cell."""
     if isinstance(cell, tuple):
-        return "".join(map(text_of, cell))
+        return "".join(map(_text, cell))
     return cell if isinstance(cell, str) else cell.code if isinstance(cell, Code) else cell.text
 
 
@@ -228,15 +229,15 @@ def _cells(block: Block) -> Iterator[Cell]:
 
 
 def _glossary(blocks: Sequence[Block]) -> str:
-    """Say of every code on the page what it means and what to do."""
+    """Return meaning and action of every code on the page."""
     entries = []
     for word in codes_of(blocks):
-        means, do = explain(word) or ("", "")
+        meaning, action = explain(word) or ("", "")
         entries.append(
-            f'<div id="word-{html.escape(word)}"><dt><code>{html.escape(word)}</code></dt><dd>{html.escape(means)}</dd>'
-            f"<dd><b>To do:</b> {html.escape(do)}</dd></div>"
+            f'<div id="word-{html.escape(word)}"><dt><code>{html.escape(word)}</code></dt>'
+            f"<dd>{html.escape(meaning)}</dd><dd><b>Action:</b> {html.escape(action)}</dd></div>"
         )
-    return f"<section><h2>{GLOSSARY}</h2><dl>{''.join(entries)}</dl></section>" if entries else ""
+    return f"<section><h2>Codes</h2><dl>{''.join(entries)}</dl></section>" if entries else ""
 
 
 def _figure(figure: Figure, numbers: Iterator[int], width: float) -> str:
@@ -270,52 +271,38 @@ def _heading(words: str, level: int, sign: str = "") -> str:
 
 
 def _table(table: Table, level: int) -> str:
-    head = "".join(_cell(cell, "col") for cell in table.head) if any(table.head) else ""
-    rows = "".join(
-        "<tr>" + "".join(_cell(cell, "" if i else "row") for i, cell in enumerate(row)) + "</tr>" for row in table.rows
-    )
+    classes = _classes(table)
+    head = "".join(map(_cell, table.head, classes, repeat("col"))) if any(table.head) else ""
+    rows = "".join(f"<tr>{''.join(map(_cell, row, classes, chain(['row'], repeat(''))))}</tr>" for row in table.rows)
     title = _heading(table.title, level) if table.title else ""
     note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
     label = html.escape(table.title or "table")
     return (
-        f'{title}<div class="scroll" role="region" aria-label="{label}" tabindex="0"><table class="{_classes(table)}">'
+        f'{title}<div class="scroll" role="region" aria-label="{label}" tabindex="0"><table>'
         f"{f'<thead><tr>{head}</tr></thead>' if head else ''}<tbody>{rows}</tbody></table></div>{note}"
     )
 
 
-def columns_of_words(table: Table) -> set[int]:
-    """Return which columns hold words for the most part, the first being one of them; they stand left."""
-    found = {0}
-    for i in range(1, max((len(row) for row in table.rows), default=0)):
-        cells = [text_of(row[i]) for row in table.rows if i < len(row) and row[i]]
-        if 2 * sum(bool(_NUMBER.fullmatch(cell)) for cell in cells) < len(cells):
-            found.add(i)
-    return found
+def _classes(table: Table) -> list[str]:
+    """Return the class of each column: words (the first column is always one), sentences, long names, or numbers."""
+    classes = []
+    for i in range(max(map(len, [table.head, *table.rows]))):
+        cells = [text for row in table.rows if i < len(row) and (text := _text(row[i]))]
+        if i and 2 * sum(bool(_NUMBER.fullmatch(cell)) for cell in cells) >= len(cells):
+            classes.append("")
+        elif max(map(len, cells), default=0) > _LONGEST_CELL:
+            classes.append("text long")
+        elif any(len(word) > _LONGEST_WORD for cell in cells for word in cell.split()):
+            classes.append("text name")
+        else:
+            classes.append("text")
+    return classes
 
 
-def _classes(table: Table) -> str:
-    """Return the classes that set columns of words left, and break lines in those of sentences."""
-    words = sorted(columns_of_words(table))
-    long = [
-        i for i in words if max((len(text_of(row[i])) for row in table.rows if i < len(row)), default=0) > _SENTENCE
-    ]
-    broken = [
-        i for i in words if i not in long and any(_has_long_word(text_of(row[i])) for row in table.rows if i < len(row))
-    ]
-    return " ".join(
-        [*(f"text-{i + 1}" for i in words), *(f"long-{i + 1}" for i in long), *(f"name-{i + 1}" for i in broken)]
-    )
-
-
-def _has_long_word(text: str) -> bool:
-    return any(len(word) > _UNBROKEN for word in text.split())
-
-
-def _cell(cell: Cell, scope: str) -> str:
-    """Write a cell; one that is empty heads nothing."""
-    if scope and cell:
-        return f'<th scope="{scope}">{_inline(cell)}</th>'
-    return f"<td>{_inline(cell)}</td>"
+def _cell(cell: Cell, kind: str, scope: str) -> str:
+    """Return a cell; an empty one is no header."""
+    style = f' class="{kind}"' if kind else ""
+    return f'<th scope="{scope}"{style}>{_inline(cell)}</th>' if scope and cell else f"<td{style}>{_inline(cell)}</td>"
 
 
 def _inline(cell: Cell) -> str:
@@ -329,6 +316,7 @@ def _inline(cell: Cell) -> str:
     return html.escape(cell)
 
 
+# Pages are made of figures, too.
 __all__ = [
     "Block",
     "Cell",
@@ -348,9 +336,8 @@ __all__ = [
     "Tone",
     "Words",
     "codes_of",
-    "columns_of_words",
     "html_of",
-    "text_of",
+    "sentence_of",
     "warnings_of",
     "write_page",
 ]

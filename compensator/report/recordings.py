@@ -1,4 +1,4 @@
-"""The page of recordings: how a machine was compensated over a day, a week, a year."""
+"""The page of a machine's recordings over a day, a week or a year."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from compensator.reasons import Caution, explain
 from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
+from compensator.report.notation import plain, signed
 from compensator.report.page import (
     Block,
     Cell,
@@ -27,21 +28,21 @@ from compensator.report.page import (
 )
 
 TIME = "time, UTC"
-#: Order in which states stand on the page, the gravest last; what nobody recorded comes behind them.
+#: Order of the states on the page.
 STATES = ("ok", "degraded", "starting", "hold", "fault", NO_RECORDING)
 #: States in which the offset follows the machine.
 _FOLLOWS = ("ok", "degraded")
-#: Largest share of the time without a following offset that is worth a warning only.
+#: Share of the time without a following offset (or degraded) above which the verdict is worse.
 _MUCH = 0.1
-#: More is left than the service's own standard deviation times this: the model or a sensor is wrong, not only noisy.
+#: A remaining error beyond this multiple of the stated standard deviation is not noise: the model or a sensor is wrong.
 _BEYOND = 3.0
-#: Days that stand one below the other; more are put together by months.
+#: Longest table of days; more days are summed by months.
 _DAYS = 31
-#: So many rows stand on the page at once; more are there to open.
+#: Longest table that is shown unfolded, rows.
 _ROWS = 12
-#: Ends of a recording that have sentences of their own.
+#: Ends of a recording that are codes.
 _ENDS: Mapping[str, Cell] = {"finished": Code("finished"), "no end": Code("open")}
-#: Curves in a picture of channels, and pieces of time shaded in one.
+#: Largest numbers of curves and of shaded intervals in a figure.
 _CURVES, _SHADED = 5, 100
 _UNITS = (
     ("_degc", "temperature, °C"),
@@ -63,7 +64,7 @@ def page_of(history: History) -> Page:
     Parameters
     ----------
     history : History
-        What they tell.
+        Read from them.
     """
     beyond = _beyond(history.whole)
     blocks: list[Block] = [
@@ -108,49 +109,46 @@ def figures(history: History) -> dict[str, object]:
 
 
 def span(history: History) -> str:
-    """Return from when to when the recordings go."""
+    """Return the interval that the recordings cover."""
     first, last = (datetime.fromtimestamp(t, UTC) for t in (history.first_s, history.last_s))
     same_day = first.date() == last.date()
     return f"{first:%Y-%m-%d %H:%M} to {last:{'%H:%M' if same_day else '%Y-%m-%d %H:%M'}} UTC"
 
 
 def verdict(history: History) -> str:
-    """Return one sentence that needs no knowledge of the service."""
+    """Return the result in one sentence."""
     whole, seconds = history.whole, history.whole.seconds
     total = sum(seconds.values())
     followed = sum(seconds[state] for state in _FOLLOWS)
-    # All of the time only where nothing at all is missing.
-    words = "all" if followed == total else f"{min(100.0 * followed / total, 99.9):.1f} %"
-    words = f"The correction followed the machine for {words} of {_hours(total)}"
+    # "All" only if nothing is missing.
+    share = "all" if followed == total else f"{min(100.0 * followed / total, 99.9):.1f} %"
+    words = f"The correction followed the machine for {share} of {_hours(total)}"
     if whole.left.samples:
         words += (
-            f"; the probe saw an error in Y of {whole.measured.rms:.1f} µm rms, of which {whole.left.rms:.1f} "
-            f"are left with the correction{_beside_stated(whole)}"
+            f"; the measured error in Y was {whole.measured.rms:.1f} µm rms, of which {whole.left.rms:.1f} remain with "
+            f"the correction{_against_stated(whole)}"
         )
     elif whole.offset.samples:
-        words += f"; it reached {_um(whole.offset.peak, 1)} µm"
+        words += f"; it reached {signed(whole.offset.peak, 1)} µm"
     return f"{words}."
 
 
-def _beside_stated(whole: Period) -> str:
-    """Say what is left beside the service's own standard deviation: it alone says what a good model leaves here."""
-    stated = whole.std.rms
-    if not stated > 0.0:
-        return ""
-    if whole.left.rms <= _BEYOND * stated:
-        return f" (the service itself states a standard deviation of {_short(stated)})"
-    return (
-        f": {whole.left.rms / stated:.0f} times the standard deviation of {_short(stated)} that the service itself "
-        "states, so the model lacks something or a sensor lies"
-    )
+def _against_stated(whole: Period) -> str:
+    """Compare the remaining error with the standard deviation that the service states."""
+    if _beyond(whole) is not None:
+        return (
+            f": {whole.left.rms / whole.std.rms:.0f} times the standard deviation of {_short(whole.std.rms)} that the "
+            "service states, so the model lacks an effect or a sensor is wrong"
+        )
+    return f" (the service states a standard deviation of {_short(whole.std.rms)})" if whole.std.rms > 0.0 else ""
 
 
 def _beyond(whole: Period) -> Caution | None:
-    """Say where more is left than the service itself expects; nothing where Y was not measured."""
+    """Warn where the remaining error exceeds what the service states."""
     if not (whole.left.samples and 0.0 < _BEYOND * whole.std.rms < whole.left.rms):
         return None
-    said = f"With the correction {_short(whole.left.rms)} rms are left, the service states {_short(whole.std.rms)}."
-    return Caution("left_beyond_stated", said)
+    remains = f"{_short(whole.left.rms)} rms remain with the correction; the service states {_short(whole.std.rms)}."
+    return Caution("left_beyond_stated", remains)
 
 
 def _short(value_um: float) -> str:
@@ -168,10 +166,10 @@ def _tone(history: History) -> Tone:
     return "warn" if doubtful else "good"
 
 
-# ---------------------------------------------------------------------------- pictures
+# ---------------------------------------------------------------------------- figures
 
 
-def _picture(
+def _curves(
     history: History,
     title: str,
     y_label: str,
@@ -183,7 +181,7 @@ def _picture(
     drawn = [(name, history.curves[key]) for name, key in curves.items() if key in history.curves]
     lines = tuple(line_of(name, curve) for name, curve in drawn)
     if any(line.band is not None for line in lines):
-        note = f"{note} Lines are means, shaded is what lies between the lowest and the highest.".strip()
+        note = f"{note} Lines are means; the band spans the lowest and highest values.".strip()
     return Figure(
         title=title,
         x_label=TIME,
@@ -205,11 +203,11 @@ def _offset(history: History) -> Figure:
         for piece in history.states[state].pieces
     ]
     curves = {"offset": "offset"}
-    words = f"Largest offset {_um(history.whole.offset.peak, 1)} µm."
+    words = f"Largest offset {signed(history.whole.offset.peak, 1)} µm."
     if history.whole.left.samples:
-        curves = {"measured": "measured", "left (measured + offset)": "left"} | curves
-        words += f" Left of the measured error: {history.whole.left.rms:.2f} µm rms."
-    return _picture(history, "Offset, and what is left", "Y, µm", curves, words, 3.4, tuple(stood[:_SHADED]))
+        curves = {"measured": "measured", "remaining (measured + offset)": "left"} | curves
+        words += f" Remaining error: {history.whole.left.rms:.2f} µm rms."
+    return _curves(history, "Offset and remaining error", "Y, µm", curves, words, 3.4, tuple(stood[:_SHADED]))
 
 
 def _band(history: History) -> Figure:
@@ -236,23 +234,23 @@ def _band(history: History) -> Figure:
 
 def _shares(history: History) -> Figure:
     curves = {key.removeprefix("share "): key for key in history.curves if key.startswith("share ")}
-    note = "Since the zero; the offset is minus their sum, within its limits."
-    return _picture(history, "Share of each path in the predicted deformation", "Y, µm", curves, note)
+    note = "Since the zero. The offset is the negative sum, within its limits."
+    return _curves(history, "Predicted deformation by path", "Y, µm", curves, note)
 
 
 def _residual(history: History) -> list[Block]:
     residual = history.whole.residual
     if not residual.samples:
-        return [Words(title="Residual", lines=["Y was not measured, so nothing can be said of the residual."])]
-    note = f"{residual.rms:.2f} µm rms; the largest is {_um(residual.peak, 1)} µm, {_utc(residual.at_s)}."
-    return [_picture(history, "Residual, measured − predicted", "residual, µm", {"residual": "residual"}, note)]
+        return [Words(title="Residual", lines=["Y was not measured: there is no residual."])]
+    note = f"{residual.rms:.2f} µm rms; the largest is {signed(residual.peak, 1)} µm, {_utc(residual.at_s)}."
+    return [_curves(history, "Residual, measured − predicted", "residual, µm", {"residual": "residual"}, note)]
 
 
 def _temperatures(history: History) -> list[Block]:
     curves = {"T_Q": "channel t_q_degc", "AT": "channel at_degc"}
-    heat = _picture(history, "Heat, estimated from T_Q and AT", "heat, W", {"heat": "heat"}, height=2.4)
-    note = "Where a curve is missing there was no value that could be used."
-    temperatures = _picture(history, "Temperatures that the model uses", "temperature, °C", curves, note, 2.6)
+    heat = _curves(history, "Heat, estimated from T_Q and AT", "heat, W", {"heat": "heat"}, height=2.4)
+    note = "Gaps: no usable value."
+    temperatures = _curves(history, "Temperatures used by the model", "temperature, °C", curves, note, 2.6)
     return [temperatures, heat] if history.curves["heat"].known else [temperatures]
 
 
@@ -263,7 +261,7 @@ def _other_channels(history: History) -> list[Block]:
             unit = next((words for ending, words in _UNITS if name.endswith(ending)), f"{name}, unit as in its name")
             groups[unit].append(name)
     pictures = [
-        _picture(
+        _curves(
             history,
             f"Other channels: {unit.partition(',')[0]}",
             unit,
@@ -282,12 +280,12 @@ def _other_channels(history: History) -> list[Block]:
 def _figures(history: History) -> Table:
     whole = history.whole
     rows = [
-        ["largest offset", _um(whole.offset.peak, 1), "µm", _at(whole.offset)],
-        ["largest standard deviation of the offset", _plain(whole.std.peak, 2), "µm", _at(whole.std)],
-        ["error in Y as measured, rms", _plain(whole.measured.rms, 2), "µm", ""],
-        ["left with the correction, rms", _plain(whole.left.rms, 2), "µm", ""],
-        ["largest left with the correction", _um(whole.left.peak, 1), "µm", _at(whole.left)],
-        ["residual, rms", _plain(whole.residual.rms, 2), "µm", ""],
+        ["largest offset", signed(whole.offset.peak, 1), "µm", _at(whole.offset)],
+        ["largest standard deviation of the offset", plain(whole.std.peak, 2), "µm", _at(whole.std)],
+        ["measured error in Y, rms", plain(whole.measured.rms, 2), "µm", ""],
+        ["remaining error, rms", plain(whole.left.rms, 2), "µm", ""],
+        ["largest remaining error", signed(whole.left.peak, 1), "µm", _at(whole.left)],
+        ["residual, rms", plain(whole.residual.rms, 2), "µm", ""],
         ["samples", str(whole.samples), "", ""],
     ]
     note = "" if whole.measured.samples else "Y was not measured: –."
@@ -299,19 +297,19 @@ def _states(history: History) -> Table:
     for state in STATES:
         if state in history.states:
             seconds, times = history.whole.seconds[state], history.states[state].count
-            means, do = explain(state) or ("Nobody knows: the service was away.", "See the events around it.")
+            meaning, action = explain(state) or ("The service did not run.", "See the events before and after.")
             cell: Cell = state if state == NO_RECORDING else Code(state)
-            rows.append([cell, _minutes(seconds), _share(history, state), str(times), means, do])
-    return Table(title="Minutes by state", rows=rows, head=["state", "min", "share", "times", "means", "to do"])
+            rows.append([cell, _minutes(seconds), _share(history, state), str(times), meaning, action])
+    return Table(title="Time in each state", rows=rows, head=["state", "min", "share", "times", "meaning", "action"])
 
 
 def _reasons(history: History) -> Table:
     rows: list[list[Cell]] = []
     for reason, stretch in sorted(history.reasons.items(), key=lambda item: -history.reason_seconds[item[0]]):
-        means, do = explain(reason) or ("", "")
+        meaning, action = explain(reason) or ("", "")
         seconds, last = history.reason_seconds[reason], stretch.pieces[-1][1]
-        rows.append([Code(reason), _minutes(seconds), str(stretch.count), _utc(last), means, do])
-    return Table(title="Reasons", rows=rows, head=["reason", "min", "times", "last at, UTC", "means", "to do"])
+        rows.append([Code(reason), _minutes(seconds), str(stretch.count), _utc(last), meaning, action])
+    return Table(title="Reasons", rows=rows, head=["reason", "min", "times", "last, UTC", "meaning", "action"])
 
 
 def _episodes(history: History) -> Block:
@@ -324,7 +322,7 @@ def _episodes(history: History) -> Block:
 
     note = f"The longest {EPISODES} of {history.episodes_count}." if history.episodes_count > EPISODES else ""
     rows = [row(episode) for episode in history.episodes]
-    return _folded("Alarms: every time it was not ok", ["from, UTC", "min", "state", "reasons"], rows, note)
+    return _folded("Alarms: every interval not in state ok", ["from, UTC", "min", "state", "reasons"], rows, note)
 
 
 def _days(history: History) -> list[Block]:
@@ -336,9 +334,9 @@ def _days(history: History) -> list[Block]:
         "ok, min",
         "degraded, min",
         "held, min",
-        "away, min",
+        "no recording, min",
         "largest offset, µm",
-        "left, µm rms",
+        "remaining error, µm rms",
         "residual, µm rms",
     ]
     days = [_day(date, period) for date, period in sorted(history.days.items())]
@@ -362,9 +360,9 @@ def _day(name: str, period: Period) -> list[Cell]:
         name,
         str(period.samples),
         *map(_minutes, times),
-        _um(period.offset.peak, 1),
-        _plain(period.left.rms, 2),
-        _plain(period.residual.rms, 2),
+        signed(period.offset.peak, 1),
+        plain(period.left.rms, 2),
+        plain(period.residual.rms, 2),
     ]
 
 
@@ -383,15 +381,13 @@ def _missed(history: History) -> Block:
                 ]
             )
     if not rows:
-        return Words(
-            title="What the devices missed", lines=["Nothing: every channel had a good value in every sample."]
-        )
+        return Words(title="Missing values", lines=["None: every channel had a good value in every sample."])
     whole = len(history.channels) - len(rows)
     return Table(
-        title="What the devices missed",
+        title="Missing values",
         rows=rows,
-        head=["channel", "samples missing", "share", "why", "single bad readings"],
-        note=f"{whole} other channel(s) had a good value in every sample." if whole else "",
+        head=["channel", "samples missing", "share", "reason", "single bad readings"],
+        note=f"{whole} other channel(s): no missing value." if whole else "",
     )
 
 
@@ -405,7 +401,7 @@ def _codes(counts: Mapping[str, int]) -> Cell:
 def _events(history: History) -> Block:
     rows: list[list[Cell]] = [[_utc(t), kind, text] for t, kind, text in history.events]
     note = f"The last {EVENTS} of {history.events_count}." if history.events_count > EVENTS else ""
-    return _folded("Events", ["at, UTC", "kind", "what happened"], rows, note)
+    return _folded("Events", ["time, UTC", "kind", "event"], rows, note)
 
 
 def _files(history: History) -> Details:
@@ -421,7 +417,7 @@ def _files(history: History) -> Details:
                 title="Recordings",
                 head=["file", "samples", "first, UTC", "last, UTC", "end"],
                 rows=files,
-                note="Whether anything was changed is not looked at here: compensator replay does.",
+                note="Integrity is not checked here; compensator replay does that.",
             ),
             Table(title="Models", head=["model", "from, UTC", "SHA-256"], rows=models),
         ],
@@ -429,14 +425,14 @@ def _files(history: History) -> Details:
 
 
 def _folded(title: str, head: Sequence[str], rows: Sequence[Sequence[Cell]], note: str) -> Block:
-    """Return a table, folded where it is long."""
+    """Return a table, folded if it is long."""
     if len(rows) <= _ROWS:
         return Table(title=title, head=head, rows=rows, note=note)
     table = Table(head=head, rows=rows, note=note)
     return Section(title=title, blocks=[Details(title=f"All {len(rows)}", blocks=[table])])
 
 
-# ---------------------------------------------------------------------------- words
+# ---------------------------------------------------------------------------- text
 
 
 def _utc(t_s: float) -> str:
@@ -445,14 +441,6 @@ def _utc(t_s: float) -> str:
 
 def _at(spread: Spread) -> str:
     return "" if math.isnan(spread.at_s) else _utc(spread.at_s)
-
-
-def _um(value: float, digits: int) -> str:
-    return "–" if math.isnan(value) else f"{value:+.{digits}f}".replace("-", "−")
-
-
-def _plain(value: float, digits: int) -> str:
-    return "–" if math.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
 def _minutes(seconds: float) -> str:
@@ -465,7 +453,7 @@ def _hours(seconds: float) -> str:
 
 def _share(history: History, state: str) -> str:
     share = history.whole.seconds[state] / sum(history.whole.seconds.values())
-    # Neither nothing nor all where it is not.
+    # Not rounded to nothing or all.
     shown = share if share in (0.0, 1.0) else min(max(share, 0.0005), 0.9995)
     return f"{100.0 * shown:.1f} %"
 

@@ -1,23 +1,24 @@
-"""The last day of a machine in letters: curves of bars, a strip of states, and the states in words."""
+"""The last day of a machine in the terminal: sparklines and a strip of states."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from rich.console import RenderableType
 from rich.text import Text
 
 from compensator.clock import NS
-from compensator.watch.words import TONES, age, here, plain
+from compensator.report.notation import plain
+from compensator.watch.words import TONES, here
 
 _BARS = "▁▂▃▄▅▆▇█"
-#: What a state is drawn as; higher is worse, so that colour is not needed.
+#: Bar of each severity: higher is worse, for readers without colour.
 _STRIP = {"good": "▁", "warn": "▄", "bad": "█"}
-#: How each tone is coloured.
+#: Colour of each severity.
 STYLES = {"good": "green", "warn": "yellow", "bad": "bold red"}
-#: What is drawn of the history: name, column, unit.
+#: Rows: name, column of the history, unit.
 _ROWS = (
     ("offset", "y_offset_um", "µm"),
     ("DTF", "y_dtf_um", "µm"),
@@ -28,77 +29,19 @@ _ROWS = (
     ("AT", "at_degc", "°C"),
 )
 _SHORT = ("offset", "residual")
-#: Room beside the bars: name before, range behind.
+#: Width of the name before and the range after the bars.
 _BESIDE = 38
-#: Points farther apart than this do not belong to one spell, s.
-GAP_S = 150.0
-#: One point of the history stands for so long, s.
-_POINT_S = 60.0
-
-
-class Spell(NamedTuple):
-    """A time in one state for the same reasons.
-
-    Parameters
-    ----------
-    begin_s, end_s : float
-        First and last point, s since 1970.
-    state : str
-        What the service said of itself.
-    reasons : str
-        Codes, with blanks between.
-    """
-
-    begin_s: float
-    end_s: float
-    state: str
-    reasons: str
-
-    def text(self, now_s: float) -> str:
-        """Return it in one line, in local time.
-
-        Parameters
-        ----------
-        now_s : float
-            The day of today is left out, s since 1970.
-        """
-        begin, today = (here(round(t * NS)) for t in (self.begin_s, now_s))
-        when = f"{begin:%H:%M}" if begin.date() == today.date() else f"{begin:%m-%d %H:%M}"
-        long = age(self.end_s - self.begin_s + _POINT_S)
-        return f"{when} {self.state} for {long}" + (f": {self.reasons}" if self.reasons else "")
-
-
-def spells(history: Mapping[str, Sequence[Any]]) -> list[Spell]:
-    """Return the states of a history, the newest first.
-
-    Examples
-    --------
-    >>> day = {"t_s": [0.0, 60.0, 120.0], "state": ["ok", "ok", "hold"], "reasons": ["", "", "operator_hold"]}
-    >>> [(spell.state, spell.end_s - spell.begin_s) for spell in spells(day)]
-    [('hold', 0.0), ('ok', 60.0)]
-    """
-    found: list[Spell] = []
-    columns = (history.get(name, ()) for name in ("t_s", "state", "reasons"))
-    for t, state, reasons in zip(*columns, strict=True):
-        if state is None:
-            continue
-        last = found[-1] if found else None
-        if last is not None and (last.state, last.reasons) == (state, reasons or "") and t - last.end_s < GAP_S:
-            found[-1] = last._replace(end_s=t)
-        else:
-            found.append(Spell(t, t, state, reasons or ""))
-    return found[::-1]
 
 
 def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = False) -> list[RenderableType]:
-    """Return the last day as lines of bars, each with its range and unit, over a strip of states.
+    """Return the last day as sparklines with range and unit, and a strip of states.
 
     Parameters
     ----------
     history : mapping of str to sequence
         Columns as of `History`.
     width : int
-        Of what may be filled, letters.
+        Available width, characters.
     short : bool
         Offset, residual and states only.
     """
@@ -112,9 +55,9 @@ def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = Fal
         values = [value for value in series if value is not None]
         if len(values) < 2:
             continue
-        said = f"{plain(min(values), 1)} to {plain(max(values), 1)} {unit}"
-        bars = sparkline(evenly(t_s, series, count), count)
-        lines.append(Text.assemble((f"{name:<9}", "dim"), f"{bars:<{count}}", f" {said}"))
+        extent = f"{plain(min(values), 1)} to {plain(max(values), 1)} {unit}"
+        bars = sparkline(evenly(t_s, series, count))
+        lines.append(Text.assemble((f"{name:<9}", "dim"), f"{bars:<{count}}", f" {extent}"))
     if lines:
         wide = min(count, len(t_s))
         lines += [_strip(t_s, history["state"], wide), _axis(t_s, wide)]
@@ -126,7 +69,7 @@ def _summed(effects: Sequence[Sequence[float | None]]) -> list[float | None]:
 
 
 def _strip(t_s: Sequence[float], states: Sequence[str | None], count: int) -> Text:
-    """Draw the worst state of each part; a part in which nothing was heard is a blank."""
+    """Draw the worst state of each part; a part without messages is blank."""
     order = ("good", "warn", "bad")
     worst = [-1] * count
     span = max(t_s[-1] - t_s[0], 1e-9)
@@ -137,7 +80,7 @@ def _strip(t_s: Sequence[float], states: Sequence[str | None], count: int) -> Te
     text = Text.assemble(("state    ", "dim"))
     for level in worst:
         text.append(" " if level < 0 else _STRIP[order[level]], style="" if level < 0 else STYLES[order[level]])
-    return text.append(" ▁ ok ▄ mind █ hold, fault", style="dim")
+    return text.append(" ▁ ok ▄ caution █ hold, fault", style="dim")
 
 
 def _axis(t_s: Sequence[float], count: int) -> Text:
@@ -147,33 +90,26 @@ def _axis(t_s: Sequence[float], count: int) -> Text:
 
 
 def evenly(t_s: Sequence[float], values: Sequence[float | None], width: int) -> list[float | None]:
-    """Return the values at even steps of time, None where nothing was heard."""
+    """Return means over even steps of time, at most `width` of them; None where there is no value."""
     if len(t_s) < 2 or t_s[-1] <= t_s[0]:
         return list(values)
     count = min(width, len(t_s))
     parts: list[list[float]] = [[] for _ in range(count)]
     for t, value in zip(t_s, values, strict=True):
-        if value is not None:
+        if value is not None and math.isfinite(value):
             parts[min(int((t - t_s[0]) / (t_s[-1] - t_s[0]) * count), count - 1)].append(value)
     return [sum(part) / len(part) if part else None for part in parts]
 
 
-def sparkline(values: Sequence[float | None], width: int) -> str:
-    """Draw values as a line of bars, the mean of each part; a part without any is a blank.
+def sparkline(values: Sequence[float | None]) -> str:
+    """Draw values as bars; a missing value is blank.
 
     Examples
     --------
-    >>> sparkline([0.0, 1.0, None, 2.0], 4)
+    >>> sparkline([0.0, 1.0, None, 2.0])
     '▁▅ █'
     """
-    if not values:
-        return ""
-    count = min(width, len(values))
-    parts = [values[i * len(values) // count : (i + 1) * len(values) // count] for i in range(count)]
-    means = [[v for v in part if v is not None and math.isfinite(v)] for part in parts]
-    known = [sum(part) / len(part) for part in means if part]
-    if not known:
-        return " " * count
-    low, high = min(known), max(known)
+    known = [value for value in values if value is not None]
+    low, high = min(known, default=0.0), max(known, default=0.0)
     scale = (len(_BARS) - 1) / (high - low) if high > low else 0.0
-    return "".join(_BARS[round((sum(p) / len(p) - low) * scale)] if p else " " for p in means)
+    return "".join(" " if value is None else _BARS[round((value - low) * scale)] for value in values)

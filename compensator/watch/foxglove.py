@@ -1,7 +1,7 @@
-"""A live connection for the Foxglove application: what is heard goes on over its WebSocket protocol.
+"""A live connection for the Foxglove application: forwards messages over its WebSocket protocol.
 
 Needs the extra `foxglove`. The topics of the watched machine are those of its recordings (`/sample`, `/estimate`,
-`/offset`, `/event`), so that one layout opens both; those of machines below the prefix have their name before them.
+`/offset`, `/event`), so one layout opens both; topics of machines below the prefix begin with the machine.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from compensator.errors import ServiceError
 from compensator.messages import shipped_schema
 from compensator.watch.machine import KINDS, Malformed, decoded
 
-#: The only address that is bound.
+#: The only address to which the server is bound.
 HOST = "127.0.0.1"
-#: Events that a viewer gets when it joins.
+#: Number of past events that a new viewer receives.
 EVENTS = 20
 
 
 def topic_of(key: str, prefix: str) -> tuple[str, str] | None:
-    """Return topic and kind for a key, None where it is none of ours.
+    """Return topic and kind of a key, None if it is unknown.
 
     Examples
     --------
@@ -38,19 +38,19 @@ def topic_of(key: str, prefix: str) -> tuple[str, str] | None:
 
 
 class FoxgloveServer:
-    """Serves viewers on loopback. Use it as a context manager.
+    """A server for viewers on loopback. Use it as a context manager.
 
     Parameters
     ----------
     prefix : str
-        What is watched.
+        Prefix that is watched.
     port : int
-        0 takes a free one.
+        0 selects a free port.
 
     Raises
     ------
     ServiceError
-        If the extra is not installed, or the port is taken.
+        If the extra is not installed, or the port is in use.
     """
 
     def __init__(self, prefix: str, port: int) -> None:
@@ -63,13 +63,13 @@ class FoxgloveServer:
         self._context: Any = foxglove.Context()
         self._lock = threading.Lock()
         self._channels: dict[str, Any] = {}
-        #: What a viewer that joins gets at once, by topic: the latest message, the last events.
+        #: What a new viewer receives at once, by topic: the latest message, the last events.
         self._latest: dict[str, list[tuple[bytes, int]]] = {}
         self._server: Any = None
 
     @property
     def port(self) -> int:
-        """Port that is served."""
+        """Port of the server."""
         return int(self._server.port) if self._server is not None else self._port
 
     def __enter__(self) -> FoxgloveServer:
@@ -82,7 +82,7 @@ class FoxgloveServer:
                 server_listener=_Listener(self._join),
             )
         except (RuntimeError, OSError, OverflowError) as error:
-            raise ServiceError(f"--foxglove-port {self._port}: {error}; 0 takes a free one") from error
+            raise ServiceError(f"--foxglove-port {self._port}: {error}; 0 selects a free port") from error
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -90,8 +90,8 @@ class FoxgloveServer:
         if server is not None:
             server.stop()
 
-    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
-        """Pass a message on, at its own time; what is malformed is left out."""
+    def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+        """Forward a message at its own time; malformed ones are dropped."""
         found = topic_of(key, self._prefix)
         if found is None:
             return
@@ -112,13 +112,13 @@ class FoxgloveServer:
                 channel = self._channels[topic] = self._foxglove.Channel(topic, schema=schema, context=self._context)
         channel.log(payload, log_time=message.time_utc_ns)
 
-    def alive(self, key: str, alive: bool) -> None:
-        """Leave it out: a recording has none either."""
+    def set_alive(self, key: str, alive: bool) -> None:
+        """Ignore liveliness: recordings have none either."""
 
     def _join(self, topic: str) -> None:
-        """Give a viewer that joins what is known, so that it need not wait for the next sample.
+        """Send a new viewer the latest messages, so that it need not wait for the next sample.
 
-        The library does not say how to reach this one alone: others get the same message with the same time again.
+        The library cannot address one viewer: others receive the same messages with the same times again.
         """
         with self._lock:
             known, channel = list(self._latest.get(topic, ())), self._channels.get(topic)
@@ -128,11 +128,11 @@ class FoxgloveServer:
 
 
 class _Listener:
-    """What the server calls; everything that a viewer could send is refused by offering no capability for it."""
+    """Callbacks of the server; it offers no capabilities, so viewers cannot send anything."""
 
     def __init__(self, join: Callable[[str], None]) -> None:
         self._join = join
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Hear that a viewer has opened a topic."""
+        """Handle a new subscription of a viewer."""
         self._join(str(channel.topic))

@@ -1,30 +1,51 @@
-"""The last day of a machine as far as it was seen: one point a minute."""
+"""The last day of a machine as received: one point per minute."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 from compensator.clock import NS
 from compensator.messages import EstimateMessage, Offset, Sample
 
-#: Length of what is kept and of what one point stands for, ns.
+#: Length of the history and of one point, ns.
 SPAN_NS = 24 * 3600 * NS
 STEP_NS = 60 * NS
-#: What a point has of the estimate and of the offset.
+#: Shortest pause that separates two intervals in the same state, s.
+LEAST_PAUSE_S = 150.0
+#: Values of a point from the estimate and from the offset.
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_base_um", "y_pred_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_std_um", "state")
-#: Names of a point's values beside its time, number and effects.
+#: Columns of the history in addition to time and effects.
 COLUMNS = (*_OFFSET, "reasons", *_ESTIMATE, "t_q_degc", "at_degc")
 
 
-class History:
-    """Points of the last day, whatever order the messages come in.
+class Spell(NamedTuple):
+    """An interval in one state with the same reasons.
 
-    The newest sample of a minute is its point; one of a faster model that was followed by another in the same minute
-    is left out. Values of one sample come in several messages and belong together by its number. A value that did not
-    arrive is None.
+    Parameters
+    ----------
+    begin_s, end_s : float
+        Its first point and the end of its last, s since 1970.
+    state : str
+        State of the service.
+    reasons : str
+        Codes, separated by spaces.
+    """
+
+    begin_s: float
+    end_s: float
+    state: str
+    reasons: str
+
+
+class History:
+    """Points of the last day; messages may arrive in any order.
+
+    The newest sample of a minute is its point. The values of one sample come in several messages with the same number.
+    A value that did not arrive is None.
     """
 
     def __init__(self) -> None:
@@ -34,7 +55,7 @@ class History:
         return len(self._points)
 
     def add(self, message: Sample | EstimateMessage | Offset) -> None:
-        """Take one message in."""
+        """Add a message."""
         bucket = message.time_utc_ns // STEP_NS
         point = self._points.get(bucket)
         if point is None or message.seq > point["seq"]:
@@ -52,25 +73,25 @@ class History:
             point["reasons"] = " ".join(message.reasons)
 
     def prune(self, now_ns: int) -> None:
-        """Forget what is older than a day."""
+        """Remove points older than a day."""
         oldest = (now_ns - SPAN_NS) // STEP_NS
         for bucket in [bucket for bucket in self._points if bucket < oldest]:
             del self._points[bucket]
 
     def misfit(self, now_ns: int, minutes: int) -> tuple[float, float, int]:
-        """Return how far measured and predicted Y are apart, what the service states, and of how many points that is.
+        """Return the medians of |residual| and of the stated standard deviation over the last minutes.
 
         Parameters
         ----------
         now_ns : int
             Now, ns since 1970 UTC.
         minutes : int
-            How far to look back, min.
+            Length of the interval, min.
 
         Returns
         -------
         (float, float, int)
-            Medians of |residual| and of the offset's standard deviation, µm; NaN without any point that has both.
+            Both medians, µm (NaN without any point that has both values), and the number of such points.
         """
         last = now_ns // STEP_NS
         points = [self._points[bucket] for bucket in range(last - minutes, last + 1) if bucket in self._points]
@@ -81,7 +102,7 @@ class History:
         return median(residual for residual, _ in both), median(std for _, std in both), len(both)
 
     def columns(self, since_ns: int = 0) -> dict[str, list[Any]]:
-        """Return the points from a time on, column by column.
+        """Return the points since a time, by columns.
 
         Parameters
         ----------
@@ -102,12 +123,43 @@ class History:
         return found
 
 
+def spells(history: Mapping[str, Sequence[Any]], valid_for_s: float | None) -> list[Spell]:
+    """Return the intervals of a history, the newest first.
+
+    Parameters
+    ----------
+    history : mapping of str to sequence
+        Columns as of `History`.
+    valid_for_s : float, optional
+        Validity of an offset, s: a longer pause separates two intervals.
+
+    Examples
+    --------
+    >>> day = {"t_s": [0.0, 60.0, 120.0], "state": ["ok", "ok", "hold"], "reasons": ["", "", "operator_hold"]}
+    >>> [(spell.state, spell.end_s - spell.begin_s) for spell in spells(day, 150.0)]
+    [('hold', 60.0), ('ok', 120.0)]
+    """
+    found: list[Spell] = []
+    step_s = STEP_NS / NS
+    pause_s = max(LEAST_PAUSE_S, valid_for_s or 0.0)
+    columns = (history.get(name, ()) for name in ("t_s", "state", "reasons"))
+    for t, state, reasons in zip(*columns, strict=True):
+        last = found[-1] if found else None
+        if state is None:
+            continue
+        if last is not None and last[2:] == (state, reasons or "") and t - last.end_s + step_s < pause_s:
+            found[-1] = last._replace(end_s=t + step_s)
+        else:
+            found.append(Spell(t, t + step_s, state, reasons or ""))
+    return found[::-1]
+
+
 def usable(sample: Sample, name: str) -> float | None:
-    """Return the mean of a channel, None where it is missing or was refused."""
+    """Return the mean of a channel; None if it is missing or refused."""
     channel = sample.channels.get(name)
     return channel.mean if channel is not None and channel.quality == "good" else None
 
 
 def _short(value: Any) -> Any:
-    """Leave out digits that no picture shows."""
+    """Round to the digits that a figure can show."""
     return round(value, 4) if isinstance(value, float) else value

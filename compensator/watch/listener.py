@@ -1,7 +1,7 @@
-"""Hears everything below a prefix over Zenoh, and asks once for the latest; never sends anything else.
+"""Subscribes to everything below a prefix over Zenoh and queries the latest messages; sends nothing else.
 
-Commands are queries, too: a question to `thermal/**` would zero and hold every machine of the shop. So only the keys
-that are named here are ever asked.
+Commands are queries, too: a query on `thermal/**` would zero and hold every machine of the shop. So only the keys
+in `ASKED` are ever queried.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from compensator.errors import ServiceError, UsageError
 from compensator.service.command_client import alive_at, operator_of_file
 from compensator.service.session import get, in_words, put, session_config
 
-#: Seconds between two attempts where nobody is there to connect to.
+#: Time between two attempts to connect, s.
 RETRY_S = 1.0
-#: Messages that wait to be looked at, at most.
+#: Largest number of messages that wait to be processed.
 WAITING = 65_536
-#: Longest wait for the answers to the first question, s.
+#: Longest wait for the answers to a query, s.
 ANSWER_S = 3.0
 
 
 class Sink(Protocol):
-    """Where goes what is heard; called on Zenoh's threads."""
+    """Receives what the listener hears; called on Zenoh's threads."""
 
-    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
-        """Take a message, or the answer to a question."""
+    def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+        """Receive a message, or the answer to a query."""
 
-    def alive(self, key: str, alive: bool) -> None:
-        """Take that a liveliness token came or went."""
+    def set_alive(self, key: str, alive: bool) -> None:
+        """Receive a change of a liveliness token."""
 
 
 class Source(NamedTuple):
@@ -45,9 +45,9 @@ class Source(NamedTuple):
     Parameters
     ----------
     prefix : str
-        Below which; empty for everything.
+        Prefix of the keys; empty for all.
     where : str
-        Endpoints, for people.
+        Endpoints, as text.
     config : callable
         Returns the configuration of a Zenoh client.
     """
@@ -57,18 +57,18 @@ class Source(NamedTuple):
     config: Callable[[], zenoh.Config]
 
 
-#: What is asked: services answer these with the latest.
+#: Keys that are queried: services answer them with the latest message.
 ASKED = ("y/offset", "status", "sample", "estimate")
 
 
 def endpoints_of(settings: Zenoh) -> list[str]:
-    """Return where the service of a configuration is reached: its routers first, then itself."""
+    """Return the endpoints of the service of a configuration: its routers first, then its own."""
     listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
     return [*settings.connect, *(endpoint for endpoint in listened if not endpoint.endswith(":0"))]
 
 
 def below(prefix: str, rest: str) -> str:
-    """Return the key expression for a key of the machine of a prefix and of all machines below it.
+    """Return the key expression of a key for the machine at a prefix and all machines below it.
 
     Examples
     --------
@@ -107,7 +107,7 @@ class Listener:
         Raises
         ------
         ServiceError
-            If nobody is there, or an endpoint cannot be used.
+            If there is no answer, or an endpoint cannot be used.
         """
         config = self._source.config()
         put(config, "connect/timeout_ms", 0)
@@ -115,32 +115,32 @@ class Listener:
         try:
             session = self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise ServiceError(f"zenoh: nobody answers at {self._source.where}: {in_words(error)}") from error
+            raise ServiceError(f"zenoh: no answer at {self._source.where}: {in_words(error)}") from error
         prefix = self._source.prefix
-        # Zenoh's own threads fill the channel without waiting for Python: where they had to wait, the router would drop
-        # what a whole shop says at one instant.
+        # Zenoh's own threads fill the channel without waiting for Python: if they had to wait, the router would drop
+        # messages when a whole shop publishes at one instant.
         subscriber = session.declare_subscriber(below(prefix, "**"), zenoh.handlers.FifoChannel(WAITING))
-        self._hearing = threading.Thread(target=self._hear, args=(subscriber,), name="watch hears")
+        self._hearing = threading.Thread(target=self._hear, args=(subscriber,), name="watch receives")
         self._hearing.start()
         session.liveliness().declare_subscriber(below(prefix, "alive"), self._token, history=True)
         session.info.declare_transport_events_listener(self._transport, history=False)
         self._on_connection(True)
 
-    def look(self, *, tokens: bool = True) -> None:
-        """Ask everybody for the latest, and wait for the answers.
+    def query(self, *, tokens: bool = True) -> None:
+        """Query the latest messages of all services, and wait for the answers.
 
         Parameters
         ----------
         tokens : bool
-            Whether to ask for liveliness tokens, too. Who listens on hears of them without asking, and an answer that
-            was overtaken by an end would bring the dead back.
+            Query liveliness tokens, too. The subscription reports them anyway, and a late answer would revive a
+            service that has ended since.
         """
         session = self._session
         if session is None:
             return
         prefix = self._source.prefix
         keys = [below(prefix, rest) for rest in ASKED]
-        # A reader of one machine may be let through with its own keys alone.
+        # Access control may permit a reader the keys of one machine only.
         keys += [f"{prefix}/thermal/{rest}" for rest in ASKED] if prefix else []
         asked = [session.get(key, timeout=ANSWER_S) for key in keys]
         alive = session.liveliness().get(below(prefix, "alive"), timeout=ANSWER_S) if tokens else ()
@@ -153,16 +153,16 @@ class Listener:
                 self._token(answer.ok)
 
     def elsewhere(self) -> list[str]:
-        """Return the prefixes of services that are alive, whether they are listened to or not."""
+        """Return the prefixes of all services that are alive, subscribed or not."""
         return alive_at("**/thermal/alive", self._session, ANSWER_S) if self._session is not None else []
 
     def start(self) -> None:
-        """Connect in the background, again and again until somebody is there, and ask after each new connection."""
+        """Connect in the background, with retries, and query after each new connection."""
         self._thread = threading.Thread(target=self._keep_connected, name="watch")
         self._thread.start()
 
     def close(self) -> None:
-        """End everything; may be called twice."""
+        """Close the session and end the threads; may be called twice."""
         self._stop.set()
         self._wanted.set()
         if self._thread is not None:
@@ -183,7 +183,7 @@ class Listener:
     # ------------------------------------------------------------------ on other threads
 
     def _hear(self, subscriber: Any) -> None:
-        """Hand on what is heard until the session is closed."""
+        """Forward messages until the session is closed."""
         with suppress(zenoh.ZError):
             for sample in subscriber:
                 self._heard(sample)
@@ -197,14 +197,14 @@ class Listener:
                 self._stop.wait(RETRY_S)
         while not self._stop.is_set():
             try:
-                self.look(tokens=False)
+                self.query(tokens=False)
             except zenoh.ZError:
                 self._on_connection(False)
             self._wanted.wait()
             self._wanted.clear()
 
     def _transport(self, event: Any) -> None:
-        """Zenoh reconnects by itself; what was said meanwhile is asked for."""
+        """Query after each reconnection, which Zenoh makes by itself."""
         came = event.kind == zenoh.SampleKind.PUT
         self._on_connection(came)
         if came:
@@ -216,24 +216,24 @@ class Listener:
             return
         payload = sample.payload.to_bytes()
         for sink in self._sinks:
-            sink.take(key, payload, asked=asked)
+            sink.receive(key, payload, asked=asked)
 
     def _token(self, sample: Any) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
         if alive:
-            # Its token is the last thing that a service declares: from now on it can be asked.
+            # A service declares its token last: from now on it answers queries.
             self._wanted.set()
         for sink in self._sinks:
-            sink.alive(str(sample.key_expr), alive)
+            sink.set_alive(str(sample.key_expr), alive)
 
 
 def of_endpoints(prefix: str, endpoints: list[str]) -> Source:
-    """Listen at endpoints, without TLS files.
+    """Return the source at some endpoints, without TLS.
 
     Raises
     ------
     UsageError
-        If one cannot be an endpoint.
+        If one is not an endpoint.
     """
     for endpoint in endpoints:
         if not re.fullmatch(r"(tcp|tls|quic|ws|unixsock-stream)/\S+", endpoint):
@@ -242,32 +242,32 @@ def of_endpoints(prefix: str, endpoints: list[str]) -> Source:
 
 
 def of_settings(settings: Zenoh) -> Source:
-    """Listen where the service of a configuration is reached from its own computer.
+    """Return the source of a configuration's service, as reached from its own computer.
 
     Raises
     ------
     UsageError
-        If it is reached nowhere, or over TLS: the machine's own certificate reads nothing.
+        If it has no endpoint, or uses TLS: the machine's own certificate is not permitted to read.
     """
     if settings.secured():
         raise UsageError(
-            "--zenoh: missing; over TLS a receiver's or operator's certificate is needed, expected a "
-            "Zenoh configuration such as receiver.json5"
+            "--zenoh: missing; TLS needs a receiver's or operator's certificate, expected a Zenoh configuration such "
+            "as receiver.json5"
         )
     endpoints = endpoints_of(settings)
     if not endpoints:
-        raise UsageError("zenoh: neither listen nor connect has an endpoint to reach the service at")
+        raise UsageError("zenoh: expected an endpoint in listen or connect")
     client = msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints)
     return Source(settings.prefix, ", ".join(endpoints), lambda: session_config(client))
 
 
 def of_file(path: Path, prefix: str) -> Source:
-    """Listen with a receiver's or operator's Zenoh configuration.
+    """Return the source of a receiver's or operator's Zenoh configuration.
 
     Raises
     ------
     ConfigError
-        If it, or a file that it names, cannot be used.
+        If it or a file named in it cannot be used.
     """
     endpoints = get(operator_of_file(path).config, "connect/endpoints")
     return Source(prefix, ", ".join(endpoints), lambda: operator_of_file(path).config)

@@ -1,6 +1,6 @@
 "use strict";
-// Asks every other second for what is known and draws it. Everything that comes from a machine is put in as text.
-const POLL_MS = 2000, NEEDY = 10, DAY_S = 86400, SIGNS = {good: "✓", warn: "⚠", bad: "✗"};
+// Requests the present state every other second and draws it. Everything from a machine is inserted as text.
+const POLL_MS = 2000, MOST_ACTIONS = 10, DAY_S = 86400, SIGNS = {good: "✓", warn: "⚠", bad: "✗"};
 const TONES = {ok: "good", starting: "warn", degraded: "warn", hold: "bad", fault: "bad"};
 const $ = (id) => document.getElementById(id);
 let past = {prefix: null, history: null}, drawn = "", lastAnswer = null, effects = [], current = null;
@@ -12,7 +12,7 @@ const make = (tag, attributes = {}, ...children) => {
   element.append(...children);
   return element;
 };
-const say = (element, text) => { if (element.textContent !== text) element.textContent = text; };
+const setText = (element, text) => { if (element.textContent !== text) element.textContent = text; };
 const known = (value) => typeof value === "number" && isFinite(value);
 const signed = (value, digits = 2) => known(value) ? (value < 0 ? "−" : "+") + Math.abs(value).toFixed(digits) : "–";
 const plain = (value, digits = 2) => known(value) ? (value < 0 ? "−" : "") + Math.abs(value).toFixed(digits) : "–";
@@ -27,11 +27,11 @@ const stamp = (t_s) => `${day(t_s)} ${clock(t_s, true)}`;
 const age = (s) => !known(s) ? "–" : s < 120 ? `${Math.max(s, 0).toFixed(0)} s` : s < 3600 ? `${Math.floor(s / 60)} min`
   : s < 172800 ? `${Math.floor(s / 3600)} h ${Math.floor(s % 3600 / 60)} min` : `${(s / 86400).toFixed(1)} d`;
 const wordLink = (code) => make("a", {href: `#word=${code.split(":")[0]}`}, code);
-const alive = (machine) => ({true: "alive", false: "gone", null: "not known"})[String(machine.alive)];
+const alive = (machine) => ({true: "alive", false: "gone", null: "unknown"})[String(machine.alive)];
 
-// ---------------------------------------------------------------- what is asked for
+// ---------------------------------------------------------------- requests
 
-function wanted(machines) {
+function selected(machines) {
   if (location.hash.startsWith("#m=")) current = decodeURIComponent(location.hash.slice(3));
   else if (!location.hash.startsWith("#word=")) current = null;
   return current ?? (machines.length === 1 ? machines[0].prefix : null);
@@ -43,25 +43,25 @@ async function ask(path) {
   return answer.json();
 }
 
-async function turn() {
+async function update() {
   try {
     const shop = await ask("/shop.json");
-    const prefix = wanted(shop.machines);
+    const prefix = selected(shop.machines);
     lastAnswer = new Date();
     if (prefix === null || !shop.machines.some((one) => one.prefix === prefix)) showShop(shop, prefix);
     else await showOne(prefix, shop.machines.length);
     connection(shop.status);
   } catch (error) {
-    const since = lastAnswer ? lastAnswer.toLocaleTimeString("en-GB") : "the start";
-    verdict("bad", "old", `The watch has not answered since ${since}: what stands below is old. Start compensator watch --page again.`);
+    const since = lastAnswer ? lastAnswer.toLocaleTimeString("en-GB") : "the page was opened";
+    verdict("bad", "No answer", `compensator watch has not answered since ${since}; the values below are out of date. Restart compensator watch --page.`);
   }
 }
 
 function connection(status) {
-  const text = status.connected ? `Connected to ${status.where}.` : `No connection to ${status.where}; trying again. What stands here is old.`;
-  say($("note"), text + (status.ignored ? ` ${status.ignored} message(s) with keys or of machines that are not followed.` : ""));
+  const text = status.connected ? `Connected to ${status.where}.` : `No connection to ${status.where}; retrying. The values below are out of date.`;
+  setText($("note"), text + (status.ignored ? ` ${status.ignored} message(s) with unknown keys or of further machines ignored.` : ""));
   const now_s = Date.now() / 1000, place = Intl.DateTimeFormat().resolvedOptions().timeZone;
-  say($("zone"), `Times of day are of this computer's time zone, ${place === "UTC" ? "" : `${place}, `}${zone(now_s)}.`);
+  setText($("zone"), `Times of day are in this computer's time zone, ${place === "UTC" ? "" : `${place}, `}${zone(now_s)}.`);
   $("note").className = status.connected ? "note" : "note tone is-bad";
 }
 
@@ -76,15 +76,15 @@ function verdict(tone, word, text) {
 
 function showShop(shop, missing) {
   $("shop").hidden = false; $("machine").hidden = true; $("all").hidden = missing === null;
-  say($("title"), "Thermal compensation, live"); document.title = "Machines, live";
+  setText($("title"), "Thermal compensation, live"); document.title = "Machines, live";
   const tones = shop.machines.map((one) => one.tone);
   const tone = !tones.length || tones.includes("bad") ? "bad" : tones.includes("warn") ? "warn" : "good";
-  if (missing !== null) verdict("bad", "silent", `Nothing is heard of ${missing}.`);
-  else verdict(tone, {good: "all well", warn: "mind", bad: "look"}[tone], shop.headline);
-  const needy = shop.machines.filter((one) => one.tone !== "good");
-  const lines = needy.slice(0, NEEDY).map((one) => [make("b", {}, `${SIGNS[one.tone]} ${one.prefix} ${one.shown}: `), one.to_do]);
-  if (needy.length > NEEDY) lines.push([`… and ${needy.length - NEEDY} more.`]);
-  list("todo", lines, "warning");
+  if (missing !== null) verdict("bad", "Silent", `No messages from ${missing}.`);
+  else verdict(tone, {good: "All ok", warn: "Caution", bad: "Attention"}[tone], shop.headline);
+  const severe = shop.machines.filter((one) => one.tone !== "good");
+  const lines = severe.slice(0, MOST_ACTIONS).map((one) => [make("b", {}, `${SIGNS[one.tone]} ${one.prefix} ${one.shown}: `), one.to_do]);
+  if (severe.length > MOST_ACTIONS) lines.push([`… and ${severe.length - MOST_ACTIONS} more.`]);
+  list("actions", lines, "warning");
   const body = $("machines").tBodies[0], focused = document.activeElement && document.activeElement.id;
   const rows = new Map([...body.rows].map((row) => [row.dataset.prefix, row]));
   shop.machines.forEach((machine, i) => {
@@ -107,7 +107,7 @@ function fillRow(row, machine) {
   const cells = [`${SIGNS[machine.tone]} ${machine.shown}`, signed(machine.y_offset_um), signed(machine.y_offset_rate_um_per_min),
     plain(machine.y_offset_std_um), signed(machine.residual_um), plain(machine.t_q_degc), plain(machine.at_degc),
     age(machine.age_s), alive(machine), [...why, ...machine.warnings].join(" ")];
-  cells.forEach((text, i) => say(row.cells[i + 1], text));
+  cells.forEach((text, i) => setText(row.cells[i + 1], text));
   row.cells[1].className = `tone is-${machine.tone}`;
   row.cells[2].className = machine.shown === "silent" ? "old" : "";
 }
@@ -117,20 +117,20 @@ function fillRow(row, machine) {
 async function showOne(prefix, count) {
   if (past.prefix !== prefix) { past = {prefix, history: null}; drawn = ""; }
   const times = past.history ? past.history.t_s : [];
-  // The newest points are asked for again: their values come in several messages.
+  // The newest points are requested again: their values come in several messages.
   const since = times.length ? Math.max(times[times.length - 1] - 300, 0) : 0;
   const found = await ask(`/machine.json?prefix=${encodeURIComponent(prefix)}&since_s=${since}`);
   const machine = found.machine;
   effects = found.effects;
   past.history = joined(past.history, found.history, found.now_s);
   $("shop").hidden = true; $("machine").hidden = false; $("all").hidden = count < 2;
-  say($("title"), machine.machine === prefix ? prefix : `${machine.machine} (${prefix})`);
+  setText($("title"), machine.machine === prefix ? prefix : `${machine.machine} (${prefix})`);
   document.title = `${SIGNS[machine.tone]} ${machine.machine} ${machine.shown}`;
   verdict(machine.tone, machine.shown, sentence(machine));
   pictures(machine, past.history, found.now_s);
-  list("why", machine.reasons.map((reason) => [wordLink(reason.code), `: ${reason.means} `, make("b", {}, "To do: "), reason.do]), "warning");
-  list("mind", machine.warnings.map((text, i) => [text, " ", wordLink(machine.warning_codes[i])]), "warning");
-  bad(machine); now(machine); events(machine.events); spells(past.history); channels(machine); points(past.history);
+  list("reasons", machine.reasons.map((reason) => [wordLink(reason.code), `: ${reason.means} `, make("b", {}, "Action: "), reason.do]), "warning");
+  list("warnings", machine.warnings.map((text, i) => [text, " ", wordLink(machine.warning_codes[i])]), "warning");
+  faulty(machine); now(machine); events(machine.events); spells(found.spells); channels(machine); points(past.history);
 }
 
 function joined(before, news, now_s) {
@@ -145,7 +145,7 @@ function sentence(machine) {
   const offset = `${signed(machine.y_offset_um)} µm`;
   if (machine.shown === "silent") return `for ${age(machine.age_s)}; the last offset was ${offset}. ${machine.means} ${machine.do}`;
   if (machine.shown === "unknown") return `${machine.means} ${machine.do}`;
-  const rest = machine.tone === "good" ? "" : machine.shown === "ok" ? " But mind what is said below." : ` ${machine.do}`;
+  const rest = machine.tone === "good" ? "" : machine.shown === "ok" ? " See the warnings below." : ` ${machine.do}`;
   return `${known(machine.y_offset_um) ? `offset ${offset}` : "no offset"}. ${machine.means}${rest}`;
 }
 
@@ -165,11 +165,11 @@ function fill(table, rows) {
   body.replaceChildren(...rows.map((cells) => make("tr", {}, ...cells.map((cell, i) => make(i ? "td" : "th", i ? {} : {scope: "row"}, cell)))));
 }
 
-function bad(machine) {
+function faulty(machine) {
   const channels = Object.entries(machine.channels).filter(([, one]) => one.quality !== "good").map(([name, one]) =>
-    [`${name}: `, wordLink(one.quality), `: ${one.means} `, make("b", {}, "To do: "), one.do]);
+    [`${name}: `, wordLink(one.quality), `: ${one.means} `, make("b", {}, "Action: "), one.do]);
   const devices = Object.entries(machine.devices ?? {}).filter(([, error]) => error !== "ok").map(([name, error]) => [`${name}: ${error}`]);
-  list("bad", [...channels, ...devices], "warning");
+  list("faulty", [...channels, ...devices], "warning");
 }
 
 function now(machine) {
@@ -198,19 +198,14 @@ function events(found) {
   if ($("events").dataset.key === key) return;
   $("events").dataset.key = key;
   const lines = found.slice(0, 20).map((event) => make("li", {}, make("b", {}, `${stamp(event.time_utc_ns / 1e9)} ${event.kind}: `),
-    event.text, ...(event.do ? [" ", make("b", {}, "To do: "), event.do] : [])));
-  $("events").replaceChildren(lines.length ? make("ul", {}, ...lines) : make("p", {}, "None was seen."));
+    event.text, ...(event.do ? [" ", make("b", {}, "Action: "), event.do] : [])));
+  $("events").replaceChildren(lines.length ? make("ul", {}, ...lines) : make("p", {}, "None."));
 }
 
-function spells(history) {
-  const found = [];
-  history.t_s.forEach((t, i) => {
-    const last = found[found.length - 1], state = history.state[i] ?? "–", reasons = history.reasons[i] ?? "";
-    if (last && last.state === state && last.reasons === reasons && t - last.to < gap()) last.to = t;
-    else found.push({from: t, to: t, state, reasons});
-  });
-  fill($("spells"), found.reverse().slice(0, 30).map((one) =>
-    [day(one.from) === day(Date.now() / 1000) ? clock(one.from) : `${day(one.from).slice(5)} ${clock(one.from)}`, `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.to - one.from + 60), one.reasons]));
+function spells(found) {
+  const when = (t) => `${day(t) === day(Date.now() / 1000) ? "" : `${day(t).slice(5)} `}${clock(t)}`;
+  fill($("spells"), found.map((one) =>
+    [when(one.begin_s), `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.end_s - one.begin_s), one.reasons]));
 }
 
 function channels(machine) {
@@ -246,7 +241,7 @@ function pictures(machine, history, end) {
     : Array.from({length: count}, (_, i) => line(effects[i] ?? `effect ${i + 1}`, history.effects.map((one) => one[i] ?? null)));
   $("pictures").replaceChildren(
     chart(frame, "Offset, added to the commanded Y, with its standard deviation", "µm", [line("offset", history.y_offset_um, history.y_offset_std_um)], history.state),
-    chart(frame, "Share of each path in the predicted deformation", "µm", [line("DTF (heat)", history.y_dtf_um), line("TDTF (air)", history.y_tdtf_um), ...several]),
+    chart(frame, "Predicted deformation by path", "µm", [line("DTF (heat)", history.y_dtf_um), line("TDTF (air)", history.y_tdtf_um), ...several]),
     chart(frame, "Residual: measured − predicted deformation", "µm", [line("residual", history.residual_um)]),
     chart(frame, "Temperatures", "°C", [line("T_Q", history.t_q_degc), line("AT", history.at_degc)]));
 }
@@ -272,11 +267,11 @@ function chart(frame, title, unit, series, states) {
   const left = 52, right = 8, top = 6, strip = states ? 26 : 0, tall = width < 500 ? 170 : 210, height = tall + strip + 40;
   const caption = make("figcaption", {}, title), keys = make("ul", {class: "keys"});
   const values = series.flatMap((one) => one.y.flatMap((v, i) => known(v) ? (one.band && known(one.band[i]) ? [v - one.band[i], v + one.band[i]] : [v]) : []));
-  const said = series.map((one) => { const seen = one.y.filter(known); return seen.length ? `${one.name} last ${plain(seen[seen.length - 1])} ${unit}, from ${plain(Math.min(...seen))} to ${plain(Math.max(...seen))}` : `${one.name}: nothing seen`; });
-  const svg = make("svg", {viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${title}. ${said.join("; ")}; in the last ${((end - from) / 3600).toFixed(1)} h.`});
+  const ranges = series.map((one) => { const seen = one.y.filter(known); return seen.length ? `${one.name} last ${plain(seen[seen.length - 1])} ${unit}, from ${plain(Math.min(...seen))} to ${plain(Math.max(...seen))}` : `${one.name}: no values`; });
+  const svg = make("svg", {viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${title}. ${ranges.join("; ")}; in the last ${((end - from) / 3600).toFixed(1)} h.`});
   const figure = make("figure", {}, caption, keys, svg);
   series.forEach((one, i) => keys.append(make("li", {}, make("svg", {viewBox: "0 0 32 12", "aria-hidden": "true"}, make("path", {d: "M0 6H32", class: `curve c${i}`})), one.name)));
-  if (!values.length) { keys.replaceChildren(make("li", {}, "nothing was seen of it yet")); }
+  if (!values.length) { keys.replaceChildren(make("li", {}, "no values yet")); }
   let low = values.length ? Math.min(...values) : 0, high = values.length ? Math.max(...values) : 1;
   if (high - low < 0.2) { const middle = (high + low) / 2; low = middle - 0.1; high = middle + 0.1; }
   const margin = 0.06 * (high - low); low -= margin; high += margin;
@@ -286,7 +281,7 @@ function chart(frame, title, unit, series, states) {
     make("text", {x: left - 6, y: y(v) + 4, "text-anchor": "end"}, plain(v, rungs.digits)));
   for (const s of hours(from, end, width / 75)) svg.append(make("line", {x1: x(s), x2: x(s), y1: top, y2: tall + strip, class: "axis"}),
     make("text", {x: Math.min(Math.max(x(s), left), width - 20), y: tall + strip + 16, "text-anchor": "middle"}, clock(s)));
-  svg.append(make("text", {x: width - right, y: height - 6, "text-anchor": "end"}, `time of day, ${zone(end)}`), make("text", {x: 2, y: height - 6}, `${title.split(/[:,]/)[0].toLowerCase().replace("share of each path in the predicted deformation", "share")}, ${unit}`));
+  svg.append(make("text", {x: width - right, y: height - 6, "text-anchor": "end"}, `time of day, ${zone(end)}`), make("text", {x: 2, y: height - 6}, `${title.split(/[:,]/)[0].toLowerCase().replace("predicted deformation by path", "share")}, ${unit}`));
   series.forEach((one, i) => {
     if (one.band) svg.append(make("path", {d: bands(t, one, from, x, y), class: `band c${i}`}));
     svg.append(make("path", {d: curve(t, one.y, from, x, y), class: `curve c${i}`}));
@@ -300,7 +295,7 @@ function curve(t, values, from, x, y) {
   t.forEach((s, i) => {
     if (!known(values[i]) || s < from) { before = s < from ? before : null; return; }
     const joins = before !== null && s - before < gap();
-    // A point with nothing beside it is drawn as a dot.
+    // An isolated point is drawn as a dot.
     path += joins ? `L${x(s).toFixed(1)} ${y(values[i]).toFixed(1)}` : `M${x(s).toFixed(1)} ${y(values[i]).toFixed(1)}h.1`;
     before = s;
   });
@@ -324,7 +319,7 @@ function bands(t, one, from, x, y) {
 }
 
 function strips(svg, t, states, from, x, top) {
-  // Higher is worse, so that colour is not needed; where nothing was heard there is nothing.
+  // Higher is worse, for readers without colour; intervals without messages are blank.
   const tall = {good: 5, warn: 12, bad: 20};
   let i = 0;
   while (i < t.length) {
@@ -342,12 +337,12 @@ function strips(svg, t, states, from, x, top) {
 
 // ---------------------------------------------------------------- always
 
-function openWords() {
+function openCodes() {
   if (!location.hash.startsWith("#word=")) return;
   $("words").open = true;
   const target = $(decodeURIComponent(location.hash.slice(1)));
   if (target) target.scrollIntoView();
 }
-addEventListener("hashchange", () => { openWords(); turn(); });
-addEventListener("resize", () => { if (past.history && !$("machine").hidden) turn(); });
-(async () => { openWords(); for (;;) { await turn(); await new Promise((resolve) => setTimeout(resolve, POLL_MS)); } })();
+addEventListener("hashchange", () => { openCodes(); update(); });
+addEventListener("resize", () => { if (past.history && !$("machine").hidden) update(); });
+(async () => { openCodes(); for (;;) { await update(); await new Promise((resolve) => setTimeout(resolve, POLL_MS)); } })();

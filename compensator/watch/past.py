@@ -1,4 +1,4 @@
-"""The last day before the watch began, from the recordings of a machine."""
+"""The day before the watch began, from the recordings of a machine."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _TOPICS = ("sample", "estimate", "offset", "event")
 
 
 def last_day(folder: Path, machine: str, now_ns: int) -> Iterator[Sample | EstimateMessage | Offset | Event]:
-    """Yield what the recordings of a machine have of the last day; what cannot be read is left out.
+    """Yield the messages of the last day in a machine's recordings; files that cannot be read are skipped.
 
-    The file that is being written is read as far as it goes.
+    The file that is being written is read up to its present end.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def last_day(folder: Path, machine: str, now_ns: int) -> Iterator[Sample | Estim
         Now, ns since 1970 UTC.
     """
     since_ns = now_ns - SPAN_NS
-    # A file is at most a day long, and finished after its last message: what ended before need not be read.
+    # A file is modified after its last message: one that was last modified before the interval is skipped.
     for path in recordings(folder, machine):
         try:
             if path.stat().st_mtime_ns < since_ns:

@@ -1,8 +1,7 @@
-"""The live page: one file of HTML and JSON beside it, on loopback only.
+"""Server of the live page: one HTML file and JSON, on loopback only.
 
-Whoever sits at this computer may look; nobody else can. A page of another site that has its name resolved to this
-address is refused by the name in its request, nothing can be changed from here, and the page loads nothing from
-anywhere.
+Only users of this computer can read it. Requests under another host name (DNS rebinding) are refused, nothing can be
+changed, and the page loads nothing from elsewhere.
 """
 
 from __future__ import annotations
@@ -24,25 +23,28 @@ from compensator import __version__
 from compensator.clock import NS
 from compensator.errors import ServiceError
 from compensator.reasons import WORDS
+from compensator.watch.history import spells
 from compensator.watch.shop import Shop, headline
 
-#: The only address that is bound.
+#: The only address to which the server is bound.
 HOST = "127.0.0.1"
-#: What is dropped of a machine in the table of a shop.
+#: Largest number of intervals in one state on the page.
+SPELLS = 30
+#: Values of a machine that the table of a shop does not need.
 _DETAILS = ("channels", "devices", "events", "shares")
 
 
 class PageServer:
-    """Serves the live page. Use it as a context manager.
+    """A server of the live page. Use it as a context manager.
 
     Parameters
     ----------
     shop : Shop
-        What is known.
+        The machines.
     status : callable
-        Returns how the watch itself is: `connected`, `where`, `prefix`, `ignored`.
+        Returns the status of the watch: `connected`, `where`, `prefix`, `ignored`.
     port : int
-        0 takes a free one.
+        0 selects a free port.
     """
 
     def __init__(self, shop: Shop, status: Callable[[], dict[str, Any]], port: int) -> None:
@@ -52,14 +54,14 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{HOST}:{self._server.server_port if self._server else self._port}/"
 
     def __enter__(self) -> PageServer:
         try:
             self._server = _Server((HOST, self._port), _Handler)
         except (OSError, OverflowError) as error:
-            raise ServiceError(f"--port {self._port}: {error}; 0 takes a free one") from error
+            raise ServiceError(f"--port {self._port}: {error}; 0 selects a free port") from error
         self._server.answer = self._answer
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="live page")
         self._thread.start()
@@ -73,7 +75,7 @@ class PageServer:
         self._server = self._thread = None
 
     def _answer(self, path: str, query: dict[str, list[str]]) -> tuple[str, bytes] | None:
-        """Return type and body for a path, None where there is nothing."""
+        """Return content type and body of a path, None if it does not exist."""
         if path == "/":
             return "text/html; charset=utf-8", page()[0]
         if path == "/shop.json":
@@ -87,6 +89,8 @@ class PageServer:
                 return None
             history = self._shop.history(prefix, int(float(since)) * NS)
             found = {"now_s": self._shop.now_ns() / NS, "status": self._status(), "machine": machine}
+            intervals = spells(self._shop.history(prefix), machine["valid_for_s"])[:SPELLS]
+            found["spells"] = [spell._asdict() for spell in intervals]
             return _json(found | {"history": history, "effects": self._shop.effects(prefix)})
         return None
 
@@ -97,7 +101,7 @@ def _json(found: Any) -> tuple[str, bytes]:
 
 @cache
 def page() -> tuple[bytes, str]:
-    """Return the page and its content security policy, which names the one style and the one script by their hashes."""
+    """Return the page and its content security policy, which permits its style and script by their hashes."""
 
     def part(room: str, name: str) -> str:
         return resources.files(room).joinpath(name).read_text(encoding="utf-8")
@@ -105,8 +109,9 @@ def page() -> tuple[bytes, str]:
     style = part("compensator.report", "style.css") + part("compensator.watch", "live.css")
     script = part("compensator.watch", "live.js")
     words = "".join(
-        f'<dt id="word={code}"><code>{code}</code></dt><dd>{html.escape(means)} <b>To do:</b> {html.escape(do)}</dd>'
-        for code, (means, do) in WORDS.items()
+        f'<dt id="word={code}"><code>{code}</code></dt>'
+        f"<dd>{html.escape(meaning)} <b>Action:</b> {html.escape(action)}</dd>"
+        for code, (meaning, action) in WORDS.items()
     )
     text = part("compensator.watch", "live.html")
     for name, filled in (("style", style), ("words", words), ("version", __version__), ("script", script)):
@@ -121,28 +126,28 @@ def page() -> tuple[bytes, str]:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    # Somebody else's program on the same port would otherwise be served from beside this one.
+    # Otherwise another program could share the port.
     allow_reuse_port = False
     answer: Callable[[str, dict[str, list[str]]], tuple[str, bytes] | None]
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One request; answers nothing but GET and HEAD by the address's own name."""
+    """A request; only GET and HEAD under the address's own name are answered."""
 
     server: _Server
     server_version, sys_version = "compensator", ""
-    #: A client that says nothing is let go after this, s.
+    #: Timeout of a silent client, s.
     timeout = 10.0
 
     def do_GET(self) -> None:
-        """Answer."""
-        if not self._by_its_own_name():
+        """Answer a request."""
+        if not self._has_own_host():
             # 421: the name in the request is not that of this server.
             return self._send(HTTPStatus.MISDIRECTED_REQUEST, "text/plain", b"expected this page by its own address\n")
         parts = urlsplit(self.path)
         found = self.server.answer(parts.path, parse_qs(parts.query))
         if found is None:
-            return self._send(HTTPStatus.NOT_FOUND, "text/plain", b"not here\n")
+            return self._send(HTTPStatus.NOT_FOUND, "text/plain", b"not found\n")
         return self._send(HTTPStatus.OK, *found)
 
     do_HEAD = do_GET  # noqa: N815
@@ -153,7 +158,7 @@ class _Handler(BaseHTTPRequestHandler):
             return lambda: self._send(HTTPStatus.METHOD_NOT_ALLOWED, "text/plain", b"expected GET\n")
         raise AttributeError(name)
 
-    def _by_its_own_name(self) -> bool:
+    def _has_own_host(self) -> bool:
         port = self.server.server_port
         return self.headers.get("Host", "") in (f"{HOST}:{port}", f"localhost:{port}")
 
@@ -176,4 +181,4 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Say nothing: a page that is open asks every other second."""
+        """Log nothing: an open page sends requests every other second."""

@@ -1,4 +1,4 @@
-"""All machines that are heard; filled by other threads, looked at by views."""
+"""All machines that were received; filled by other threads, read by views."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from compensator.clock import NS, Clock
 from compensator.watch.machine import KINDS, Machine
 
-#: So many machines are kept at most; what comes from others is counted.
+#: Largest number of machines; messages of others are only counted.
 MACHINES = 1000
 _ORDER = {"bad": 0, "warn": 1, "good": 2}
 
@@ -26,7 +26,7 @@ class Shop:
     --------
     >>> from compensator.clock import SystemClock
     >>> shop = Shop(SystemClock())
-    >>> shop.take("shop/vmc-07/thermal/y/offset", b"nonsense")
+    >>> shop.receive("shop/vmc-07/thermal/y/offset", b"nonsense")
     >>> shop.overview()[0]["malformed"], shop.overview()[0]["shown"]
     (1, 'unknown')
     """
@@ -35,59 +35,49 @@ class Shop:
         self._clock = clock
         self._lock = threading.Lock()
         self._machines: dict[str, Machine] = {}
-        self._changes = 0
-        #: Messages of keys that are none of ours, and of machines beyond those that are kept.
+        #: Number of messages with unknown keys, or of machines beyond `MACHINES`.
         self.ignored = 0
 
-    @property
-    def changes(self) -> int:
-        """Counts what arrived, so that a view knows whether to look again."""
-        return self._changes
-
-    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
-        """Take a message in, from any thread.
+    def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+        """Receive a message, from any thread.
 
         Parameters
         ----------
-        key : str
-            Its key.
-        payload : bytes
-            JSON, or whatever somebody sent.
+        key, payload : str, bytes
+            Its key and content; the content may be anything.
         asked : bool
-            Whether it is the answer to a question.
+            Whether it is the answer to a query.
         """
         prefix, _, rest = key.rpartition("/thermal/")
         kind = KINDS.get(rest)
         with self._lock:
-            self._changes += 1
             machine = self._machine(prefix) if kind is not None else None
             if machine is None or kind is None:
                 self.ignored += 1
             else:
-                machine.take(kind, payload, self._clock.monotonic_ns() / NS, asked=asked)
+                machine.update(kind, payload, self._clock.monotonic_ns() / NS, asked=asked)
 
-    def alive(self, key: str, alive: bool) -> None:
-        """Take in that a liveliness token came or went."""
+    def set_alive(self, key: str, alive: bool) -> None:
+        """Receive a change of a liveliness token, from any thread."""
         prefix, _, rest = key.rpartition("/thermal/")
         with self._lock:
-            self._changes += 1
             machine = self._machine(prefix) if rest == "alive" else None
             if machine is not None:
                 machine.alive = alive
 
-    def unknown_alive(self) -> None:
-        """Forget who is alive: whoever told it is gone."""
+    def forget_alive(self) -> None:
+        """Mark the liveliness of all machines as unknown: the connection is gone."""
         with self._lock:
             for machine in self._machines.values():
                 machine.alive = None
 
-    def past(self, prefix: str, messages: Iterable[Any]) -> None:
-        """Take in what a recording has from before."""
+    def add_recorded(self, prefix: str, messages: Iterable[Any]) -> None:
+        """Add messages from a recording to a machine's history."""
         with self._lock:
             machine = self._machine(prefix)
             if machine is not None:
                 for message in messages:
-                    machine.past(message)
+                    machine.add_recorded(message)
 
     def _machine(self, prefix: str) -> Machine | None:
         machine = self._machines.get(prefix)
@@ -95,28 +85,28 @@ class Shop:
             machine = self._machines[prefix] = Machine(prefix)
         return machine
 
-    # ------------------------------------------------------------------ looking
+    # ------------------------------------------------------------------ views
 
     def now_ns(self) -> int:
-        """Return the wall clock that ages are counted by, ns since 1970 UTC."""
+        """Return the wall clock of all ages, ns since 1970 UTC."""
         return self._clock.utc_ns()
 
     def overview(self) -> list[dict[str, Any]]:
-        """Return what is known of every machine, those that need somebody first."""
+        """Return the snapshots of all machines, the most severe first."""
         now_ns, monotonic_s = self._clock.utc_ns(), self._clock.monotonic_ns() / NS
         with self._lock:
             found = [machine.snapshot(now_ns, monotonic_s) for machine in self._machines.values()]
         return sorted(found, key=lambda one: (_ORDER[one["tone"]], one["prefix"]))
 
     def one(self, prefix: str) -> dict[str, Any] | None:
-        """Return what is known of one machine, None where nothing is."""
+        """Return the snapshot of one machine; None if it is unknown."""
         now_ns, monotonic_s = self._clock.utc_ns(), self._clock.monotonic_ns() / NS
         with self._lock:
             machine = self._machines.get(prefix)
             return machine.snapshot(now_ns, monotonic_s) if machine is not None else None
 
     def history(self, prefix: str, since_ns: int = 0) -> dict[str, list[Any]]:
-        """Return the last day of a machine as far as it was seen; see `History.columns`."""
+        """Return the last day of a machine; see `History.columns`."""
         with self._lock:
             machine = self._machines.get(prefix)
             return machine.history.columns(since_ns) if machine is not None else {}
@@ -129,7 +119,7 @@ class Shop:
 
 
 def headline(machines: list[dict[str, Any]]) -> str:
-    """Return in one sentence how a shop is.
+    """Return a summary of the states of a shop.
 
     Examples
     --------
@@ -137,7 +127,7 @@ def headline(machines: list[dict[str, Any]]) -> str:
     '3 machines: 1 silent, 2 ok'
     """
     if not machines:
-        return "No machine is heard."
+        return "No machine received."
     counts: dict[str, int] = {}
     for name in ("silent", "unknown", "fault", "hold", "degraded", "starting", "ok"):
         count = sum(machine["shown"] == name for machine in machines)

@@ -1,8 +1,8 @@
-"""Records everything that a shop publishes to MCAP: every message as it came, with its key and when it arrived.
+"""Records everything that a shop publishes to MCAP: every message as received, with its key and time of arrival.
 
-A copy to look at and to compare machines with. The evidence are the recordings of each service: they have the sample
-before its offset went out, and a hash chain. Here a message is on disk within `SYNC_S` of its arrival, a kill loses no
-more than that, and what never arrived is counted from the numbers of the messages.
+This is a copy for viewing and for comparing machines. The evidence is each service's own recording, which holds the
+sample before its offset was published, and a hash chain. Here a message is on disk within `SYNC_S` of its arrival, a
+kill loses no more than that, and lost messages are counted by their sequence numbers.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from compensator.watch.shop_file import compact
 
 log = logging.getLogger("compensator")
 
-#: Longest time between the arrival of a message and its being on disk, s.
+#: Longest time from the arrival of a message until it is on disk, s.
 SYNC_S = 2.0
-#: Messages that wait for the disk at most; the oldest go first, and are counted.
+#: Largest number of messages that wait for the disk; the oldest are dropped first, and counted.
 WAITING = 200_000
-#: Channels in one file at most: a program that makes up keys fills no memory.
+#: Largest number of channels in one file: invented keys cannot fill the memory.
 CHANNELS = 20_000
-#: Topic of what is no message of the contract, before its key.
+#: Topic prefix of messages that follow no schema.
 OTHER = "other/"
 
 
 class _Arrival(NamedTuple):
-    """What came, where and when."""
+    """A message with its key and time of arrival."""
 
     time_ns: int
     key: str
@@ -46,16 +46,16 @@ class _Arrival(NamedTuple):
 
 
 class ShopRecorder:
-    """Recorder of a shop. Use it as a context manager; on the way out everything is on disk and compact.
+    """Recorder of a shop. Use it as a context manager; at its exit everything is on disk and compact.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Made when it is not there.
+        Created if it does not exist.
     prefix : str
-        What is recorded, for the metadata.
+        Prefix of the keys, for the metadata.
     clock : Clock
-        Handed in.
+        Time of arrival.
     """
 
     def __init__(self, folder: Path, prefix: str, clock: Clock) -> None:
@@ -70,11 +70,11 @@ class ShopRecorder:
         self._numbers: dict[tuple[str, str], Sequence] = {}
         self.files: list[Path] = []
         self.messages = 0
-        #: Messages that arrived and are in no file: the disk did not take them for too long.
+        #: Number of messages that arrived but are in no file, because the disk failed for too long.
         self.not_recorded = 0
 
-    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
-        """Take a message, from any thread; the answer to a question was published before and is none."""
+    def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+        """Receive a message, from any thread; answers to queries repeat messages and are ignored."""
         if asked:
             return
         with self._lock:
@@ -83,9 +83,9 @@ class ShopRecorder:
                 self._waiting.popleft()
                 self.not_recorded += 1
 
-    def alive(self, key: str, alive: bool) -> None:
-        """Record that a liveliness token came or went, as JSON of its own under its key."""
-        self.take(key, b'{"alive": true}' if alive else b'{"alive": false}')
+    def set_alive(self, key: str, alive: bool) -> None:
+        """Record a change of a liveliness token, as JSON under its key."""
+        self.receive(key, b'{"alive": true}' if alive else b'{"alive": false}')
 
     def __enter__(self) -> ShopRecorder:
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -103,7 +103,7 @@ class ShopRecorder:
             finisher.join()
 
     def answer(self) -> tuple[dict[str, Any], str]:
-        """Return what was recorded and what was lost, for the end of the command."""
+        """Return what was recorded and lost, as JSON and as text."""
         missed = self.missed()
         result = {
             "files": [str(path) for path in self.files],
@@ -112,13 +112,13 @@ class ShopRecorder:
             "missed": missed,
         }
         lost = ", ".join(f"{count} of {key}" for key, count in missed.items()) or "none"
-        text = f"{self.messages} messages in {len(self.files)} file(s) in {self._folder}; lost on the way: {lost}"
+        text = f"{self.messages} messages in {len(self.files)} file(s) in {self._folder}; lost in transit: {lost}"
         if self.not_recorded:
-            text += f"; not taken by the disk: {self.not_recorded}"
+            text += f"; not recorded, because the disk failed: {self.not_recorded}"
         return result, text
 
     def missed(self) -> dict[str, int]:
-        """Return how many messages of each key never arrived, by the gaps of their numbers, where any did not."""
+        """Return the number of lost messages of each key, by gaps in the sequence numbers."""
         found = {f"{prefix}/thermal/{kind}": one.missed for (prefix, kind), one in self._numbers.items()}
         return {key: count for key, count in sorted(found.items()) if count}
 
@@ -127,9 +127,9 @@ class ShopRecorder:
     def _work(self) -> None:
         while not self._ended:
             self._wake.wait(SYNC_S / 2.0)
-            self._turn()
-        # What came last, and once more what the disk refused before.
-        if not self._turn():
+            self._write_waiting()
+        # The last messages, and once more those that the disk refused.
+        if not self._write_waiting():
             with self._lock:
                 self.not_recorded += len(self._waiting)
         try:
@@ -137,8 +137,8 @@ class ShopRecorder:
         except OSError as error:
             log.error("compensator: the shop's recording could not be finished: %s", error)
 
-    def _turn(self) -> bool:
-        """Bring what waits to disk; tell whether the disk took it."""
+    def _write_waiting(self) -> bool:
+        """Write the waiting messages; return whether the disk accepted them."""
         with self._lock:
             batch = list(self._waiting)
             self._waiting.clear()
@@ -150,7 +150,7 @@ class ShopRecorder:
         return True
 
     def _write(self, batch: list[_Arrival]) -> None:
-        """Bring a batch to disk, each day into its own file; what is on disk is taken off it."""
+        """Write a batch, each day to its own file; remove from the batch what is on disk."""
         while batch:
             day = _day(batch[0])
             part = next(list(same) for _, same in groupby(batch, _day))
@@ -158,17 +158,17 @@ class ShopRecorder:
                 self._finish()
                 self._file, self._day = _File(self._folder, part[0].time_ns, self._prefix), day
                 self.files.append(self._file.path)
-            taken = sum([self._file.add(arrival, self._numbered(arrival)) for arrival in part])
+            written = sum([self._file.add(arrival, self._numbered(arrival)) for arrival in part])
             self._file.sync()
-            self.messages += taken
-            self.not_recorded += len(part) - taken
+            self.messages += written
+            self.not_recorded += len(part) - written
             del batch[: len(part)]
             if self._failed:
                 self._failed = False
-                log.info("compensator: the disk takes the shop's recording again")
+                log.info("compensator: the shop's recording is written again")
 
     def _numbered(self, arrival: _Arrival) -> tuple[str, int, int]:
-        """Return kind, number and time of a message, and follow its numbers; `other` where it is none."""
+        """Return kind, number and time of a message, and count it; `other` if it follows no schema."""
         prefix, _, rest = arrival.key.rpartition("/thermal/")
         kind = KINDS.get(rest, "")
         if rest == "alive":
@@ -181,7 +181,7 @@ class ShopRecorder:
             return "other", 0, arrival.time_ns
         numbers = self._numbers
         if kind in ("offset", "sample", "estimate"):
-            numbers.setdefault((prefix, rest), Sequence()).take(message.seq, message.time_utc_ns)
+            numbers.setdefault((prefix, rest), Sequence()).update(message.seq, message.time_utc_ns)
         started_ns = message.started_utc_ns if kind == "status" else 0
         if kind == "event" and message.kind == "start":
             started_ns = message.time_utc_ns
@@ -190,13 +190,13 @@ class ShopRecorder:
         return kind, message.seq & 0xFFFFFFFF, message.time_utc_ns
 
     def _give_up(self, batch: list[_Arrival], error: OSError) -> None:
-        """Leave the file as it was at the last sync and try the batch again in another."""
+        """Leave the file as it was at the last sync and queue the batch for another file."""
         file, self._file = self._file, None
         if file is not None:
             file.give_up()
         if not self._failed:
             self._failed = True
-            log.error("compensator: the disk does not take the shop's recording: %s", error)
+            log.error("compensator: the shop's recording cannot be written: %s", error)
         with self._lock:
             room = max(WAITING - len(self._waiting), 0)
             self.not_recorded += max(len(batch) - room, 0)
@@ -222,15 +222,15 @@ def _day(arrival: _Arrival) -> str:
 def _compact_all(paths: list[Path]) -> None:
     for path in paths:
         try:
-            said = compact(path)
+            outcome = compact(path)
         except (OSError, ValueError) as error:
-            said = f"could not be made compact and stays as it is: {error}"
-        if said:
-            log.info("%s: %s", path.name, said)
+            outcome = f"could not be compacted and stays as it is: {error}"
+        if outcome:
+            log.info("%s: %s", path.name, outcome)
 
 
 class _File(LiveFile):
-    """The file that is being written; its channels come with their first message."""
+    """The file that is being written; channels are registered with their first message."""
 
     def __init__(self, folder: Path, time_ns: int, prefix: str) -> None:
         super().__init__(_names(folder, time_ns))
@@ -246,7 +246,7 @@ class _File(LiveFile):
         self.writer.add_metadata("shop", metadata)
 
     def add(self, arrival: _Arrival, numbered: tuple[str, int, int]) -> bool:
-        """Write one message: log time is its arrival, publish time its own; tell whether there was room for it."""
+        """Write a message (log time: arrival, publish time: its own); return whether there was a channel for it."""
         kind, number, time_ns = numbered
         topic = f"/{OTHER if kind == 'other' else ''}{arrival.key}"
         channel = self._channels.get(topic)
@@ -270,7 +270,7 @@ class _File(LiveFile):
         return self.writer.register_channel(topic, encoding, schema, about)
 
     def end(self, messages: int, not_recorded: int, missed: dict[str, int], time_ns: int) -> None:
-        """Say what never arrived since the recorder began, write the end and close."""
+        """Write the summary of lost messages and the end of the file, and close it."""
         summary = {"messages": messages, "not_recorded": not_recorded, "missed": missed}
         try:
             schema = self.writer.register_schema("ShopSummary", "jsonschema", SUMMARY)
@@ -289,7 +289,7 @@ SUMMARY = (
     b'{"type": "object", "additionalProperties": {"type": "integer"}}}, '
     b'"required": ["messages", "not_recorded", "missed"]}'
 )
-#: Schema of what is recorded of liveliness tokens.
+#: Schema of liveliness changes.
 ALIVE = (
     b'{"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "thermal.alive", "type": "object", '
     b'"properties": {"alive": {"type": "boolean"}}, "required": ["alive"]}'
@@ -297,7 +297,7 @@ ALIVE = (
 
 
 def _names(folder: Path, time_ns: int) -> Iterator[Path]:
-    """Yield names for a new file by the time."""
+    """Yield names for a new file at a time."""
     stamp = datetime.fromtimestamp(time_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
     for count in range(1000):
         yield folder / f"shop_{stamp}{f'-{count:03d}' if count else ''}.mcap"

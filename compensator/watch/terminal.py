@@ -1,4 +1,4 @@
-"""A machine or a shop in the terminal."""
+"""View of a machine or a shop in the terminal."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from rich.table import Table
 from rich.text import Text
 
 from compensator.clock import NS
-from compensator.watch.day import STYLES, drawn, evenly, sparkline, spells
+from compensator.report.notation import plain, signed
+from compensator.watch.day import STYLES, drawn, evenly, sparkline
+from compensator.watch.history import Spell, spells
 from compensator.watch.shop import Shop, headline
-from compensator.watch.words import SIGNS, age, here, plain, signed, zone
+from compensator.watch.words import SIGNS, age, here, zone
 
-#: Width from which on a column is shown in the table of a shop: (heading, least width of the terminal).
+#: Columns of the table of a shop: heading, least width of the terminal.
 _COLUMNS = (
     ("machine", 0),
     ("state", 0),
@@ -29,42 +31,42 @@ _COLUMNS = (
     ("age", 0),
     ("alive", 72),
     ("last 24 h", 140),
-    ("why", 60),
+    ("reasons", 60),
 )
-#: Events, and times in one state, shown of one machine.
+#: Numbers of events and of intervals in one state shown for one machine.
 EVENTS, SPELLS = 6, 4
-#: What is to be done about a machine that says itself that it is well.
-BELOW = "But mind what is said below."
-#: Rows of a terminal from which on everything is drawn.
+#: Action for a machine in state ok that has warnings.
+BELOW = "See the warnings below."
+#: Height of a terminal from which on everything is drawn.
 TALL = 44
-#: Lists that stand above the numbers; the rest stands below the day.
-URGENT, PAST = ("Why", "Mind", "Channels", "Devices"), "States of the last day, the newest first"
+#: Lists above the numbers; the others come below the day.
+URGENT, PAST = ("Reasons", "Warnings", "Channels", "Devices"), "States of the last day, the newest first"
 
 
 def view(
     shop: Shop, *, prefix: str, where: str, connected: bool, console: Console, stays: bool = True
 ) -> RenderableType:
-    """Return what is shown now: the machine of the prefix, or all below it.
+    """Return the present view: the machine of the prefix, or all below it.
 
     Parameters
     ----------
     shop : Shop
-        What is known.
+        The machines.
     prefix, where : str
-        What is watched, and over which endpoint.
+        Prefix and endpoints.
     connected : bool
         Whether there is a connection.
     console : rich.console.Console
-        Its size says how much there is room for.
+        Its size limits the view.
     stays : bool
-        Whether it is drawn again and again until Ctrl-C.
+        Whether the view is updated until Ctrl-C.
     """
     machines = shop.overview()
     now = here(shop.now_ns())
     about = Text(f"{prefix or 'everything'} at {where}, {now:%Y-%m-%d %H:%M:%S} {zone(now)}", style="dim")
     parts: list[RenderableType] = [Text(headline(machines), style="bold"), about]
     if not connected:
-        parts.append(Text(f"✗ No connection to {where}; trying again. What stands here is old.", style="bold red"))
+        parts.append(Text(f"✗ No connection to {where}; retrying. The values below are out of date.", style="bold red"))
     if len(machines) == 1:
         history = shop.history(machines[0]["prefix"])
         short = stays and console.height < TALL
@@ -74,14 +76,16 @@ def view(
         parts.append(overview(shop, machines, console.width, rows=rows))
         parts += _to_do(machines[:rows], console.width, console.height - 8 - len(machines))
     if shop.ignored:
-        parts.append(Text(f"{shop.ignored} message(s) with keys or of machines that are not followed.", style="yellow"))
+        parts.append(
+            Text(f"{shop.ignored} message(s) with unknown keys or of further machines ignored.", style="yellow")
+        )
     if stays:
-        parts.append(Text("Ctrl-C ends the view; nothing is sent to the machines.", style="dim"))
+        parts.append(Text("Ctrl-C ends the view. Nothing is sent to the machines.", style="dim"))
     return Group(*parts)
 
 
 def _to_do(machines: Sequence[dict[str, Any]], width: int, rows: int) -> list[RenderableType]:
-    """Return what is to be done, machine by machine, as far as there is room below the table."""
+    """Return the actions by machine, as far as they fit below the table."""
     lines: list[RenderableType] = []
     for machine in machines:
         text = Text(f"{SIGNS[machine['tone']]} {machine['prefix']} {machine['shown']}: {machine['to_do']}")
@@ -89,30 +93,30 @@ def _to_do(machines: Sequence[dict[str, Any]], width: int, rows: int) -> list[Re
         if machine["tone"] == "good" or rows < 1:
             break
         lines.append(text)
-    return [Text("\nWhat to do", style="bold"), *lines] if lines else []
+    return [Text("\nActions", style="bold"), *lines] if lines else []
 
 
 # ---------------------------------------------------------------------------- a shop
 
 
 def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: int | None = None) -> RenderableType:
-    """Return the table of a shop, those that need somebody first.
+    """Return the table of a shop, the most severe first.
 
     Parameters
     ----------
     shop : Shop
-        For the last day of each.
+        For the last day of each machine.
     machines : sequence of dict
         Snapshots.
     width : int
-        Of the terminal, letters.
+        Width of the terminal, characters.
     rows : int, optional
-        So many at most; how many were left out is said.
+        Largest number of rows; the number of omitted machines is shown.
     """
     names = [name for name, least in _COLUMNS if width >= least]
     table = Table(expand=width < 140, box=None, padding=(0, 1, 0, 0), header_style="dim")
     for name in names:
-        left, why = name in ("machine", "state", "why", "alive", "last 24 h"), name == "why"
+        left, why = name in ("machine", "state", "reasons", "alive", "last 24 h"), name == "reasons"
         table.add_column(
             name,
             justify="left" if left else "right",
@@ -125,7 +129,8 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
     for machine in shown:
         cells = _cells(machine)
         if "last 24 h" in names:
-            cells["last 24 h"] = Text(_offsets(shop.history(machine["prefix"]), 24))
+            history = shop.history(machine["prefix"])
+            cells["last 24 h"] = Text(sparkline(evenly(history["t_s"], history["y_offset_um"], 24)))
         table.add_row(*(cells[name] for name in names))
     left_out = machines[len(shown) :]
     if not left_out:
@@ -136,7 +141,7 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
 
 
 def _cells(machine: dict[str, Any]) -> dict[str, Text]:
-    # Codes: a sentence would be cut off; what to do stands below, or in the view of the machine alone.
+    # Codes, as sentences would be cut off; the actions are below, or in the view of one machine.
     reasons = [reason["code"] for reason in machine["reasons"]] if machine["shown"] != "silent" else []
     why = " ".join([*reasons, *machine["warning_codes"]])
     return {
@@ -150,7 +155,7 @@ def _cells(machine: dict[str, Any]) -> dict[str, Text]:
         "AT °C": Text(plain(machine["at_degc"])),
         "age": Text(age(machine["age_s"]) if machine["age_s"] is not None else "–"),
         "alive": Text(_alive(machine)),
-        "why": Text(why),
+        "reasons": Text(why),
     }
 
 
@@ -159,7 +164,7 @@ def _alive(machine: dict[str, Any]) -> str:
 
 
 def state(machine: dict[str, Any]) -> Text:
-    """Return what a machine is shown as, with a sign."""
+    """Return the shown state of a machine with its sign."""
     tone = machine["tone"]
     return Text(f"{SIGNS[tone]} {machine['shown']}", style=STYLES[tone])
 
@@ -170,20 +175,20 @@ def state(machine: dict[str, Any]) -> Text:
 def detail(
     machine: dict[str, Any], history: dict[str, list[Any]], width: int, now_ns: int, *, short: bool = False
 ) -> RenderableType:
-    """Return everything of one machine.
+    """Return the view of one machine.
 
     Parameters
     ----------
     machine : dict
         Snapshot.
     history : dict of str to list
-        Its last day, column by column.
+        Its last day, by columns.
     width : int
-        Of the terminal, letters.
+        Width of the terminal, characters.
     now_ns : int
         Now, ns since 1970 UTC.
     short : bool
-        Leave out what a terminal that is not tall has no room for: what does not fit is cut off below.
+        Omit what does not fit a low terminal, which cuts the view off at the bottom.
     """
     parts: list[RenderableType] = [_verdict(machine)]
     pairs = _pairs(machine)
@@ -191,7 +196,9 @@ def detail(
     numbers = Table.grid(padding=(0, 2))
     for i in range(0, len(pairs), per_row):
         numbers.add_row(*(cell for name, value in pairs[i : i + per_row] for cell in (Text(name, style="dim"), value)))
-    past = [spell.text(now_ns / NS) for spell in spells(history)[: SPELLS // 2 if short else SPELLS]]
+    past = [
+        _spell(spell, now_ns) for spell in spells(history, machine["valid_for_s"])[: SPELLS // 2 if short else SPELLS]
+    ]
     lists = [(title, lines) for title, lines in _lists(machine, past, here(now_ns)) if lines]
     urgent = [(title, lines) for title, lines in lists if title in URGENT]
     parts += [_titled(title, lines) for title, lines in urgent]
@@ -237,7 +244,7 @@ def _pairs(machine: dict[str, Any]) -> list[tuple[str, Text]]:
 
 
 def _about(machine: dict[str, Any]) -> str:
-    """Return what tells where the numbers come from, in one line."""
+    """Return service, messages, model and recording in one line."""
     model = f"{machine['model'] or '–'} {(machine['model_sha256'] or '')[:8]}".rstrip()
     return (
         f"service {_alive(machine)}; {machine['received']} messages received, {machine['missed']} missed; "
@@ -254,10 +261,10 @@ def _lists(machine: dict[str, Any], past: list[str], now: datetime) -> list[tupl
         + (f" → {event['do']}" if event["do"] else "")
         for event in machine["events"][:EVENTS]
     ]
-    mind = [warning.marked for warning in machine["warnings"]]
+    warned = [warning.marked for warning in machine["warnings"]]
     return [
-        ("Why", reasons),
-        ("Mind", mind),
+        ("Reasons", reasons),
+        ("Warnings", warned),
         ("Channels", channels),
         ("Devices", devices),
         (PAST, past),
@@ -270,6 +277,13 @@ def _channel(name: str, channel: dict[str, Any]) -> str:
     return f"{name}: {channel['quality']}" + (f" ({errors})" if errors else "") + f": {channel['do']}"
 
 
+def _spell(spell: Spell, now_ns: int) -> str:
+    begin = here(round(spell.begin_s * NS))
+    when = f"{begin:%H:%M}" if begin.date() == here(now_ns).date() else f"{begin:%m-%d %H:%M}"
+    text = f"{when} {spell.state} for {age(spell.end_s - spell.begin_s)}"
+    return f"{text}: {spell.reasons}" if spell.reasons else text
+
+
 def _titled(title: str, lines: list[str]) -> RenderableType:
     table = Table.grid(padding=(0, 1))
     for line in lines:
@@ -277,15 +291,11 @@ def _titled(title: str, lines: list[str]) -> RenderableType:
     return Group(Text(f"\n{title}", style="bold"), table)
 
 
-def _offsets(history: dict[str, list[Any]], width: int) -> str:
-    return sparkline(evenly(history["t_s"], history["y_offset_um"], width), width) if history else ""
-
-
 # ---------------------------------------------------------------------------- without a terminal
 
 
 def line(machine: dict[str, Any]) -> str:
-    """Return a machine in one line, for a pipe or a log."""
+    """Return a machine as one line, for a pipe or a log."""
     when = (
         f"{datetime.fromtimestamp(machine['time_utc_ns'] / NS, UTC):%Y-%m-%dT%H:%M:%SZ}"
         if machine["time_utc_ns"]

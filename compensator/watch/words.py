@@ -1,10 +1,10 @@
-"""What is shown, in words: a machine's verdict, its reasons, its events, and how old something is."""
+"""Text of the views: severity and signs, meaning and action of codes and events, times and ages."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from compensator.clock import NS
 from compensator.messages import Event
@@ -12,7 +12,7 @@ from compensator.reasons import explain
 
 Tone = Literal["good", "warn", "bad"]
 
-#: What a machine is shown as → how much it needs somebody.
+#: Severity of each state.
 TONES: Mapping[str, Tone] = {
     "ok": "good",
     "starting": "warn",
@@ -22,22 +22,22 @@ TONES: Mapping[str, Tone] = {
     "silent": "bad",
     "unknown": "bad",
 }
-#: A sign beside each, so that colour is not needed.
+#: Sign of each severity, for readers without colour.
 SIGNS: Mapping[Tone, str] = {"good": "✓", "warn": "⚠", "bad": "✗"}
-#: Kind of an event → what to do.
+#: Action for each kind of event.
 _DO: Mapping[str, str] = {
     "device": "Check power, cable and address of the device; `compensator probe` reads it once.",
     "recording": "Check free space, permissions and the disk.",
     "clock": "Check the time service of the machine's computer.",
-    "error": "Report it with its text; the offset is held until the service is well again.",
-    "command_refused": "Find out who sent it and whether they may; the offset was not touched.",
-    "adopt": "The model before goes on; see what is said of the new one.",
-    "restart": "Nothing while the standard deviation is small enough for the work.",
+    "error": "Report it with its text; the offset is held until the error is gone.",
+    "command_refused": "Find out who sent it and with what permission; the offset did not change.",
+    "adopt": "The previous model remains active; see the text for what is wrong with the new one.",
+    "restart": "None if the standard deviation is small enough for the work.",
 }
 
 
 class Words(NamedTuple):
-    """A code with what it means and what to do."""
+    """A code with its meaning and action."""
 
     code: str
     means: str
@@ -45,7 +45,7 @@ class Words(NamedTuple):
 
 
 def in_words(code: str) -> Words:
-    """Return a state or reason in words; one that is unknown is said to be so.
+    """Return a state or reason with its meaning and action, also if it is unknown.
 
     Examples
     --------
@@ -55,13 +55,15 @@ def in_words(code: str) -> Words:
     found = explain(code)
     if found is None:
         return Words(
-            code, "This program does not know the code; the service may be newer.", "Bring both to one version."
+            code,
+            "Unknown code: the service may be newer than this program.",
+            "Install the same version on both computers.",
         )
     return Words(code, *found)
 
 
 def to_do(event: Event) -> str:
-    """Return what to do about an event; empty where there is nothing."""
+    """Return the action for an event; empty if none is needed."""
     if event.kind in ("device", "adopt") and event.data.get("ok") is not False:
         return ""
     if event.kind == "state":
@@ -69,13 +71,14 @@ def to_do(event: Event) -> str:
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
         return " ".join(dict.fromkeys(in_words(code).do for code in codes)) if state not in ("", "ok") else ""
-    if event.kind == "recording" and ("again" in event.text or "removed" in event.data):
+    # The disk works again, or old recordings were removed as configured.
+    if event.kind == "recording" and event.data.keys() & {"lost", "removed"}:
         return ""
     return _DO.get(event.kind, "")
 
 
 def here(time_ns: int) -> datetime:
-    """Return a time as the clock on this computer's wall shows it; recordings and messages stay in UTC.
+    """Return a time in this computer's zone; recordings and messages stay in UTC.
 
     Parameters
     ----------
@@ -86,7 +89,7 @@ def here(time_ns: int) -> datetime:
 
 
 def zone(time: datetime) -> str:
-    """Name the time zone of a local time, with what it is ahead of UTC.
+    """Return the time zone of a local time with its offset from UTC.
 
     Examples
     --------
@@ -99,7 +102,7 @@ def zone(time: datetime) -> str:
 
 
 def age(seconds: float) -> str:
-    """Write how old something is.
+    """Format an age.
 
     Examples
     --------
@@ -113,19 +116,3 @@ def age(seconds: float) -> str:
     if seconds < 48 * 3600:
         return f"{seconds // 3600:.0f} h {seconds % 3600 // 60:.0f} min"
     return f"{seconds / 86400:.1f} d"
-
-
-def signed(value: Any, digits: int = 2) -> str:
-    """Write a number with its sign; a dash where there is none.
-
-    Examples
-    --------
-    >>> signed(1.234), signed(-0.5), signed(None)
-    ('+1.23', '−0.50', '–')
-    """
-    return f"{value:+.{digits}f}".replace("-", "−") if isinstance(value, (int, float)) else "–"
-
-
-def plain(value: Any, digits: int = 2) -> str:
-    """Write a number; a dash where there is none."""
-    return f"{value:.{digits}f}".replace("-", "−") if isinstance(value, (int, float)) else "–"

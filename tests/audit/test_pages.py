@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import math
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,8 @@ def page(capsys: pytest.CaptureFixture[str], code: int, *arguments: str | Path) 
     out = Path(str(arguments[0])).parent / "page.html"
     assert main(["replay", *map(str, arguments), "--page", str(out)]) == code
     assert f"page: {out}" in capsys.readouterr().out
-    return html.unescape(out.read_text(encoding="utf-8"))
+    # Without the classes that align columns.
+    return html.unescape(re.sub(r' class="text[ a-z]*"', "", out.read_text(encoding="utf-8")))
 
 
 def outcomes(text: str) -> dict[str, str]:
@@ -97,6 +99,8 @@ def test_every_model_that_recorded_is_named(tmp_path: Path, capsys: pytest.Captu
 def test_a_page_of_another_format_is_refused_before_the_work(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(rec), "--page", "page.doc"]) == 2
     assert "--page page.doc: expected a name that ends in .html, .pdf or .png" in capsys.readouterr().err
+    if shutil.which("chromium") is None:
+        pytest.skip("chromium is not installed: nothing was printed")
     out = rec.parent / "audit.pdf"
     assert main(["replay", str(rec), "--page", str(out)]) == 0
     assert out.read_bytes().startswith(b"%PDF")

@@ -206,13 +206,13 @@ class Late:
     def __init__(self) -> None:
         self.late_ns: list[int] = []
 
-    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+    def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
         if not asked:
             now_ns = time.time_ns()
             at = payload.index(b'"time_utc_ns":') + 14
             self.late_ns.append(now_ns - int(payload[at : payload.index(b",", at)]))
 
-    def alive(self, key: str, alive: bool) -> None:
+    def set_alive(self, key: str, alive: bool) -> None:
         return
 
 

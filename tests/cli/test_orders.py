@@ -42,7 +42,7 @@ def test_a_wrong_prefix_is_told_from_a_service_that_is_away(tmp_path: Path, caps
         capsys.readouterr()
         assert main(["watch", "--connect", f"tcp/127.0.0.1:{port}", "--prefix", "shop/vmc-70", "--once"]) == 1
         error = capsys.readouterr().err
-        assert "nothing is heard below shop/vmc-70" in error and error.endswith("alive there: shop/vmc-07\n")
+        assert "no messages below shop/vmc-70" in error and error.endswith("alive there: shop/vmc-07\n")
 
 
 def test_a_folder_that_a_service_holds_is_known_to_be_held(tmp_path: Path) -> None:

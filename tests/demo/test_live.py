@@ -20,7 +20,7 @@ import pytest
 
 from compensator.cli import main
 from compensator.clock import NS
-from compensator.demo.live import obey
+from compensator.demo.live import apply_fault
 from compensator.demo.machine import CapaNcdt, configuration, hardware
 from compensator.messages import Offset
 from compensator.recording.reading import read_messages, recordings
@@ -75,24 +75,24 @@ def test_typing_breaks_a_sensor_and_mends_it(tmp_path: Path) -> None:
             ("break y", 2, "over_range"),
             ("unplug y", 2, "device_disconnected"),
         ):
-            assert obey(line + "\n", faults).startswith(f"{line}: done")
+            assert apply_fault(line + "\n", faults).startswith(f"{line}: done")
             assert readings(config) == [*sound[:number], expected, *sound[number + 1 :]]
-            assert obey("mend\n", faults) == "all is well again"
+            assert apply_fault("mend\n", faults) == "all sensors repaired"
             assert readings(config) == sound, line
 
 
 def test_a_value_can_be_made_to_stand_still() -> None:
     faults = {"t_q": (Faults(), 0)}
-    obey("freeze t_q", faults)
+    apply_fault("freeze t_q", faults)
     assert "frozen" in faults["t_q"][0].of_input(0)
-    obey("mend", faults)
+    apply_fault("mend", faults)
     assert not faults["t_q"][0].of_input(0)
 
 
 @pytest.mark.parametrize("line", ["break", "break oil", "smash t_q", "", "mend t_q", "unplug t_q now"])
 def test_what_is_mistyped_is_answered_with_what_can_be_typed(line: str) -> None:
     faults = {name: (Faults(), 0) for name in ("t_q", "at", "y")}
-    assert obey(line, faults).endswith("expected one of break, freeze, unplug with one of t_q, at, y; or mend")
+    assert apply_fault(line, faults).endswith("expected one of break, freeze, unplug with one of t_q, at, y; or mend")
     assert not any(fault.of_input(0) for fault, _ in faults.values())
 
 
@@ -116,7 +116,7 @@ def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest
         assert any("Ctrl-C ends it" in line for line in process.stderr)
         process.stdin.write("break t_q\n")
         process.stdin.flush()
-        assert any(line == "break t_q: done; shows within two minutes\n" for line in process.stderr)
+        assert any(line == "break t_q: done; visible within two minutes\n" for line in process.stderr)
         assert main(command) == 1, "a second one in the same folder is refused, and leaves alone what is there"
         assert "held by another service of vmc-07" in capfd.readouterr().err
         process.send_signal(signal.SIGINT)

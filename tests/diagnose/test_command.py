@@ -44,7 +44,7 @@ def test_json_model_and_page(tmp_path, table, capsys):
     assert [effect.kind for effect in model.effects] == ["scheduled"]
     assert model.provenance["diagnosis"]["base_model_sha256"] == load_model("quill").sha256
     page = (out / "report.html").read_text(encoding="utf-8")
-    for words in ("before and after", "Errors on held-out data", "how it ranked", model.sha256):
+    for words in ("before and after", "Errors on held-out data", "ranked", model.sha256):
         assert words in page
 
 

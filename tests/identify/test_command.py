@@ -49,7 +49,13 @@ def test_model_page_and_summary(tmp_path, calibration, capsys):
     assert model.dtf.covariance is not None
     assert model.validity["heat_w"][1] > 90.0
     page = (out.parent / "report.html").read_text(encoding="utf-8")
-    for words in ("step response", "poles and zeros", "autocorrelation", "Beside the reference model", model.sha256):
+    for words in (
+        "step response",
+        "poles and zeros",
+        "autocorrelation",
+        "Comparison with the reference model",
+        model.sha256,
+    ):
         assert words in page
     assert main(["simulate", str(other), "--model", str(out), "--out", str(tmp_path / "s.csv"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["fit_pct"] > 90.0

@@ -47,21 +47,7 @@ def make(folder: Path) -> dict[str, Path]:
         )
         == 0
     )
-    assert (
-        main(
-            [
-                "diagnose",
-                str(run),
-                "--model",
-                str(model),
-                "--out",
-                str(pages["diagnose"].parent),
-                "--page",
-                str(pages["diagnose"].with_name("page.pdf")),
-            ]
-        )
-        == 0
-    )
+    assert main(["diagnose", str(run), "--model", str(model), "--out", str(pages["diagnose"].parent)]) == 0
     assert main(["report", str(rec), "--out", str(pages["report"])]) == 0
     assert main(["replay", str(rec), "--page", str(pages["replay"])]) == 0
     assert main(["replay", str(rec), "--model", "quill", "--page", str(pages["replay-model"])]) == 0

@@ -14,7 +14,6 @@ import pytest
 
 from compensator.cli import main
 from compensator.reasons import WORDS
-from compensator.report.drawing import ON_PAPER
 
 STYLE = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
 SCHEMES = [
@@ -144,11 +143,6 @@ def test_warnings_and_alarms_are_met_in_the_gallery(pages: dict[str, Path]) -> N
     assert {"hold", "degraded", "t_q_missing", "operator_hold"} <= linked["report"]
 
 
-def test_a_page_is_written_as_pdf_beside_the_html(pages: dict[str, Path]) -> None:
-    data = pages["diagnose"].with_name("page.pdf").read_bytes()
-    assert data.startswith(b"%PDF") and len(re.findall(rb"/Type /Page\b", data)) >= 2
-
-
 @pytest.mark.parametrize(
     "command",
     [["demo"], ["identify", "none.csv", "--out", "m.toml"], ["diagnose", "none.csv", "--model", "quill", "--out", "d"]],
@@ -194,9 +188,3 @@ def test_the_first_two_curves_differ_for_the_colour_blind(scheme: dict[str, str]
     """More than two differ by their dashes alone, as on a grey print."""
     one, other = (np.array(BLINDNESS[kind]) @ linear(scheme[f"--line-{i}"]) for i in (0, 1))
     assert np.linalg.norm(one - other) > 0.25
-
-
-def test_paper_has_the_colours_of_the_printed_page() -> None:
-    printed = SCHEMES[2]
-    assert (ON_PAPER.ink, ON_PAPER.grid) == (printed["--ink"], printed["--grid"])
-    assert ON_PAPER.lines == tuple(printed[f"--line-{i}"] for i in range(5))

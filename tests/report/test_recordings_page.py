@@ -6,7 +6,6 @@ import html
 import json
 import math
 import re
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -218,45 +217,7 @@ def test_a_folder_with_results_leads_to_its_pages(tmp_path: Path, capsys: pytest
     assert "It & works." in capsys.readouterr().out
     page = (tmp_path / "all.html").read_text(encoding="utf-8")
     assert re.findall(r'<a href="([^"]*)"', page) == ["demo%20out/report.html", "demo%20out/calibration/report.html"]
-    assert '<p class="verdict warn"><b>⚠ mind</b>It &amp; works.</p>' in page and "not ours" not in page
-
-
-# ---------------------------------------------------------------------------- paper
-
-
-def letters(pdf: bytes) -> str:
-    """What is written on the sheets: the letters of every text operator, in the order in which they are drawn."""
-    found = []
-    for stream in re.findall(rb"stream\r?\n(.*?)endstream", pdf, re.S):
-        try:
-            content = zlib.decompress(stream)
-        except zlib.error:
-            continue
-        for shown in re.findall(rb"\[(.*?)\] TJ|\(((?:[^()\\]|\\.)*)\) Tj", content, re.S):
-            parts = re.findall(rb"\(((?:[^()\\]|\\.)*)\)", shown[0]) or [shown[1]]
-            found.append(b"".join(parts).decode("latin-1").replace("\0", "").replace("\\(", "(").replace("\\)", ")"))
-    return "\n".join(found)
-
-
-def test_a_pdf_has_sheets_and_words(folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "page.pdf"
-    assert main(["report", str(folder), "--out", str(out)]) == 0
-    data = out.read_bytes()
-    assert data.startswith(b"%PDF-1.") and data.rstrip().endswith(b"%%EOF")
-    assert len(re.findall(rb"/Type /Page\b", data)) >= 3
-    words = letters(data)
-    for expected in ("Minutes by state", "operator_hold", "What the devices missed", "time, UTC", "vmc-07: 2026-01-05"):
-        assert expected in words
-
-
-def test_a_png_is_a_picture(folder: Path, tmp_path: Path) -> None:
-    from matplotlib.image import imread
-
-    out = tmp_path / "page.png"
-    assert main(["report", str(folder), "--out", str(out)]) == 0
-    picture = imread(out)
-    assert picture.shape[1] > 1000 and picture.shape[0] > 500
-    assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 50
+    assert '<p class="verdict warn"><b>⚠ Caution</b>It &amp; works.</p>' in page and "not ours" not in page
 
 
 # ---------------------------------------------------------------------------- memory

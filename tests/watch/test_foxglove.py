@@ -53,8 +53,8 @@ class Viewer:
 def test_a_viewer_gets_the_latest_at_once_and_then_all_that_follows() -> None:
     key = "shop/vmc-07/thermal/y/offset"
     with FoxgloveServer("shop/vmc-07", 0) as server:
-        server.take(key, offset(5))
-        server.take("shop/vmc-07/thermal/estimate", estimate(5))
+        server.receive(key, offset(5))
+        server.receive("shop/vmc-07/thermal/estimate", estimate(5))
         with Viewer(server.port) as viewer:
             viewer.until_advertised("/offset", "/estimate")
             channel = viewer.channels["/offset"]
@@ -62,17 +62,17 @@ def test_a_viewer_gets_the_latest_at_once_and_then_all_that_follows() -> None:
             assert json.loads(channel["schema"])["properties"]["y_offset_um"]
             viewer.subscribe("/offset")
             assert viewer.message() == (START_NS, offset(5))
-            server.take(key, b"nonsense")
-            server.take(key, offset(5), asked=True)
-            server.take("shop/vmc-07/thermal/y/other", b"{}")
-            server.take(key, offset(6, START_NS + 1))
+            server.receive(key, b"nonsense")
+            server.receive(key, offset(5), asked=True)
+            server.receive("shop/vmc-07/thermal/y/other", b"{}")
+            server.receive(key, offset(6, START_NS + 1))
             assert viewer.message() == (START_NS + 1, offset(6, START_NS + 1))
 
 
 def test_a_viewer_that_joins_gets_the_last_events() -> None:
     with FoxgloveServer("shop", 0) as server:
         for i in range(30):
-            server.take("shop/vmc-07/thermal/event", event(i, START_NS + i))
+            server.receive("shop/vmc-07/thermal/event", event(i, START_NS + i))
         with Viewer(server.port) as viewer:
             viewer.until_advertised("/vmc-07/event")
             viewer.subscribe("/vmc-07/event")

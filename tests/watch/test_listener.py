@@ -36,15 +36,15 @@ class Waiting:
         self.keys: list[tuple[str, bool]] = []
         self._changed = threading.Condition()
 
-    def take(self, key: str, payload: bytes, *, asked: bool = False) -> None:
+    def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
         with self._changed:
-            self.shop.take(key, payload, asked=asked)
+            self.shop.receive(key, payload, asked=asked)
             self.keys.append((key, asked))
             self._changed.notify_all()
 
-    def alive(self, key: str, alive: bool) -> None:
+    def set_alive(self, key: str, alive: bool) -> None:
         with self._changed:
-            self.shop.alive(key, alive)
+            self.shop.set_alive(key, alive)
             self._changed.notify_all()
 
     def connection(self, connected: bool) -> None:
@@ -103,7 +103,7 @@ def test_one_look_knows_every_machine_and_commands_none(services: tuple[int, lis
             expected = {"shop/vmc-07": ("ok", True), "shop/vmc-08": ("ok", True)}
             if prefix == "shop/vmc-08":
                 del expected["shop/vmc-07"]
-            waiting.until(lambda: waiting.states() == expected, again=listener.look)  # noqa: B023
+            waiting.until(lambda: waiting.states() == expected, again=listener.query)  # noqa: B023
         assert all(asked for _, asked in waiting.keys)
     assert commands == []
 
@@ -158,7 +158,7 @@ def test_a_router_that_comes_late_or_comes_back_is_found() -> None:
 
 def test_nobody_there_is_one_line() -> None:
     listener = Listener(of_endpoints("shop", [f"tcp/127.0.0.1:{free_port()}"]))
-    with pytest.raises(ServiceError, match="nobody answers at tcp/127"):
+    with pytest.raises(ServiceError, match="no answer at tcp/127"):
         listener.open()
     with pytest.raises(UsageError, match="expected an endpoint such as"):
         of_endpoints("shop", ["127.0.0.1:7447"])
@@ -173,5 +173,5 @@ def test_the_machines_own_certificate_is_not_what_a_reader_uses() -> None:
     settings = Zenoh(prefix="a", connect=["tls/127.0.0.1:7447"], tls_ca="a", tls_certificate="b", tls_key="c")
     with pytest.raises(UsageError, match="--zenoh: missing"):
         of_settings(settings)
-    with pytest.raises(UsageError, match="has an endpoint"):
+    with pytest.raises(UsageError, match="expected an endpoint"):
         of_settings(Zenoh(prefix="a"))

@@ -9,6 +9,7 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import EstimateMessage, Event, Offset, Sample
+from compensator.watch.history import spells
 from compensator.watch.machine import Machine, decoded
 from compensator.watch.shop import Shop
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
@@ -23,7 +24,7 @@ class Heard:
 
     def hear(self, **messages: bytes) -> None:
         for kind, payload in messages.items():
-            self.shop.take(KEY + ("y/offset" if kind == "offset" else kind), payload)
+            self.shop.receive(KEY + ("y/offset" if kind == "offset" else kind), payload)
 
     @property
     def machine(self) -> dict[str, Any]:
@@ -39,7 +40,7 @@ def heard() -> Heard:
 
 def test_a_machine_that_is_well(heard: Heard) -> None:
     heard.hear(offset=offset(5), sample=sample(5), estimate=estimate(5), status=status(5))
-    heard.shop.alive(KEY + "alive", True)
+    heard.shop.set_alive(KEY + "alive", True)
     heard.clock.advance(30)
     machine = heard.machine
     assert (machine["machine"], machine["shown"], machine["tone"], machine["alive"]) == ("vmc-07", "ok", "good", True)
@@ -103,7 +104,7 @@ def test_a_missing_channel_is_missing(heard: Heard) -> None:
 
 def test_a_reason_that_nobody_knows_is_said_to_be_unknown(heard: Heard) -> None:
     heard.hear(offset=offset(5, state="degraded", reasons=["flux_capacitor"]))
-    assert "does not know" in heard.machine["reasons"][0]["means"]
+    assert "Unknown code" in heard.machine["reasons"][0]["means"]
 
 
 @pytest.mark.parametrize(
@@ -146,9 +147,9 @@ def test_what_is_repeated_or_late_changes_nothing_and_is_counted(heard: Heard) -
 
 
 def test_answers_to_a_question_are_nothing_repeated_or_missed(heard: Heard) -> None:
-    heard.shop.take(KEY + "y/offset", offset(5), asked=True)
+    heard.shop.receive(KEY + "y/offset", offset(5), asked=True)
     heard.hear(offset=offset(8))
-    heard.shop.take(KEY + "y/offset", offset(7), asked=True)
+    heard.shop.receive(KEY + "y/offset", offset(7), asked=True)
     assert (heard.machine["seq"], heard.machine["missed"], heard.machine["repeated"]) == (8, 0, 0)
 
 
@@ -176,7 +177,7 @@ def test_two_services_below_one_prefix_are_told(heard: Heard) -> None:
 
 def test_a_service_that_is_gone_is_told_before_its_offset_is_too_old(heard: Heard) -> None:
     heard.hear(offset=offset(5))
-    heard.shop.alive(KEY + "alive", False)
+    heard.shop.set_alive(KEY + "alive", False)
     assert heard.machine["shown"] == "ok" and heard.machine["tone"] == "warn"
     assert any("liveliness token is gone" in text for text in heard.machine["warnings"])
 
@@ -212,7 +213,7 @@ def test_events_say_what_to_do(heard: Heard) -> None:
 @pytest.mark.parametrize(
     ("kind", "data", "expected"),
     [
-        ("adopt", {"ok": False}, "model before"),
+        ("adopt", {"ok": False}, "previous model"),
         ("adopt", {"ok": True}, ""),
         ("command_refused", {"ok": False}, "who"),
         ("recording", {}, "free space"),
@@ -230,16 +231,16 @@ def test_an_event_asks_for_something_only_where_something_is_wrong(
 
 def test_machines_that_need_somebody_stand_first_and_strangers_are_counted(heard: Heard) -> None:
     for name, state in (("a", "ok"), ("b", "hold"), ("c", "degraded")):
-        heard.shop.take(f"shop/{name}/thermal/y/offset", offset(1, machine=name, state=state))
+        heard.shop.receive(f"shop/{name}/thermal/y/offset", offset(1, machine=name, state=state))
     assert [machine["prefix"] for machine in heard.shop.overview()] == ["shop/b", "shop/c", "shop/a"]
-    heard.shop.take("shop/a/thermal/y/other", b"{}")
+    heard.shop.receive("shop/a/thermal/y/other", b"{}")
     assert heard.shop.ignored == 1 and len(heard.shop.overview()) == 3
 
 
 def test_effects_have_numbers_where_their_names_do_not_fit() -> None:
     machine = Machine("shop/vmc-07")
-    machine.take("estimate", estimate(5, effects=(1.0, 2.0)), 0.0)
-    machine.take("status", status(5), 0.0)
+    machine.update("estimate", estimate(5, effects=(1.0, 2.0)), 0.0)
+    machine.update("status", status(5), 0.0)
     assert machine.effects() == ["effect 1", "effect 2"]
 
 
@@ -247,9 +248,9 @@ def test_the_day_is_one_point_a_minute_with_values_of_one_sample() -> None:
     machine = Machine("shop/vmc-07")
     for i in range(0, 3600, 10):  # an hour at ten seconds
         t = START_NS + i * NS
-        machine.take("offset", offset(i, t, y_offset_um=float(i)), i)
-        machine.take("sample", sample(i, t, t_q=float(i)), i)
-        machine.take("estimate", estimate(i, t, residual_um=float(i)), i)
+        machine.update("offset", offset(i, t, y_offset_um=float(i)), i)
+        machine.update("sample", sample(i, t, t_q=float(i)), i)
+        machine.update("estimate", estimate(i, t, residual_um=float(i)), i)
     columns = machine.history.columns()
     assert len(columns["t_s"]) == 60
     assert (
@@ -257,7 +258,7 @@ def test_the_day_is_one_point_a_minute_with_values_of_one_sample() -> None:
     )
     since = machine.history.columns(START_NS + 1800 * NS)
     assert len(since["t_s"]) == 30
-    machine.take("offset", offset(10**6, START_NS + 25 * 3600 * NS), 0.0)
+    machine.update("offset", offset(10**6, START_NS + 25 * 3600 * NS), 0.0)
     assert len(machine.history) == 1
 
 
@@ -271,11 +272,17 @@ def test_the_past_of_a_recording_says_nothing_of_now() -> None:
     ):
         message = decoded(kind, payload)
         assert isinstance(message, (Offset, Sample, EstimateMessage, Event))
-        machine.past(message)
+        machine.add_recorded(message)
     assert machine.shown(START_NS, 0.0) == "unknown" and machine.age_s(START_NS, 0.0) is None
     assert machine.history.columns()["y_offset_um"] == [-12.34]
     assert machine.snapshot(START_NS, 0.0)["t_q_degc"] == 31.5
     assert machine.snapshot(START_NS + 200 * NS, 0.0)["t_q_degc"] is None
-    machine.take("event", event(2, START_NS - NS), 0.0)
-    machine.take("event", event(3, kind="zero", text="zero"), 0.0)  # heard again
+    machine.update("event", event(2, START_NS - NS), 0.0)
+    machine.update("event", event(3, kind="zero", text="zero"), 0.0)  # heard again
     assert len(machine.events) == 2
+
+
+def test_samples_of_a_slow_model_are_one_interval() -> None:
+    day = {"t_s": [0.0, 300.0, 600.0, 2000.0], "state": ["ok"] * 4, "reasons": [""] * 4}
+    assert [(spell.begin_s, spell.end_s) for spell in spells(day, 750.0)] == [(2000.0, 2060.0), (0.0, 660.0)]
+    assert len(spells(day, 150.0)) == 4

@@ -32,15 +32,15 @@ def filled() -> Shop:
         for name in ("vmc-07", "vmc-08"):
             t, key = START_NS + i * 60 * NS, f"shop/{name}/thermal/"
             state = {"state": "degraded", "reasons": ["t_q_missing"]} if 60 < i < 90 else {}
-            shop.take(key + "y/offset", offset(i, t, machine=name, y_offset_um=-i / 3.0, **state))
-            shop.take(
+            shop.receive(key + "y/offset", offset(i, t, machine=name, y_offset_um=-i / 3.0, **state))
+            shop.receive(
                 key + "sample",
                 sample(i, t, t_q=None if state else 20.0 + i / 20.0, quality="open_circuit" if state else "good"),
             )
-            shop.take(key + "estimate", estimate(i, t, residual_um=0.1))
-            shop.take(key + "status", status(i, t, devices={"couples": EVIL}))
+            shop.receive(key + "estimate", estimate(i, t, residual_um=0.1))
+            shop.receive(key + "status", status(i, t, devices={"couples": EVIL}))
         clock.advance(60)
-    shop.take("shop/vmc-07/thermal/event", event(3, text=EVIL, ok=False))
+    shop.receive("shop/vmc-07/thermal/event", event(3, text=EVIL, ok=False))
     return shop
 
 
@@ -167,7 +167,7 @@ def test_a_browser_draws_the_shop(server: PageServer, tmp_path: Path) -> None:
 def test_the_shop_says_what_to_do_and_times_are_of_the_viewers_zone(tmp_path: Path) -> None:
     shop = filled()
     key, t = "shop/vmc-07/thermal/y/offset", START_NS + 180 * 60 * NS  # 08:59 UTC
-    shop.take(key, offset(180, t, state="hold", reasons=["operator_hold"]))
+    shop.receive(key, offset(180, t, state="hold", reasons=["operator_hold"]))
     with PageServer(shop, lambda: STATUS, 0) as served:
         text, console = drawn(served.address, tmp_path, 400)
         assert console == ""
@@ -181,9 +181,11 @@ def test_the_shop_says_what_to_do_and_times_are_of_the_viewers_zone(tmp_path: Pa
 def test_a_channel_that_is_not_well_stands_above_the_numbers(tmp_path: Path) -> None:
     shop = filled()
     t = START_NS + 180 * 60 * NS
-    shop.take("shop/vmc-07/thermal/sample", sample(180, t, t_q=None, quality="open_circuit"))
+    shop.receive("shop/vmc-07/thermal/sample", sample(180, t, t_q=None, quality="open_circuit"))
     with PageServer(shop, lambda: STATUS, 0) as served:
         text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 400)
     assert console == ""
-    said = 't_q_degc: <a href="#word=open_circuit">open_circuit</a>: The thermocouple or its wiring is broken. <b>To do'
+    said = (
+        't_q_degc: <a href="#word=open_circuit">open_circuit</a>: The thermocouple or its wiring is broken. <b>Action'
+    )
     assert said in text and text.index(said) < text.index('<dl id="now"')

@@ -60,21 +60,21 @@ def shop_in_trouble() -> Shop:
             if name == "silent" and i > 60:
                 continue
             key, t, state = f"shop/{name}/thermal/", START_NS + i * 60 * NS, "ok" if name == "silent" else name
-            shop.take(key + "y/offset", offset(i, t, **({"machine": name, "state": state} | changes)))
-            shop.take(key + "sample", sample(i, t, quality="open_circuit" if name == "hold" else "good"))
-            shop.take(key + "estimate", estimate(i, t))
-            shop.take(key + "status", status(i, t, devices={"couples": LONG}, recording=LONG))
+            shop.receive(key + "y/offset", offset(i, t, **({"machine": name, "state": state} | changes)))
+            shop.receive(key + "sample", sample(i, t, quality="open_circuit" if name == "hold" else "good"))
+            shop.receive(key + "estimate", estimate(i, t))
+            shop.receive(key + "status", status(i, t, devices={"couples": LONG}, recording=LONG))
         clock.advance(60)
-    shop.take("shop/hold/thermal/event", event(3, text=LONG, ok=False))
-    shop.take("shop/hold/thermal/y/offset", b"nonsense")
+    shop.receive("shop/hold/thermal/event", event(3, text=LONG, ok=False))
+    shop.receive("shop/hold/thermal/y/offset", b"nonsense")
     return shop
 
 
 @pytest.mark.parametrize(
     ("where", "said", "scheme"),
     [
-        ("", "look6 machines", 0),
-        ("", "look6 machines", 1),
+        ("", "Attention6 machines", 0),
+        ("", "Attention6 machines", 1),
         ("hold", "hold", 0),
         ("hold", "hold", 1),
         ("starting", "startingno offset", 1),

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from compensator import durable
 from compensator.cli import main
 from compensator.clock import NS
 from compensator.errors import DataError
+from compensator.recording import live_file
 from compensator.watch import shop_recorder
 from compensator.watch.shop_file import compact
 from compensator.watch.shop_recorder import ShopRecorder
@@ -64,9 +64,9 @@ def test_everything_is_there_as_it_came(tmp_path: Path) -> None:
         ]
         for key, payload in sent:
             clock.advance(1)
-            recorder.take(key, payload)
-        recorder.take(KEY + "y/offset", offset(4), asked=True)
-        recorder.alive(KEY + "alive", False)
+            recorder.receive(key, payload)
+        recorder.receive(KEY + "y/offset", offset(4), asked=True)
+        recorder.set_alive(KEY + "alive", False)
     (path,) = recordings(tmp_path)
     found = read(path)
     known = [one for one in found if not one[0].startswith("/other/") and not one[0].endswith("alive")]
@@ -90,13 +90,13 @@ def test_everything_is_there_as_it_came(tmp_path: Path) -> None:
 def test_what_never_arrived_is_counted_and_a_restart_is_not(tmp_path: Path) -> None:
     with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
         for number in (5, 6, 9):
-            recorder.take(KEY + "y/offset", offset(number, START_NS + number * NS))
-            recorder.take(KEY + "sample", sample(number, START_NS + number * NS))
-        recorder.take(KEY + "sample", sample(10, START_NS + 10 * NS))
+            recorder.receive(KEY + "y/offset", offset(number, START_NS + number * NS))
+            recorder.receive(KEY + "sample", sample(number, START_NS + number * NS))
+        recorder.receive(KEY + "sample", sample(10, START_NS + 10 * NS))
         other = "shop/vmc-08/thermal/y/offset"
         for number in (100, 200):
-            recorder.take(other, offset(number, START_NS + number * NS))
-        recorder.take("shop/vmc-08/thermal/status", status(200, started_ns=START_NS + 150 * NS))
+            recorder.receive(other, offset(number, START_NS + number * NS))
+        recorder.receive("shop/vmc-08/thermal/status", status(200, started_ns=START_NS + 150 * NS))
     result, text = recorder.answer()
     assert result["missed"] == {KEY + "sample": 2, KEY + "y/offset": 2}
     assert "2 of shop/vmc-07/thermal/y/offset" in text
@@ -108,7 +108,7 @@ def test_each_day_has_its_file(tmp_path: Path) -> None:
     clock = Clock()
     with ShopRecorder(tmp_path, "shop", clock) as recorder:
         for number in range(4):
-            recorder.take(KEY + "y/offset", offset(number))
+            recorder.receive(KEY + "y/offset", offset(number))
             clock.advance(12 * 3600)
     assert [path.name for path in recordings(tmp_path)] == ["shop_20260105T060000Z.mcap", "shop_20260106T060000Z.mcap"]
     assert [[one[2] for one in read(path)] for path in recordings(tmp_path)] == [[0, 1], [2, 3]]
@@ -122,7 +122,7 @@ from tests.watch.heard import offset
 recorder = shop_recorder.ShopRecorder(__import__("pathlib").Path(sys.argv[1]), "shop", SystemClock())
 with recorder:
     for number in range(100):
-        recorder.take("shop/vmc-07/thermal/y/offset", offset(number))
+        recorder.receive("shop/vmc-07/thermal/y/offset", offset(number))
     while recorder.messages < 100:
         time.sleep(0.005)
     os.kill(os.getpid(), 9)
@@ -152,13 +152,13 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path, monkeypatch
             raise OSError(28, "No space left on device")
         sync(descriptor)
 
-    monkeypatch.setattr(durable.os, "fsync", fsync)
+    monkeypatch.setattr(live_file.os, "fsync", fsync)
     monkeypatch.setattr(shop_recorder, "SYNC_S", 0.02)
     with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
-        recorder.take(KEY + "y/offset", offset(1))
+        recorder.receive(KEY + "y/offset", offset(1))
         while failing[0]:
             pass
-        recorder.take(KEY + "y/offset", offset(2))
+        recorder.receive(KEY + "y/offset", offset(2))
     assert [one[2] for path in recordings(tmp_path) for one in read(path)] == [1, 2]
     assert recorder.not_recorded == 0 and recorder.messages == 2
 
@@ -167,7 +167,7 @@ def test_what_does_not_fit_into_memory_is_counted(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(shop_recorder, "WAITING", 3)
     recorder = ShopRecorder(tmp_path, "shop", Clock())
     for number in range(5):
-        recorder.take(KEY + "y/offset", offset(number))
+        recorder.receive(KEY + "y/offset", offset(number))
     with recorder:
         pass
     assert recorder.not_recorded == 2 and [one[2] for one in read(recordings(tmp_path)[0])] == [2, 3, 4]
@@ -176,7 +176,7 @@ def test_what_does_not_fit_into_memory_is_counted(tmp_path: Path, monkeypatch: p
 
 def test_damage_leaves_the_file_as_it_was(tmp_path: Path) -> None:
     with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
-        recorder.take(KEY + "y/offset", offset(1))
+        recorder.receive(KEY + "y/offset", offset(1))
     path = recordings(tmp_path)[0]
     data = bytearray(path.read_bytes())
     counted: Counter[Any] = Counter()
@@ -197,9 +197,9 @@ def test_one_machine_of_a_shop_becomes_a_table(tmp_path: Path, capsys: pytest.Ca
         for number in range(3):
             time_ns = START_NS + number * 60 * NS
             for name, t_q in (("vmc-07", 31.5), ("vmc-08", 40.0)):
-                recorder.take(f"shop/{name}/thermal/y/offset", offset(number, time_ns))
-                recorder.take(f"shop/{name}/thermal/sample", sample(number, time_ns, t_q=t_q))
-                recorder.take(f"shop/{name}/thermal/estimate", estimate(number, time_ns))
+                recorder.receive(f"shop/{name}/thermal/y/offset", offset(number, time_ns))
+                recorder.receive(f"shop/{name}/thermal/sample", sample(number, time_ns, t_q=t_q))
+                recorder.receive(f"shop/{name}/thermal/estimate", estimate(number, time_ns))
     path, out = recordings(tmp_path)[0], tmp_path / "out.csv"
     assert main(["export", str(path), "--machine", "shop/vmc-08", "--out", str(out)]) == 0
     rows = list(csv.DictReader(out.read_text(encoding="utf-8").splitlines()))

@@ -31,10 +31,10 @@ def filled(*names: str) -> tuple[Shop, Clock]:
         for name in names:
             state, reasons = STATES.get(name, ("ok", []))
             key, t = f"shop/{name}/thermal/", START_NS + i * 60 * NS
-            shop.take(key + "y/offset", offset(i, t, machine=name, state=state, reasons=reasons))
-            shop.take(key + "sample", sample(i, t))
-            shop.take(key + "estimate", estimate(i, t))
-            shop.take(key + "status", status(i, t))
+            shop.receive(key + "y/offset", offset(i, t, machine=name, state=state, reasons=reasons))
+            shop.receive(key + "sample", sample(i, t))
+            shop.receive(key + "estimate", estimate(i, t))
+            shop.receive(key + "status", status(i, t))
         clock.advance(60)
     return shop, clock
 
@@ -43,7 +43,7 @@ def filled(*names: str) -> tuple[Shop, Clock]:
 @pytest.mark.parametrize("names", [("vmc-01", "vmc-02", "vmc-03"), ("vmc-03",)])
 def test_it_fits(width: int, names: tuple[str, ...]) -> None:
     shop, _ = filled(*names)
-    shop.take(f"shop/{names[0]}/thermal/event", event(3, ok=False))
+    shop.receive(f"shop/{names[0]}/thermal/event", event(3, ok=False))
     text = shown(shop, width)
     assert max(len(row.rstrip()) for row in text.splitlines()) <= width
     assert "degraded" in text and "−12.34" in text
@@ -86,7 +86,7 @@ def tokyo(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.usefixtures("tokyo")
 def test_times_are_of_the_viewers_zone_and_lines_for_a_log_of_utc() -> None:
     shop, _ = filled("vmc-02")
-    shop.take("shop/vmc-02/thermal/event", event(3))
+    shop.receive("shop/vmc-02/thermal/event", event(3))
     text = shown(shop, 100)
     # 06:00 UTC, and three minutes later.
     assert "2026-01-05 15:03:00 JST (UTC+09:00)" in text
@@ -100,8 +100,8 @@ def test_the_day_has_every_path_and_the_worst_state_of_each_part() -> None:
     for i in range(3, 60):
         t, key = START_NS + i * 60 * NS, "shop/vmc-01/thermal/"
         held = {"state": "hold", "reasons": ["operator_hold"]} if i in (30, 31) else {}
-        shop.take(key + "y/offset", offset(i, t, machine="vmc-01", **held))
-        shop.take(key + "estimate", estimate(i, t, y_dtf_um=float(i), y_tdtf_um=-float(i)))
+        shop.receive(key + "y/offset", offset(i, t, machine="vmc-01", **held))
+        shop.receive(key + "estimate", estimate(i, t, y_dtf_um=float(i), y_tdtf_um=-float(i)))
         clock.advance(60)
     text = shown(shop, 70)
     rows = {row.split()[1]: row for row in text.splitlines() if row.startswith("│ ") and len(row.split()) > 2}
@@ -119,7 +119,7 @@ def test_a_shop_says_what_to_do_as_far_as_there_is_room() -> None:
     assert "vmc-01 ok:" not in text
     for height in range(8, 24):
         assert len(shown(shop, 100, height=height).splitlines()) <= height
-    assert "What to do" not in shown(shop, 100, height=11)
+    assert "Actions" not in shown(shop, 100, height=11)
 
 
 @pytest.mark.parametrize("height", [30, 60])
@@ -133,7 +133,7 @@ def test_states_of_the_day_are_seen_in_a_terminal_that_is_not_tall(height: int) 
 def test_what_is_no_offset_is_no_number() -> None:
     clock = Clock()
     shop = Shop(clock)
-    shop.take(
+    shop.receive(
         "shop/a/thermal/y/offset",
         offset(
             1,
