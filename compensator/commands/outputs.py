@@ -71,6 +71,21 @@ def checked_folder(path: Path, option: str, *, read: Iterable[Path] = (), names:
     return path
 
 
+def checked_page(path: Path | None) -> Path | None:
+    """Return the path of `--page`, None where it is not given.
+
+    Raises
+    ------
+    UsageError
+        If no page can be written there.
+    """
+    if path is None:
+        return None
+    from compensator.report.formats import checked
+
+    return checked(path, option="--page")
+
+
 def _check_parent(path: Path, option: str) -> None:
     """Refuse a file whose folder is neither there nor can be made."""
     there = path.absolute().parent

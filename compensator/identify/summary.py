@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from compensator.identify.calibration import Calibration
@@ -149,5 +150,16 @@ def _table(calibration: Calibration) -> list[str]:
     rows.append(["folds", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""])
     arx = calibration.arx_rms_um
     rows.append(["ARX, to compare", "fitted", "", "", f"{arx:.2f}" if math.isfinite(arx) else "unstable", "", "", ""])
+    return aligned(rows, left=2)
+
+
+def aligned(rows: Sequence[Sequence[str]], *, left: int) -> list[str]:
+    """Return the lines of a table of text; the first columns stand at the left.
+
+    Examples
+    --------
+    >>> aligned([["data", "h"], ["a", "10"]], left=1)
+    ['data   h', 'a     10']
+    """
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  ".join(f"{c:{'<' if i < 2 else '>'}{widths[i]}}" for i, c in enumerate(row)) for row in rows]
+    return ["  ".join(f"{c:{'<' if i < left else '>'}{widths[i]}}" for i, c in enumerate(row)) for row in rows]

@@ -14,6 +14,9 @@ from compensator.errors import DataError
 from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
 
+#: Columns of a free run in the order of its CSV.
+COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_tdtf_um", "y_std_um")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scores:
@@ -115,12 +118,11 @@ def scores(y: Vector, y_pred: Vector) -> Scores:
     )
 
 
-def csv_rows(columns: dict[str, Vector], names: tuple[str, ...]) -> Iterator[list[str]]:
-    """Yield a header and rows; a missing value is an empty cell, a column that is absent is left out."""
-    present = [name for name in names if name in columns]
-    yield present
+def csv_rows(columns: dict[str, Vector]) -> Iterator[list[str]]:
+    """Yield a header and rows; a missing value is an empty cell."""
+    yield list(columns)
     for i in range(columns["t_s"].size):
-        yield [_shown(columns[name][i]) for name in present]
+        yield [_shown(values[i]) for values in columns.values()]
 
 
 def _shown(value: float) -> str:
