@@ -17,7 +17,7 @@ from compensator import __version__
 from compensator.api.files import ModelLike, as_in_file, model_of, page_in
 from compensator.arrays import Vector
 from compensator.blas import in_one_thread, one_thread
-from compensator.data.measurement import Measurement, measurements, runs_from
+from compensator.data.measurement import Measurement, measurements, runs_in
 from compensator.data.screening import screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.outcome import Diagnosis
@@ -209,7 +209,7 @@ def diagnose(
     """
     base = model_of(model)
     measured = measurements(data, "data", columns)
-    runs, remarks = runs_from(measured, base.period_s)
+    runs, remarks = runs_in(measured, base.period_s)
     screen_temperatures(", ".join(dict.fromkeys(run.name for run in runs)), runs, quiet_air=True)
 
     def executor_map(function: Callable[..., Any], *values: Iterable[Any]) -> Iterable[Any]:

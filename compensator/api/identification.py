@@ -15,7 +15,7 @@ from compensator import __version__
 from compensator.api.files import ModelLike, as_in_file, model_of, page_in
 from compensator.blas import one_thread
 from compensator.data.frames import frame_of
-from compensator.data.measurement import PERIOD_S, Measurement, measurements, runs_from
+from compensator.data.measurement import PERIOD_S, Measurement, measurements, runs_in
 from compensator.data.screening import screen_temperatures
 from compensator.display import html_table
 from compensator.errors import UsageError
@@ -268,7 +268,7 @@ def identify(
     remarks: list[str] = []
     runs = {}
     for role, measured in sources.items():
-        runs[role], corrected = runs_from(measured, PERIOD_S)
+        runs[role], corrected = runs_in(measured, PERIOD_S)
         remarks += corrected
     for run in runs["validation"]:
         screen_temperatures(run.name, [run], quiet_air=True)

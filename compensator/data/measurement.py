@@ -225,7 +225,7 @@ def _origin(path: Path, data: bytes) -> Origin:
     return Origin(name=path.name, sha256=hashlib.sha256(data).hexdigest(), path=path)
 
 
-def runs_from(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[list[Run], list[Caution]]:
+def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[list[Run], list[Caution]]:
     """Return the runs of measurements, and what had to be corrected.
 
     Parameters

@@ -31,7 +31,8 @@ CLASSES = {"Settings": Settings(), "Drift": Drift, "Hypothesis": Hypothesis, "Un
 def constant(room: str, holder: str, name: str) -> Any:
     if holder in CLASSES:
         return getattr(CLASSES[holder], name)
-    for place in (f"compensator.{room}.{holder}", f"compensator.{room}.effects.{holder}", f"compensator.{holder}"):
+    rooms = (room, f"{room}.effects", "data")
+    for place in (*(f"compensator.{where}.{holder}" for where in rooms), f"compensator.{holder}"):
         try:
             return getattr(importlib.import_module(place), name)
         except ModuleNotFoundError:
