@@ -253,11 +253,11 @@ def identify(
     settings = Settings(
         kind=kind,
         method=method,
-        ttf=(ttf[0], ttf[1], ttf[2]),
-        order=(order[0], order[1], order[2]) if order else None,
+        ttf=(int(ttf[0]), int(ttf[1]), int(ttf[2])),
+        order=(int(order[0]), int(order[1]), int(order[2])) if order else None,
         drive=drive,
-        given_tdtf=(tdtf[0], tdtf[1]) if tdtf else None,
-        etve_end_h=etve_end_h,
+        given_tdtf=(float(tdtf[0]), float(tdtf[1])) if tdtf else None,
+        etve_end_h=float(etve_end_h),
         folds=folds,
     )
     sources = {
@@ -315,7 +315,7 @@ def _provenance(
     """Return where a model comes from: every source with its hash, and what was asked for."""
     asked = {name: value for name, value in dataclasses.asdict(settings).items() if value is not None}
     if fit_until_h is not None:
-        asked["fit_until_h"] = fit_until_h
+        asked["fit_until_h"] = float(fit_until_h)
     every = [(role, measured) for role, group in sources.items() for measured in group]
     roles = [*columns.items(), *(pair for _, measured in every for pair in measured.roles.items())]
     asked["columns"] = [f"{role}={name}" for role, name in dict.fromkeys(roles)]
