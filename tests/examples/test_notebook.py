@@ -10,7 +10,9 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.io import savemat
 
+from compensator.cli import main
 from compensator.model.model_file import load_model
 from tests.examples.notebook import run_notebook
 
@@ -95,3 +97,18 @@ def simulated_spindle() -> pd.DataFrame:
     columns |= {f"t{i}_degc": logged(at, 0.05) for i in range(1, 17)}
     columns["t5_degc"] = logged(at + quill.ttf.sampled.response(heat), 0.05)
     return pd.DataFrame(columns).round(4)
+
+
+def test_the_example_for_users_of_matlab_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    table = simulated_spindle().iloc[: 24 * 240 : 4]
+    roles = {"t_s": "t_s", "t_q_degc": "t5_degc", "at_degc": "t16_degc", "y_um": "ch1_um", "spindle_rpm": "spindle_rpm"}
+    savemat("run.mat", {role: table[name].to_numpy()[:, None] for role, name in roles.items()})
+    page = (NOTEBOOK.parent / "MATLAB.md").read_text(encoding="utf-8")
+    exec(page.partition("```python\n")[2].partition("```")[0], {})
+    said = capsys.readouterr().out
+    assert "persistence" in said and "partly_explained" in said and "spindle_rpm" in said
+    assert {path.name for path in tmp_path.iterdir()} >= {"spindle.toml", "report.html", "spindle.png"}
+    assert main(["simulate", "run.mat", "--model", "spindle.toml", "--out", "predicted.csv"]) == 0
