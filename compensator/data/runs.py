@@ -15,6 +15,8 @@ from compensator.reasons import Caution
 WILD_DEVIATIONS = 12.0
 #: Longest stretch at the start of a run that is averaged for its reference, samples.
 REST_SAMPLES = 30
+#: A signal whose standard deviation is less than this times its noise's holds nothing else.
+NOISE_ALONE = 1.5
 #: Shortest stretch between two long gaps that is worth fitting, samples.
 SHORTEST_RUN = 30
 
@@ -109,13 +111,11 @@ def _rest_length(temperatures: Sequence[Vector], heat: Vector | None) -> int:
     size = min(REST_SAMPLES, temperatures[0].size)
     moved = np.zeros(size, dtype=bool)
     for values in temperatures:
-        head = values[:size]
+        head, noise = values[:size], noise_std(values)
         # What has moved by less than the noise of a sample cannot be told from it, and harms less than it helps.
         drift = np.abs(np.cumsum(head) / np.arange(1, size + 1) - np.median(head[:5]))
         drift[:5] = 0.0
-        moved |= (np.abs(head - np.median(head[:5])) > 5.0 * noise_std(values) + 0.01) | (
-            drift > noise_std(values) + 0.005
-        )
+        moved |= (np.abs(head - np.median(head[:5])) > 5.0 * noise + 0.01) | (drift > noise + 0.005)
     if heat is not None:
         moved |= np.abs(heat[:size] - heat[0]) > 1e-9
     return max(1, int(np.argmax(moved)) if moved.any() else size)
@@ -189,6 +189,17 @@ def noise_std(values: Vector) -> float:
     lower = size[: max(1, int(0.9 * size.size))]
     # The mean square over the lower nine tenths of a normal's magnitudes is 0.6107 of its variance.
     return max(typical, float(np.sqrt(np.mean(lower**2) / 0.6107)) if typical == 0.0 else typical)
+
+
+def is_noise(values: Vector) -> bool:
+    """Whether a signal holds nothing but white noise; NaN is left out."""
+    known = values[~np.isnan(values)]
+    return float(np.std(known)) < NOISE_ALONE * noise_std(known)
+
+
+def noise_of(runs: Sequence[Run]) -> dict[str, float]:
+    """Return the noise of `t_q_degc`, `at_degc` and `y_um`, in their units: the largest of all runs."""
+    return {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc", "y_um")}
 
 
 def walk_std(values: Sequence[Vector], noise: float) -> float:

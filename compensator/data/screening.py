@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.data.runs import Run, noise_std
+from compensator.data.runs import Run, is_noise, noise_std
 from compensator.errors import DataError
 
 #: Shortest data that is fitted at all, min.
@@ -30,8 +30,6 @@ DEAD_SAMPLES = 60
 LIVELY_TURNS, LIVELY_STILL = 0.08, 0.05
 #: T_Q − AT that falls with the heat by more than this correlation: the two are exchanged.
 EXCHANGED_CORRELATION = -0.3
-#: A signal whose standard deviation is less than this times its noise's holds nothing else.
-NOISE_ALONE = 1.5
 #: K per W at rest of anything that is a spindle; a thousandfold beyond is a wrong unit.
 HEAT_K_PER_W = (0.0005, 20.0)
 
@@ -218,7 +216,7 @@ def _check_deformation(name: str, y: Vector) -> None:
         )
     if spread > high:
         raise DataError(f"{name}: y_um moves by {spread:.4g} in all: nanometres? expected µm, at most {high:g} of them")
-    if float(np.std(known)) < NOISE_ALONE * noise_std(known):
+    if is_noise(known):
         raise DataError(
             f"{name}: y_um moves by {spread:.3g} µm and its noise alone is {noise_std(known):.2g} µm: "
             "no deformation in it to make a model from"
@@ -250,7 +248,7 @@ def _check_heat(name: str, runs: Sequence[Run]) -> None:
             f"{name}: T_Q - AT falls while heat_w rises: T_Q and AT exchanged? expected T_Q near the heat "
             "source; --column t_q_degc=at_degc --column at_degc=t_q_degc exchanges them"
         )
-    if float(np.std(difference)) < NOISE_ALONE * noise_std(difference):
+    if is_noise(difference):
         raise DataError(
             f"{name}: T_Q - AT moves by {np.ptp(difference):.2g} K while the heat changes by "
             f"{np.ptp(heat):.3g} W: is t_q_degc near the heat source?"

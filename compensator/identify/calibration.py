@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Mask, Vector
-from compensator.data.runs import Run, noise_std, walk_std
+from compensator.data.runs import Run, noise_of, noise_std, walk_std
 from compensator.data.screening import screen
 from compensator.errors import DataError
 from compensator.identify.arx import free_run_rms
@@ -174,6 +174,9 @@ def calibrate(
     used = [_mask(run, fit_until_s) for run in runs]
     if sum(int(mask.sum()) for mask in used) * period_s < 7200.0:
         raise DataError(f"{data}: less than 2 h of samples left for the fit")
+    # A run that begins after the hours of the fit is held out as a whole.
+    later = [run for run, mask in zip(runs, used, strict=True) if not mask.any() and np.isfinite(run.y_um).any()]
+    runs, used = [run for run, mask in zip(runs, used, strict=True) if mask.any()], [m for m in used if m.any()]
     temperature = None
     if kind == "heat":
         temperature = fit_temperature(
@@ -182,11 +185,8 @@ def calibrate(
     drives = [_drive(run, temperature, settings) for run in runs]
     deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
     chosen = next(c for c in deformation.candidates if c.chosen)
-    noise = {
-        "t_q_degc": max(LEAST_NOISE_K, *(noise_std(run.t_q_degc) for run in runs)),
-        "at_degc": max(LEAST_NOISE_K, *(noise_std(run.at_degc) for run in runs)),
-        "y_um": max(noise_std(run.y_um) for run in runs),
-    }
+    noise = noise_of(runs)
+    noise |= {name: max(noise[name], LEAST_NOISE_K) for name in ("t_q_degc", "at_degc")}
     model = ThermalModel(
         name=name,
         kind=kind,
@@ -209,7 +209,7 @@ def calibrate(
         drives=tuple(drives),
         temperature=temperature,
         deformation=deformation,
-        parts=tuple(_parts(model, deformation, runs, used, validation)),
+        parts=tuple(_parts(model, deformation, runs, used, [*later, *validation])),
         folds_rms_um=chosen.rms,
         noise=noise,
         remarks=(*remarks, *fixed, *deformation.remarks),

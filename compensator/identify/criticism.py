@@ -10,7 +10,7 @@ from scipy.signal import freqz
 from scipy.special import gammaincc
 
 from compensator.arrays import ComplexVector, Mask, Vector
-from compensator.data.runs import Run, noise_std
+from compensator.data.runs import Run
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
 from compensator.reasons import Caution
@@ -383,7 +383,7 @@ class _Warnings:
 
     def coloured(self) -> Caution | None:
         main = self.calibration.deformation.main
-        noise = noise_std(np.concatenate([run.y_um for run in self.calibration.runs]))
+        noise = self.calibration.noise["y_um"]
         still = self.residuals[-1]
         known = {name: float(np.max(np.abs(values))) / limit for name, (values, limit) in still.cross.items()}
         largest = max(known, key=lambda name: known[name])
