@@ -1,4 +1,4 @@
-"""Arguments of the commands; apart from them, so that asking for help loads no numbers."""
+"""Arguments of the commands; separate from them, so that `--help` loads no numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ _SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (defaul
 
 
 def _page(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--page", type=Path, metavar="FILE", help="write the page here (too): .html, .pdf, or .png")
+    parser.add_argument(
+        "--page", type=Path, metavar="FILE", help="write the page to this file too: .html, .pdf, or .png"
+    )
 
 
 def demo(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +35,7 @@ def of_service(parser: argparse.ArgumentParser) -> None:
 def simulate(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `simulate`."""
     add = parser.add_argument
-    add("data", type=Path, metavar="DATA", help="CSV, or a recording")
+    add("data", type=Path, metavar="DATA", help="CSV, MAT, or a recording")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="CSV")
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
@@ -65,18 +67,18 @@ def explain(parser: argparse.ArgumentParser) -> None:
 def identify(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `identify`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
-    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html comes beside it")
+    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, MAT, or recordings; one or several")
+    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html goes into its folder")
     _page(parser)
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
     add("--name", help="name of the model (default: that of the file)")
-    words = "with a TTF, or from T_Q - AT straight to y (default: with one where heat_w is known)"
+    words = "with a TTF, or from T_Q - AT to y (default: with a TTF where heat_w is known)"
     add("--kind", choices=("auto", "heat", "direct"), default="auto", help=words)
-    words = "TDTF given (I), from a whole ETVE (II), from its end (III), at once with the DTF (IV, the default)"
+    words = "TDTF given (I), from a whole ETVE (II), from its end (III), together with the DTF (IV, the default)"
     add("--method", choices=("I", "II", "III", "IV"), default="IV", help=words)
     words = "method I: gain and time constant of the first-order TDTF"
     add("--tdtf", type=float, nargs=2, metavar=("UM_PER_K", "MIN"), help=words)
-    words = "methods II and III: a run without any heat source"
+    words = "methods II and III: a run without heat source; may be repeated"
     add("--etve", type=Path, action="append", default=[], metavar="DATA", help=words)
     add("--etve-end-h", type=float, default=6.0, metavar="H", help="method III: length of the end, h (6)")
     add("--ttf", type=int, nargs=3, default=(2, 2, 0), metavar=("NB", "NF", "NK"), help="structure of the TTF (2 2 0)")
@@ -84,19 +86,19 @@ def identify(parser: argparse.ArgumentParser) -> None:
     add("--order", type=int, nargs=3, metavar=("NF", "NB_DTF", "NB_TDTF"), help=words)
     words = "heat that the DTF is fitted with: from T_Q as in the service (default), or the known one"
     add("--drive", choices=("ttf", "known"), default="ttf", help=words)
-    add("--folds", type=int, default=5, help="blocks of time held out in turn (5)")
-    add("--fit-until", type=float, metavar="H", help="fit up to this hour, judge on the rest")
-    words = "a run that only judges; may be repeated"
+    add("--folds", type=int, default=5, help="held-out blocks of time (5)")
+    add("--fit-until", type=float, metavar="H", help="fit up to this hour; the rest is held out")
+    words = "a run for validation only; may be repeated"
     add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
-    add("--reference", metavar="MODEL", help="another model to put the coefficients beside")
+    add("--reference", metavar="MODEL", help="another model to compare the coefficients with")
 
 
 def diagnose(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `diagnose`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
+    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, MAT, or recordings; one or several")
     add("--model", required=True, help="a model file, or quill")
-    add("--out", type=Path, required=True, metavar="DIR", help="diagnosis.json, model.toml and report.html come there")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
     _page(parser)
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
@@ -118,7 +120,7 @@ def report(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     words = "recordings, a folder of them, or a folder that demo, identify or diagnose made"
     add("what", type=Path, nargs="+", metavar="DIR_OR_FILE", help=words)
-    words = "the page: .html, .pdf, or .png for its first picture (default: NAME-report.html here)"
+    words = "the page: .html, .pdf, or .png for its first picture (default: NAME-report.html in this folder)"
     add("--out", type=Path, metavar="FILE", help=words)
 
 
@@ -150,7 +152,7 @@ def order(parser: argparse.ArgumentParser) -> None:
 def zero(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `zero`."""
     order(parser)
-    words = "rest: the machine is at rest; warm: it is not; auto (the default): the service judges"
+    words = "rest: the machine is at rest; warm: it is not; auto (the default): the service decides"
     parser.add_argument("--mode", choices=("auto", "rest", "warm"), default="auto", help=words)
 
 

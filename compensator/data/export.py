@@ -20,10 +20,10 @@ _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state"
 
 
 def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
-    """Write recordings of one machine as one CSV, in the order of their samples.
+    """Write the recordings of one machine as one CSV, in the order of their samples.
 
     Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
-    offset, its state and reasons. `heat_w` is the estimate; a measured heat stands in `heat_measured_w`.
+    offset, its state and reasons. `heat_w` is the estimate; a measured heat is in `heat_measured_w`.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
     out : pathlib.Path
         The CSV.
     machine : str
-        Of a shop's recording: prefix of the machine, such as `shop/vmc-07`.
+        Prefix of the machine, such as `shop/vmc-07`, in a shop's recording.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
 
 
 def _without_samples(recording: Path, machine: str, *, alone: bool) -> DataError:
-    """Return what is wrong with a file that gave no row; one that was given twice gives none the second time."""
+    """Return the error of a file without a new row; a file given twice has none the second time."""
     machines = machines_in(recording)
     if machines:
         words = f"of {machine or 'one machine'} in it; a shop's recording, expected --machine"
@@ -88,7 +88,7 @@ def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:
     }
     if isinstance(message, Sample):
         for name, channel in message.channels.items():
-            # A mean that the guards refused is no value for a table; the quality says why it is missing.
+            # A mean that the guards refused is missing from the table; the quality says why.
             cells["heat_measured_w" if name == "heat_w" else name] = channel.mean if channel.quality == "good" else None
             cells[f"{name}_quality"] = channel.quality
         return cells

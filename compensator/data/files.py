@@ -26,7 +26,7 @@ _OTHER_FILES = (
     (b"\xff\xfe", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
     (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
 )
-#: What helps with everything that MATLAB writes and nobody else reads.
+#: How to save what only MATLAB can read.
 _AS_CSV = "in MATLAB, writetable(T, 'run.csv') saves a table T as CSV"
 
 

@@ -38,7 +38,7 @@ class Data:
     records : tuple of Record
         In order of time; a long gap starts a new one.
     remarks : tuple of Caution
-        What had to be corrected: gaps, rows out of order.
+        Corrections: gaps, rows out of order.
     """
 
     records: tuple[Record, ...]

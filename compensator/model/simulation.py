@@ -1,4 +1,4 @@
-"""Runs a model over measured data, free of any measured deformation."""
+"""A model in free run over measured data: measured deformation is never fed back."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_t
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scores:
-    """How well a prediction follows a measurement.
+    """Errors of a prediction.
 
     Parameters
     ----------
@@ -38,13 +38,12 @@ class Scores:
 def simulate(model: ThermalModel, record: Record, *, source: str = "") -> dict[str, Vector]:
     """Run a model over a record.
 
-    The first sample with both temperatures is the reference; the deformation, where it was measured, counts
-    from its own value there.
+    The first sample with both temperatures is the reference; measured deformation counts from its first value.
 
     Parameters
     ----------
     model : ThermalModel
-        What to run.
+        The model.
     record : Record
         Needs `t_q_degc` and `at_degc`.
     source : str
