@@ -64,7 +64,7 @@ def good():
 @pytest.mark.parametrize(
     "words",
     [
-        "ambient moved",
+        "ambient changed",
         "poorly determined",
         "longest record",
         "outside the unit circle",
@@ -74,7 +74,7 @@ def good():
         "slower than the record",
         "coincide",
         "reverses",
-        "noise in the heat",
+        "of noise in a heat",
     ],
 )
 def test_a_good_calibration_is_not_blamed(good, words):
