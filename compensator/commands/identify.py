@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from compensator.api.identification import IdentificationResult, identify
+from compensator.api.identification import identify
+from compensator.api.identification_result import IdentificationResult
 from compensator.commands import Answer
 from compensator.commands.outputs import checked_file, checked_page
 from compensator.commands.progress import progress_bar

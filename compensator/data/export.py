@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,11 +16,13 @@ from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Sample
 from compensator.recording.reading import decode, machines_in, read_messages
 
+PathLike = str | os.PathLike[str]
+
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
 
 
-def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
+def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: str = "") -> int:
     """Write the recordings of one machine as one CSV, in the order of their samples.
 
     Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
@@ -27,9 +30,9 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
 
     Parameters
     ----------
-    recordings : sequence of pathlib.Path
+    recordings : path or sequence of paths
         The MCAP files, in any order.
-    out : pathlib.Path
+    out : path
         The CSV.
     machine : str
         Prefix of the machine, such as `shop/vmc-07`, in a shop's recording.
@@ -44,9 +47,10 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
     DataError
         If one is no recording or has no samples, or they are of several machines.
     """
+    paths = [Path(recordings)] if isinstance(recordings, (str, os.PathLike)) else [Path(path) for path in recordings]
     rows: dict[int, dict[str, Any]] = {}
     machines: dict[str, Path] = {}
-    for recording in recordings:
+    for recording in paths:
         before = len(rows)
         for record in read_messages(recording, ("sample", "estimate", "offset"), prefix=machine):
             message = decode(record, recording)
@@ -54,7 +58,7 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
             machines.setdefault(message.machine, recording)
             rows.setdefault(message.seq, {}).update(_cells(message))
         if len(rows) == before:
-            raise _without_samples(recording, machine, alone=len(recordings) == 1)
+            raise _without_samples(recording, machine, alone=len(paths) == 1)
     if len(machines) > 1:
         (one, first), (other, second) = list(machines.items())[:2]
         raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
@@ -64,7 +68,7 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
         row["t_s"] = (row.pop("_ns") - start) / 1e9
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     names.sort(key=lambda name: ("time_utc", "t_s", "seq").index(name) if name in ("time_utc", "t_s", "seq") else 3)
-    with whole_file(out) as file:
+    with whole_file(Path(out)) as file:
         writer = csv.DictWriter(file, names, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows.values())

@@ -203,6 +203,7 @@ def test_recordings_and_export(tmp_path: Path) -> None:
     printed, _ = command("export", *recordings, "--out", tmp_path / "command.csv")
     assert tc.export(recordings, tmp_path / "verb.csv") == printed["samples"] == 30
     assert (tmp_path / "verb.csv").read_bytes() == (tmp_path / "command.csv").read_bytes()
+    assert tc.export(str(recordings[0]), str(tmp_path / "one.csv")) == 20
     simulated = tc.simulate("quill", tc.read(recordings))
     assert simulated["t_s"].size == 30
     for data in (recordings[::-1], tmp_path / "verb.csv", frame_of_text(tmp_path / "verb.csv")):
