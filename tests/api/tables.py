@@ -14,8 +14,8 @@ from tests.identify.quill_runs import published
 START = pd.Timestamp("2026-03-28T22:00:00Z")
 
 
-def write_run(path: Path, heat_w: np.ndarray, seed: int) -> Path:
-    """Write a run of the published machine with known heat."""
+def write_run(path: Path, heat_w: np.ndarray, seed: int, **changes: np.ndarray) -> Path:
+    """Write a run of the published machine with known heat; columns may be changed."""
     heat, ambient, difference, y, _, _ = published(heat_w, seed)
     at = 21.0 + ambient
     columns = {
@@ -25,7 +25,7 @@ def write_run(path: Path, heat_w: np.ndarray, seed: int) -> Path:
         "y_um": y,
         "heat_w": heat,
     }
-    write_table(path, columns)
+    write_table(path, columns | changes)
     return path
 
 
