@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, NoReturn
 
 from compensator import __version__
+from compensator.blas import one_thread_from_start
 from compensator.commands import Answer, arguments
 from compensator.errors import CompensatorError
 from drivers.errors import DriverError
@@ -106,6 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments without the program's name; `sys.argv` where none are given.
     """
+    one_thread_from_start()
     given = _parser().parse_args(argv)
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s", force=True)
     try:

@@ -7,6 +7,11 @@ from collections.abc import Iterator
 
 import pytest
 
+from compensator.blas import one_thread_from_start
+
+# As the commands do, before a test loads numpy: the two processes of a test run share the cores.
+one_thread_from_start()
+
 
 @pytest.fixture(autouse=True)
 def _no_handler_is_left() -> Iterator[None]:

@@ -6,14 +6,14 @@ from typing import Any, NamedTuple
 
 
 class Answer(NamedTuple):
-    """What a command answers.
+    """Result of a command.
 
     Parameters
     ----------
     result : dict
         For `--json`.
     text : str
-        For people.
+        Text for people.
     code : int
         Exit code: 0 done, 1 failed, 3 an audit found a difference.
     """

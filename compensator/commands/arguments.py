@@ -45,7 +45,7 @@ check = probe = run
 def simulate(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `simulate`."""
     add = parser.add_argument
-    add("data", type=Path, metavar="DATA", help="CSV, or a recording")
+    add("data", type=Path, metavar="DATA", help="CSV, MAT, or a recording")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="CSV")
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
@@ -77,7 +77,7 @@ def explain(parser: argparse.ArgumentParser) -> None:
 def identify(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `identify`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
+    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, MAT, or recordings; one or several")
     add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html is written next to it")
     _page(parser)
     add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
@@ -95,7 +95,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     add("--method", choices=("I", "II", "III", "IV"), default="IV", help=words)
     words = "method I: gain and time constant of the first-order TDTF"
     add("--tdtf", type=float, nargs=2, metavar=("UM_PER_K", "MIN"), help=words)
-    words = "methods II and III: a run without any heat source"
+    words = "methods II and III: a run without heat source; may be repeated"
     add("--etve", type=Path, action="append", default=[], metavar="DATA", help=words)
     add("--etve-end-h", type=float, default=6.0, metavar="H", help="method III: length of the end, h (6)")
     add = parser.add_argument_group("validation").add_argument
@@ -109,7 +109,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
 def diagnose(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `diagnose`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, or a recording; one or several")
+    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, MAT, or recordings; one or several")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
     _page(parser)

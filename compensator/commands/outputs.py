@@ -1,6 +1,6 @@
-"""Where results go, looked at before any work is done: minutes of fitting must not end in a slip of the pen.
+"""Paths of results, checked before any work: minutes of fitting must not end in a mistyped name.
 
-What was read is never written over: a recording is evidence, and a table that somebody measured cannot be made again.
+Files that are read are never overwritten: a recording is evidence, and a measured table cannot be made again.
 """
 
 from __future__ import annotations
@@ -11,33 +11,33 @@ from pathlib import Path
 
 from compensator.errors import UsageError
 
-#: Endings of files that somebody might name here by mistake.
+#: Endings that are probably mistakes.
 _ENDINGS = {".csv", ".html", ".json", ".mcap", ".pdf", ".png", ".toml", ".xlsx"}
 
 
 def checked_file(path: Path, option: str, *, read: Iterable[Path] = (), ending: str) -> Path:
-    """Return the path of a file that is to be written.
+    """Return the path of a file to be written.
 
     Parameters
     ----------
     path : pathlib.Path
-        Where it is to go.
+        The file.
     option : str
-        What gave it, such as `--out`.
+        Option that named it, such as `--out`.
     read : iterable of pathlib.Path
         Files that the command reads.
     ending : str
-        How names of such files end, `.csv` or `.toml`; another of the project's own is refused.
+        Ending of such files, `.csv` or `.toml`; other known endings are refused.
 
     Raises
     ------
     UsageError
-        If it is a folder, one of the files that are read, of another kind by its name, or cannot be written.
+        If it is a folder, is read by the command, has another ending, or cannot be written.
     """
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder, expected the name of a file in it")
     if path.resolve() in {one.resolve() for one in read}:
-        raise UsageError(f"{option} {path}: is read by this command, expected another name; it would be written over")
+        raise UsageError(f"{option} {path}: is read by this command and would be written over, expected another name")
     if path.suffix.lower() in _ENDINGS - {ending}:
         raise UsageError(f"{option} {path}: expected a name that ends in {ending}")
     _check_parent(path, option)
@@ -47,19 +47,19 @@ def checked_file(path: Path, option: str, *, read: Iterable[Path] = (), ending: 
 
 
 def checked_folder(path: Path, option: str, *, read: Iterable[Path] = (), names: Iterable[str] = ()) -> Path:
-    """Return the path of a folder that is to be written to; it need not be there.
+    """Return the path of a folder for results; it need not exist.
 
     Parameters
     ----------
     path, option, read
         As :func:`checked_file`.
     names : iterable of str
-        Files that are written in it.
+        Files that will be written there.
 
     Raises
     ------
     UsageError
-        If it is a file, cannot be written, or a file in it is one of those that are read.
+        If it is a file, cannot be written, or contains a file that is read.
     """
     if path.exists() and not path.is_dir():
         raise UsageError(f"{option} {path}: is a file, expected a folder")
@@ -71,8 +71,23 @@ def checked_folder(path: Path, option: str, *, read: Iterable[Path] = (), names:
     return path
 
 
+def checked_page(path: Path | None) -> Path | None:
+    """Return the path of `--page`, None where it is not given.
+
+    Raises
+    ------
+    UsageError
+        If no page can be written there.
+    """
+    if path is None:
+        return None
+    from compensator.report.formats import checked
+
+    return checked(path, option="--page")
+
+
 def _check_parent(path: Path, option: str) -> None:
-    """Refuse a file whose folder is neither there nor can be made."""
+    """Refuse a file whose folder does not exist and cannot be made."""
     there = path.absolute().parent
     while not there.exists():
         there = there.parent

@@ -1,4 +1,4 @@
-"""Who does the work of a large command: this process, one for each core, or a Dask cluster."""
+"""Workers of a large command: this process, one process for each core, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from contextlib import contextmanager
 from compensator import __version__
 from compensator.errors import ServiceError, UsageError
 
-#: How long a scheduler is waited for, s.
+#: Time to wait for a scheduler, s.
 SCHEDULER_S = 10.0
 
 
 @contextmanager
 def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
-    """Yield what the jobs are handed to, None where this process does them itself.
+    """Yield an executor, None where this process does the work.
 
     Parameters
     ----------
     jobs : int
-        How many can be done at once; 1 or less where it is not worth starting a process.
+        Number of jobs that can run in parallel; at most 1 where a process is not worth its start.
     scheduler : str or None
-        Address of a Dask scheduler, such as `tcp://127.0.0.1:8786`. Files are named to the workers, not sent: they must
-        find them under the same path.
+        Address of a Dask scheduler, such as `tcp://127.0.0.1:8786`. Workers get the paths of files, not
+        their content.
 
     Raises
     ------
     ServiceError
-        If the scheduler does not answer, has no workers, or these run another version.
+        If the scheduler does not answer, or its workers are missing or of another version.
     UsageError
         If Dask is not installed, or the address is none.
     """
@@ -42,7 +42,7 @@ def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
     if count < 2:
         yield None
         return
-    # A fresh interpreter for each: whatever threads this one has, none of them is copied.
+    # A fresh interpreter for each: threads of this one are not copied.
     with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             yield pool
@@ -75,7 +75,7 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
 
 
 def _version() -> str:
-    """Return the version that a worker runs, or that there is none."""
+    """Return the version that a worker runs."""
     try:
         from compensator import __version__ as version
     except ImportError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,24 +16,26 @@ from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Sample
 from compensator.recording.reading import decode, machines_in, read_messages
 
+PathLike = str | os.PathLike[str]
+
 _ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
 
 
-def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
-    """Write recordings of one machine as one CSV, in the order of their samples.
+def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: str = "") -> int:
+    """Write the recordings of one machine as one CSV, in the order of their samples.
 
     Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
-    offset, its state and reasons. `heat_w` is the estimate; a measured heat stands in `heat_measured_w`.
+    offset, its state and reasons. `heat_w` is the estimate; a measured heat is in `heat_measured_w`.
 
     Parameters
     ----------
-    recordings : sequence of pathlib.Path
+    recordings : path or sequence of paths
         The MCAP files, in any order.
-    out : pathlib.Path
+    out : path
         The CSV.
     machine : str
-        Of a shop's recording: prefix of the machine, such as `shop/vmc-07`.
+        Prefix of the machine, such as `shop/vmc-07`, in a shop's recording.
 
     Returns
     -------
@@ -44,9 +47,10 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
     DataError
         If one is no recording or has no samples, or they are of several machines.
     """
+    paths = [Path(recordings)] if isinstance(recordings, (str, os.PathLike)) else [Path(path) for path in recordings]
     rows: dict[int, dict[str, Any]] = {}
     machines: dict[str, Path] = {}
-    for recording in recordings:
+    for recording in paths:
         before = len(rows)
         for record in read_messages(recording, ("sample", "estimate", "offset"), prefix=machine):
             message = decode(record, recording)
@@ -54,7 +58,7 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
             machines.setdefault(message.machine, recording)
             rows.setdefault(message.seq, {}).update(_cells(message))
         if len(rows) == before:
-            raise _without_samples(recording, machine, alone=len(recordings) == 1)
+            raise _without_samples(recording, machine, alone=len(paths) == 1)
     if len(machines) > 1:
         (one, first), (other, second) = list(machines.items())[:2]
         raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
@@ -64,7 +68,7 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
         row["t_s"] = (row.pop("_ns") - start) / 1e9
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     names.sort(key=lambda name: ("time_utc", "t_s", "seq").index(name) if name in ("time_utc", "t_s", "seq") else 3)
-    with whole_file(out) as file:
+    with whole_file(Path(out)) as file:
         writer = csv.DictWriter(file, names, restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows.values())
@@ -72,7 +76,7 @@ def export(recordings: Sequence[Path], out: Path, machine: str = "") -> int:
 
 
 def _without_samples(recording: Path, machine: str, *, alone: bool) -> DataError:
-    """Return what is wrong with a file that gave no row; one that was given twice gives none the second time."""
+    """Return the error of a file without a new row; a file given twice has none the second time."""
     machines = machines_in(recording)
     if machines:
         words = f"of {machine or 'one machine'} in it; a shop's recording, expected --machine"
@@ -88,7 +92,7 @@ def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:
     }
     if isinstance(message, Sample):
         for name, channel in message.channels.items():
-            # A mean that the guards refused is no value for a table; the quality says why it is missing.
+            # A mean that the guards refused is missing from the table; the quality says why.
             cells["heat_measured_w" if name == "heat_w" else name] = channel.mean if channel.quality == "good" else None
             cells[f"{name}_quality"] = channel.quality
         return cells

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from compensator.arrays import Vector
 from compensator.errors import DataError
@@ -39,23 +38,23 @@ class Data:
     records : tuple of Record
         In order of time; a long gap starts a new one.
     remarks : tuple of Caution
-        What had to be put right: gaps, rows out of order.
+        Corrections: gaps, rows out of order.
     """
 
     records: tuple[Record, ...]
     remarks: tuple[Caution, ...]
 
 
-def require(path: Path, record: Record, names: Sequence[str]) -> None:
+def require(name: str, record: Record, columns: Sequence[str]) -> None:
     """Refuse a record that lacks a column.
 
     Raises
     ------
     DataError
-        Naming file and column.
+        Naming data and column.
     """
-    for name in names:
-        if name not in record.columns:
+    for column in columns:
+        if column not in record.columns:
             raise DataError(
-                f"{path}: no column {name}; it has: {', '.join(record.columns)}. Name it with --column {name}=NAME"
+                f"{name}: no column {column}; it has: {', '.join(record.columns)}. Name it with --column {column}=NAME"
             )

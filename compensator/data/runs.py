@@ -1,4 +1,4 @@
-"""Measured runs as the fits want them: changes from the start, no gaps, no wild single readings."""
+"""Measured runs for the fits: changes from the start, no gaps, no outliers."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from compensator.arrays import Mask, Vector
 from compensator.data.record import SHORT_GAP_SAMPLES, Record
 from compensator.reasons import Caution
 
-#: A single reading further from the median of its neighbours than this many noise deviations is wild.
+#: A single reading this many noise deviations away from both neighbours is an outlier.
 WILD_DEVIATIONS = 12.0
-#: Longest stretch at the start of a run that is averaged for its reference, samples.
+#: Longest stretch at the start of a run whose mean is its reference, samples.
 REST_SAMPLES = 30
-#: Shortest stretch between two long gaps that is worth fitting, samples.
+#: A signal whose standard deviation is less than this times its noise's holds nothing else.
+NOISE_ALONE = 1.5
+#: Shortest stretch between two long gaps that makes a run, samples.
 SHORTEST_RUN = 30
 
 
@@ -26,7 +28,7 @@ class Run:
     Parameters
     ----------
     name : str
-        File, and the part of it where a long gap split it.
+        Name of the data, and its part where a long gap split it.
     t_s : numpy.ndarray, shape (n,)
         Time, s.
     difference_k, ambient_k : numpy.ndarray, shape (n,)
@@ -62,7 +64,7 @@ class Run:
 
 
 def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Caution, ...]]]:
-    """Yield the runs of a record with remarks on what was put right.
+    """Yield the runs of a record with remarks on its corrections.
 
     Parameters
     ----------
@@ -75,7 +77,7 @@ def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Caution, ...
     for column, values in record.columns.items():
         cleaned, wild = without_wild(values) if column != "heat_w" else (values, 0)
         if wild and column in ("t_q_degc", "at_degc", "y_um"):
-            remarks.append(Caution("wild_readings", f"{name}: {column}: {wild} wild single reading(s) left out."))
+            remarks.append(Caution("wild_readings", f"{name}: {column}: {wild} outlier(s) left out."))
         columns[column] = cleaned
     inputs = ["t_q_degc", "at_degc", *(["heat_w"] if "heat_w" in columns else [])]
     missing = np.any([np.isnan(columns[c]) for c in inputs], axis=0)
@@ -105,24 +107,22 @@ def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:
 
 
 def _rest_length(temperatures: Sequence[Vector], heat: Vector | None) -> int:
-    """Return how many samples at the start show nothing but noise: their mean is a better zero than one sample."""
+    """Return how many samples at the start show only noise: their mean is a better zero than one sample."""
     size = min(REST_SAMPLES, temperatures[0].size)
     moved = np.zeros(size, dtype=bool)
     for values in temperatures:
-        head = values[:size]
-        # What has moved by less than the noise of a sample cannot be told from it, and harms less than it helps.
+        head, noise = values[:size], noise_std(values)
+        # A drift below the noise of one sample cannot be distinguished from it, and costs less than the mean gains.
         drift = np.abs(np.cumsum(head) / np.arange(1, size + 1) - np.median(head[:5]))
         drift[:5] = 0.0
-        moved |= (np.abs(head - np.median(head[:5])) > 5.0 * noise_std(values) + 0.01) | (
-            drift > noise_std(values) + 0.005
-        )
+        moved |= (np.abs(head - np.median(head[:5])) > 5.0 * noise + 0.01) | (drift > noise + 0.005)
     if heat is not None:
         moved |= np.abs(heat[:size] - heat[0]) > 1e-9
     return max(1, int(np.argmax(moved)) if moved.any() else size)
 
 
 def _stretches(missing: Mask) -> Iterator[tuple[int, int]]:
-    """Yield the stretches between long gaps; ends that are missing are cut off."""
+    """Yield the stretches between long gaps, without missing ends."""
     present = np.flatnonzero(~missing)
     if present.size == 0:
         return
@@ -140,9 +140,9 @@ def _bridged(values: Vector) -> Vector:
 
 
 def without_wild(values: Vector) -> tuple[Vector, int]:
-    """Replace single readings far outside their neighbours by NaN.
+    """Replace outliers, single readings far from both neighbours, by NaN.
 
-    A real jump stays: only a sample that stands apart from both sides of it is wild.
+    A step stays: its samples are near one of their neighbours.
 
     Examples
     --------
@@ -155,7 +155,7 @@ def without_wild(values: Vector) -> tuple[Vector, int]:
     v = values[known]
     if v.size < 7:
         return values, 0
-    # A fast signal turns round within a sample, too: what it does in one of twenty steps is not wild.
+    # A fast signal reverses within a sample, too: what it does in one of twenty steps is no outlier.
     limit = WILD_DEVIATIONS * noise_std(v) + 3.0 * float(np.quantile(np.abs(np.diff(v)), 0.95)) + 1e-9
     before, after = v[1:-1] - v[:-2], v[1:-1] - v[2:]
     across = np.abs(v[2:] - v[:-2])
@@ -172,8 +172,8 @@ def without_wild(values: Vector) -> tuple[Vector, int]:
 def noise_std(values: Vector) -> float:
     """Return the standard deviation of white noise on a slow signal, by third differences.
 
-    The median keeps steps and wild readings out of it. A signal that moves in converter steps has many
-    differences of zero; the mean over the lower nine tenths then serves instead.
+    The median is insensitive to steps and outliers. A signal in converter steps has many differences of zero; the mean
+    square of the lower nine tenths is used then.
 
     Examples
     --------
@@ -191,7 +191,18 @@ def noise_std(values: Vector) -> float:
     return max(typical, float(np.sqrt(np.mean(lower**2) / 0.6107)) if typical == 0.0 else typical)
 
 
+def is_noise(values: Vector) -> bool:
+    """Whether a signal holds nothing but white noise; NaN is left out."""
+    known = values[~np.isnan(values)]
+    return float(np.std(known)) < NOISE_ALONE * noise_std(known)
+
+
+def noise_of(runs: Sequence[Run]) -> dict[str, float]:
+    """Return the noise of `t_q_degc`, `at_degc` and `y_um`, in their units: the largest of all runs."""
+    return {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc", "y_um")}
+
+
 def walk_std(values: Sequence[Vector], noise: float) -> float:
-    """Return the standard deviation of the change in one sample, the sensor's noise taken off."""
+    """Return the standard deviation of the change per sample, less the sensor's noise."""
     changes = np.concatenate([np.diff(v) for v in values])
     return float(np.sqrt(max(float(np.mean(changes**2)) - 2.0 * noise**2, 0.0))) if changes.size else 0.0

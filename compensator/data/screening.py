@@ -1,4 +1,4 @@
-"""Refuses data that no model can come from, with one line that says why."""
+"""Refuses data that allows no model, with the reason in one line."""
 
 from __future__ import annotations
 
@@ -7,32 +7,30 @@ from collections.abc import Sequence
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.data.runs import Run, noise_std
+from compensator.data.runs import Run, is_noise, noise_std
 from compensator.errors import DataError
 
-#: Shortest data that is fitted at all, min.
+#: Shortest data for a fit, min.
 SHORTEST_MIN = 120.0
 #: Share of samples of a column that may be missing.
 MISSING_SHARE = 0.5
-#: A shop's air above this is Fahrenheit, kelvin or a wrong scale, °C.
+#: Air in a shop above this is °F, kelvin or a wrong scale, °C.
 HOTTEST_AIR_DEGC = 50.0
-#: A machine's temperature lies in here, °C.
+#: Range of a machine's temperatures, °C.
 MACHINE_DEGC = (-30.0, 150.0)
-#: Deformations of a machine tool's spindle lie in here, peak to peak, µm.
+#: Range of a spindle's deformation, peak to peak, µm.
 DEFORMATION_UM = (0.5, 3000.0)
-#: A machine's temperatures in kelvin lie in here.
+#: Range of a machine's temperatures in kelvin.
 KELVIN = (250.0, 420.0)
-#: Beyond these no thermocouple at a machine shows a temperature, °C.
+#: Range of what can be a temperature at all, °C.
 POSSIBLE_DEGC = (-273.15, 1500.0)
-#: Shortest stretch of one and the same value by which a sensor that is never still otherwise counts as dead, samples.
+#: Shortest constant stretch of a dead sensor that is noisy otherwise, samples.
 DEAD_SAMPLES = 60
-#: Share of its steps that such a sensor's noise turns round, and share in which its value stays, outside the stretch.
+#: Outside the stretch: share of steps at which its noise reverses, and share of steps of zero.
 LIVELY_TURNS, LIVELY_STILL = 0.08, 0.05
-#: T_Q − AT that falls with the heat by more than this correlation: the two are exchanged.
+#: Correlation of T_Q − AT with the heat below which the two are exchanged.
 EXCHANGED_CORRELATION = -0.3
-#: A signal whose standard deviation is less than this times its noise's holds nothing else.
-NOISE_ALONE = 1.5
-#: K per W at rest of anything that is a spindle; a thousandfold beyond is a wrong unit.
+#: K per W of a spindle at rest; far outside, the unit is wrong.
 HEAT_K_PER_W = (0.0005, 20.0)
 
 
@@ -44,16 +42,16 @@ def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool,
     name : str
         File or files, for the message.
     runs : sequence of Run
-        What they hold.
+        The data.
     period_s : float
         Sample period, s.
     needs_heat, needs_y : bool
-        Whether a model with a TTF is wanted; whether a deformation is needed.
+        Whether known heat is needed for a TTF; whether a deformation is needed.
 
     Raises
     ------
     DataError
-        Too short, a dead or missing sensor, an input that never moves, units that cannot be right.
+        If it is too short, a sensor is dead or missing, an input never changes, or a unit is wrong.
     """
     minutes = sum(run.t_s.size for run in runs) * period_s / 60.0
     if minutes < SHORTEST_MIN:
@@ -71,21 +69,21 @@ def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool,
 
 
 def screen_temperatures(name: str, runs: Sequence[Run], *, quiet_air: bool = False) -> None:
-    """Refuse temperatures that cannot be right.
+    """Refuse temperatures that cannot be true.
 
     Parameters
     ----------
     name : str
         File or files, for the message.
     runs : sequence of Run
-        What they hold.
+        The data.
     quiet_air : bool
-        Whether an ambient that never moves is let pass: nothing is fitted to it.
+        Whether a constant ambient is accepted: nothing is fitted to it.
 
     Raises
     ------
     DataError
-        A dead sensor, fault codes among the values, another unit, or one sensor twice.
+        If a sensor is dead or given twice, values are codes of faults, or a unit is wrong.
     """
     columns = {"t_q_degc": [run.t_q_degc for run in runs], "at_degc": [run.at_degc for run in runs]}
     for column, parts in columns.items():
@@ -98,7 +96,7 @@ def screen_temperatures(name: str, runs: Sequence[Run], *, quiet_air: bool = Fal
 
 
 def check_scale(name: str, column: str, values: Vector) -> None:
-    """Refuse a temperature in kelvin, and the code of a fault among temperatures.
+    """Refuse temperatures in kelvin, and codes of faults among temperatures.
 
     Parameters
     ----------
@@ -124,7 +122,7 @@ def check_scale(name: str, column: str, values: Vector) -> None:
 
 
 def _check_possible(run: Run, column: str, values: Vector) -> None:
-    """Refuse numbers that stand for a fault, such as −9999, among temperatures."""
+    """Refuse codes of faults, such as −9999, among temperatures."""
     low, high = POSSIBLE_DEGC
     wrong = (values < low) | (values > high)
     if wrong.any() and wrong.mean() < MISSING_SHARE:
@@ -136,7 +134,7 @@ def _check_possible(run: Run, column: str, values: Vector) -> None:
 
 
 def _check_alive(run: Run, column: str, values: Vector) -> None:
-    """Refuse a sensor that shows noise in every sample and then one and the same value for an hour and more."""
+    """Refuse a sensor that is noisy and then constant for an hour or more."""
     steps = np.diff(values)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], (steps == 0.0).astype(int), [0]))))
     if edges.size == 0:
@@ -146,14 +144,14 @@ def _check_alive(run: Run, column: str, values: Vector) -> None:
     first, last = int(starts[longest]), int(ends[longest])
     others = np.concatenate((steps[:first], steps[last:]))
     others = others[np.isfinite(others)]
-    # A rest before anything happens is the same in every sample where the data comes from a calculation.
+    # Computed data is constant at rest before its start.
     if first == 0 or last - first < DEAD_SAMPLES or others.size < DEAD_SAMPLES:
         return
     turns = float(np.mean(others[1:] * others[:-1] < 0.0))
     if turns > LIVELY_TURNS and float(np.mean(others == 0.0)) < LIVELY_STILL:
         raise DataError(
             f"{run.name}: {column} = {values[first]:g} in every sample from t_s = {run.t_s[first]:g} to "
-            f"{run.t_s[last]:g}, and never still otherwise: a dead sensor? leave its cells empty there"
+            f"{run.t_s[last]:g}, and noisy otherwise: a dead sensor? leave its cells empty there"
         )
 
 
@@ -188,7 +186,7 @@ def _check_temperature(name: str, column: str, values: Vector, *, still: bool) -
 
 
 def _check_pair(name: str, t_q: Vector, at: Vector) -> None:
-    """Tell where one of the two temperatures is in another unit: they start within some kelvin of each other."""
+    """Refuse a pair of which one is in another unit: both start within some kelvin of each other."""
     coldest = float(np.quantile(t_q - at, 0.02))
     as_celsius = float(np.quantile((t_q - 32.0) / 1.8 - at, 0.02))
     if coldest > 25.0 and abs(as_celsius) < 10.0:
@@ -218,7 +216,7 @@ def _check_deformation(name: str, y: Vector) -> None:
         )
     if spread > high:
         raise DataError(f"{name}: y_um moves by {spread:.4g} in all: nanometres? expected µm, at most {high:g} of them")
-    if float(np.std(known)) < NOISE_ALONE * noise_std(known):
+    if is_noise(known):
         raise DataError(
             f"{name}: y_um moves by {spread:.3g} µm and its noise alone is {noise_std(known):.2g} µm: "
             "no deformation in it to make a model from"
@@ -250,7 +248,7 @@ def _check_heat(name: str, runs: Sequence[Run]) -> None:
             f"{name}: T_Q - AT falls while heat_w rises: T_Q and AT exchanged? expected T_Q near the heat "
             "source; --column t_q_degc=at_degc --column at_degc=t_q_degc exchanges them"
         )
-    if float(np.std(difference)) < NOISE_ALONE * noise_std(difference):
+    if is_noise(difference):
         raise DataError(
             f"{name}: T_Q - AT moves by {np.ptp(difference):.2g} K while the heat changes by "
             f"{np.ptp(heat):.3g} W: is t_q_degc near the heat source?"

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from compensator.api.identification import identify
 from compensator.arrays import Vector
-from compensator.commands.identify import Request, identify
+from compensator.commands.identify import write
 from compensator.demo.machine import MACHINES
-from compensator.identify.settings import Settings
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 
 PERIOD_S = 60.0
@@ -41,8 +41,7 @@ def calibrate(folder: Path, *, machine: str, seed: int) -> None:
     sensors = usual_sensors(duty.extra_names, heat_known=True)
     table = folder / "calibration" / "run.csv"
     write_table(table, World(MACHINES[machine](), duty, sensors, CALIBRATION_SEED + seed).record(PERIOD_S))
-    request = Request(data=[table], out=table.parent / "model.toml", name=f"sim-{machine}", settings=Settings())
-    identify(request)
+    write(identify(table, name=f"sim-{machine}"), table.parent / "model.toml")
 
 
 def paper_case(folder: Path, *, seed: int) -> dict[str, Any]:
@@ -69,10 +68,8 @@ def paper_case(folder: Path, *, seed: int) -> dict[str, Any]:
     )
     table = folder / "run.csv"
     write_table(table, World(PublishedQuill(), duty, sensors, seed).record(PERIOD_S))
-    settings = Settings(order=(3, 3, 2), drive="known")
-    return identify(
-        Request(data=[table], out=folder / "model.toml", name="paper", settings=settings, reference="quill")
-    ).result
+    found = identify(table, name="paper", order=(3, 3, 2), drive="known", reference="quill")
+    return write(found, folder / "model.toml").result
 
 
 def write_table(path: Path, columns: Mapping[str, Vector]) -> None:

@@ -1,1 +1,1 @@
-"""Calibration: from measured runs to a thermal model with standard errors, held-out errors and warnings."""
+"""Identification: from measured runs to a thermal model with standard errors, held-out errors and warnings."""

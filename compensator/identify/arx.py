@@ -1,9 +1,9 @@
-"""ARX by least squares: the linear estimate that the search starts from, and the usual tools' answer to compare with.
+"""ARX by least squares: starting values of the search, and what a usual tool would answer.
 
     A(z) y = Σ_j B_j(z) u_j + e
 
-It minimises the one-step prediction error. With white noise on the output it is biased, which is why it is a
-start here and not a result.
+It minimises the one-step prediction error. White noise on the output biases it, so it is a starting value here and
+not a result.
 
 Source: Ljung, System Identification (1999), section 4.2.
 """
@@ -24,9 +24,9 @@ def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: floa
     Parameters
     ----------
     segments : sequence of Segment
-        Data; rows with a missing y in reach are left out.
+        Data; rows that need a missing y are left out.
     structure : Structure
-        Orders and delays; an offset is fitted beside them.
+        Orders and delays; an offset is fitted too.
     period_s : float
         Sample period, s.
 
@@ -71,7 +71,7 @@ def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: floa
 
 
 def free_run_rms(segments: Sequence[Segment], structure: Structure, *, period_s: float) -> float:
-    """Return what an ARX of this structure leaves in free run, its zero taken off; infinite where it is unstable.
+    """Return the rms of an ARX's free-run error without its mean; infinite where the ARX is unstable.
 
     Parameters
     ----------
@@ -106,14 +106,14 @@ def starts(segments: Sequence[Segment], structure: Structure, *, period_s: float
     spread.append(list(np.geomspace(1.5 * period, max(longest / 2.0, 8.0 * period), n)) if n > 1 else [longest / 6.0])
     a = fit_arx(segments, structure, period_s=period_s)[0].a
     poles = np.roots(a) if np.isfinite(a).all() else np.zeros(0)
-    # Tustin's rule backwards; a pole that no relaxation has (negative, unstable) says nothing and is replaced.
+    # Inverse of Tustin's rule; a pole that no relaxation has (negative, unstable) is replaced.
     inside = [float(p.real) for p in poles if 0.05 < p.real < 0.9995]
     taus = sorted(period / 2.0 * (1.0 + p) / (1.0 - p) for p in inside)
     for tau in spread[0]:
         if len(taus) < n:
             taus.append(tau)
     taus = sorted(taus)
-    # Equal time constants are a saddle of the search: pull them apart.
+    # Equal time constants are a saddle point of the search: separate them.
     for i in range(1, n):
         taus[i] = max(taus[i], 1.3 * taus[i - 1])
     return [taus, *spread]

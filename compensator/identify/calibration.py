@@ -1,4 +1,4 @@
-"""From measured runs to a thermal model with everything that has to be known about it."""
+"""From measured runs to a thermal model with its errors, noise and range of validity."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Mask, Vector
-from compensator.data.runs import Run, noise_std, walk_std
+from compensator.data.runs import Run, noise_of, noise_std, walk_std
 from compensator.data.screening import screen
 from compensator.errors import DataError
 from compensator.identify.arx import free_run_rms
@@ -21,13 +21,13 @@ from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import PATH_UNITS, Estimator, Kind, Path, ThermalModel
 from compensator.progress import Progress, unreported
 
-#: Least noise that a temperature is taken to have, K: less than a converter's step is no knowledge.
+#: Least noise assumed for a temperature, K: about a converter's step.
 LEAST_NOISE_K = 0.005
-#: Least change of the ambient in a sample that the estimator is told to expect, K: doors are opened.
+#: Least change of the ambient per sample that the estimator expects, K: doors are opened.
 LEAST_AT_WALK_K = 0.1
-#: An unseen run is zeroed on its first hour.
+#: Zero of a run that was not fitted: the mean of its first hour.
 ZERO_S = 3600.0
-#: What the model is trusted with beyond the range it was made on, as a share of that range, and at least, K.
+#: How far the range of validity exceeds the data: share of its range, and at least, K.
 BEYOND_SHARE, BEYOND_K = 0.33, 2.0
 
 
@@ -42,10 +42,10 @@ class Part:
     role : {"fitted", "held out"}
         Whether it took part in fitting or choosing.
     t_s, y_um, y_pred_um : numpy.ndarray, shape (n,)
-        Time, measured deformation, prediction of the engine from T_Q and AT (with its zero), s, µm, µm.
+        Time, s; measured deformation and the engine's prediction from T_Q and AT (zeroed), µm.
     model, nothing, persistence : Scores
-        Of the model, of no compensation (y as a change from the run's start), and of holding the last measured
-        value before the part.
+        Of the model, of no compensation (y counted from the run's start), and of the last value measured before
+        the part.
     """
 
     name: str
@@ -65,15 +65,15 @@ class Calibration:
     Parameters
     ----------
     model : ThermalModel
-        Ready to be written.
+        The model.
     settings : Settings
-        What was asked for.
+        Kind, method, orders that were requested.
     runs : tuple of Run
         Data of the fit.
     used : tuple of numpy.ndarray of bool
-        Samples of each run that took part.
+        Samples of each run that were fitted.
     drives : tuple of numpy.ndarray
-        What drove the DTF in each run.
+        Input of the DTF in each run: heat, W, or T_Q − AT, K.
     temperature : TemperatureFit or None
         The TTF.
     deformation : DeformationFit
@@ -85,7 +85,7 @@ class Calibration:
     noise : dict of str to float
         White noise of `t_q_degc`, `at_degc`, `y_um`, in their units.
     remarks : tuple of str
-        What was put right in the data, and what the fit had to change.
+        Corrections of the data, and changes of the structure.
     """
 
     model: ThermalModel
@@ -111,7 +111,7 @@ class Calibration:
 
     @property
     def arx_rms_um(self) -> float:
-        """What an ARX of the same structure leaves in free run on the fitted data, µm: for comparison only."""
+        """Free-run rms of an ARX of the same structure on the fitted data, µm: for comparison only."""
         segments, structure = self.deformation.segments, self.deformation.main.structure
         return free_run_rms(segments, structure, period_s=self.model.period_s)
 
@@ -135,7 +135,7 @@ def calibrate(
     remarks: Sequence[str] = (),
     progress: Progress = unreported,
 ) -> Calibration:
-    """Make a thermal model of measured runs.
+    """Fit a thermal model to measured runs.
 
     Parameters
     ----------
@@ -150,11 +150,11 @@ def calibrate(
     fit_until_s : float, optional
         Only samples before this time take part; the rest is held out.
     etve, validation : sequence of Run
-        A test without heat source (methods II and III); runs that only judge.
+        Tests without heat source (methods II and III); runs for validation only.
     provenance : mapping, optional
-        What goes into the model file beside the figures: files and their hashes.
+        Origin of the data, for the model file.
     remarks : sequence of str
-        What reading the data had to put right.
+        Corrections that were made while reading the data.
     progress : callable
         Called with how many structures of how many are done.
 
@@ -166,7 +166,7 @@ def calibrate(
     Raises
     ------
     DataError
-        If no model can come from this data, with the reason.
+        If this data allows no model, with the reason.
     """
     kind = _kind(runs, settings)
     data = ", ".join(dict.fromkeys(run.name for run in runs)) or name
@@ -174,6 +174,9 @@ def calibrate(
     used = [_mask(run, fit_until_s) for run in runs]
     if sum(int(mask.sum()) for mask in used) * period_s < 7200.0:
         raise DataError(f"{data}: less than 2 h of samples left for the fit")
+    # A run that begins after the hours of the fit is held out as a whole.
+    later = [run for run, mask in zip(runs, used, strict=True) if not mask.any() and np.isfinite(run.y_um).any()]
+    runs, used = [run for run, mask in zip(runs, used, strict=True) if mask.any()], [m for m in used if m.any()]
     temperature = None
     if kind == "heat":
         temperature = fit_temperature(
@@ -182,11 +185,8 @@ def calibrate(
     drives = [_drive(run, temperature, settings) for run in runs]
     deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
     chosen = next(c for c in deformation.candidates if c.chosen)
-    noise = {
-        "t_q_degc": max(LEAST_NOISE_K, *(noise_std(run.t_q_degc) for run in runs)),
-        "at_degc": max(LEAST_NOISE_K, *(noise_std(run.at_degc) for run in runs)),
-        "y_um": max(noise_std(run.y_um) for run in runs),
-    }
+    noise = noise_of(runs)
+    noise |= {name: max(noise[name], LEAST_NOISE_K) for name in ("t_q_degc", "at_degc")}
     model = ThermalModel(
         name=name,
         kind=kind,
@@ -209,7 +209,7 @@ def calibrate(
         drives=tuple(drives),
         temperature=temperature,
         deformation=deformation,
-        parts=tuple(_parts(model, deformation, runs, used, validation)),
+        parts=tuple(_parts(model, deformation, runs, used, [*later, *validation])),
         folds_rms_um=chosen.rms,
         noise=noise,
         remarks=(*remarks, *fixed, *deformation.remarks),
@@ -246,7 +246,7 @@ def _path(name: str, kind: Kind, path: PathFit) -> Path:
 
 
 def _estimator(runs: Sequence[Run], drives: Sequence[Vector], noise: Mapping[str, float], kind: Kind) -> Estimator:
-    """Set the filter from the data: sensor noise, and how much heat and ambient change in a sample."""
+    """Return the filter's settings: sensor noise, and the change of drive and ambient per sample."""
     sensor = float(np.hypot(noise["t_q_degc"], noise["at_degc"]))
     known = [run.heat_w for run in runs if run.heat_w is not None]
     if kind == "direct":
@@ -265,7 +265,7 @@ def _estimator(runs: Sequence[Run], drives: Sequence[Vector], noise: Mapping[str
 
 
 def _validity(runs: Sequence[Run], used: Sequence[Mask], kind: Kind) -> dict[str, tuple[float, float]]:
-    """Return the ranges seen in the fit and a third more: what the model is trusted with."""
+    """Return the ranges of the fitted data, and a third more."""
 
     def widened(values: Vector, least: float) -> tuple[float, float]:
         low, high = float(values.min()), float(values.max())

@@ -1,9 +1,8 @@
 """How many modes the data can support: free-run error on folds that took no part in the fit.
 
-A fold is a block of time whose measured deformation is hidden while the model is fitted to the others; the
-model runs through it all the same, because its inputs are known. The simplest structure whose held-out error
-is not worse than the best one's by more than its standard error wins, and one whose amplitudes
-the data does not determine does not take part.
+A fold is a block of time whose measured deformation is held out while the model is fitted to the others; the model
+runs through it, because its inputs are known. Chosen is the simplest structure whose held-out error exceeds the
+smallest by no more than one standard error. A structure whose amplitudes the data does not determine is no candidate.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from compensator.progress import Progress, unreported
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
-    """A structure and how it did.
+    """A structure and its held-out error.
 
     Parameters
     ----------
     structure : Structure
-        What was tried.
+        Orders and delays.
     rms : float
         Root mean square of the free-run error on the held-out folds.
     fold_rms : tuple of float
@@ -37,7 +36,7 @@ class Candidate:
     supported : bool
         Whether the data determines all of its amplitudes.
     chosen : bool
-        Whether it won.
+        Whether it was chosen.
     """
 
     structure: Structure
@@ -50,13 +49,13 @@ class Candidate:
 def fit(
     segments: Sequence[Segment], structure: Structure, period_s: float, warm: Sequence[float] | None = None
 ) -> OutputErrorFit:
-    """Fit from ARX's poles and two spreads of time constants, or from a fit that is near."""
+    """Fit from ARX's poles and two spreads of time constants, or from the time constants of a similar fit."""
     begin = [list(warm)] if warm is not None else starts(segments, structure, period_s=period_s)
     return fit_output_error(segments, structure, period_s=period_s, starts=begin)
 
 
 def folds_of(segments: Sequence[Segment], count: int) -> Iterator[list[Segment]]:
-    """Yield the segments with one block after another of the samples used hidden from the fit."""
+    """Yield the segments with one block after another of the samples held out."""
     order = np.cumsum(np.concatenate([segment.used for segment in segments])) - 1
     edges = np.linspace(0, order[-1] + 1, count + 1).astype(int)
     parts = np.split(order, np.cumsum([segment.y.size for segment in segments])[:-1])
@@ -68,15 +67,15 @@ def folds_of(segments: Sequence[Segment], count: int) -> Iterator[list[Segment]]
 
 
 def held_out_errors(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> list[Vector]:
-    """Return the free-run errors on each fold, of the fit to the others."""
+    """Return the free-run errors on each fold of the fit to the other folds."""
     whole = fit(segments, structure, period_s)
     errors = []
     for part in folds_of(segments, folds):
         if sum(int(segment.used.sum()) for segment in part) == 0:
             continue
         residuals = fit(part, structure, period_s, warm=whole.taus_min.tolist()).residuals
-        hidden = [s.used & ~p.used for s, p in zip(segments, part, strict=True)]
-        errors.append(np.concatenate([r[h] for r, h in zip(residuals, hidden, strict=True)]))
+        held_out = [s.used & ~p.used for s, p in zip(segments, part, strict=True)]
+        errors.append(np.concatenate([r[h] for r, h in zip(residuals, held_out, strict=True)]))
     return [e for e in errors if e.size]
 
 
@@ -88,7 +87,7 @@ def choose(
     folds: int,
     progress: Progress = unreported,
 ) -> list[Candidate]:
-    """Try structures on folds and mark the one to take.
+    """Evaluate structures on folds and mark the chosen one.
 
     Parameters
     ----------
@@ -113,24 +112,24 @@ def choose(
     DataError
         If the data is too short for every candidate.
     """
-    tried: list[Candidate] = []
+    candidates: list[Candidate] = []
     for done, structure in enumerate(structures):
         progress(done, len(structures))
         try:
-            tried.append(_tried(segments, structure, period_s, folds))
+            candidates.append(_candidate(segments, structure, period_s, folds))
         except DataError:
             continue
-    if not tried:
-        raise DataError(f"too little data for the smallest structure tried ({structures[0]})")
-    among = [c for c in tried if c.supported] or tried
+    if not candidates:
+        raise DataError(f"too little data for the smallest structure ({structures[0]})")
+    among = [c for c in candidates if c.supported] or candidates
     best = min(among, key=lambda c: c.rms)
     simplest = min(
         (c for c in among if no_worse(c.fold_rms, best.fold_rms)), key=lambda c: (c.structure.parameters, c.rms)
     )
-    return [dataclasses.replace(c, chosen=c is simplest) for c in tried]
+    return [dataclasses.replace(c, chosen=c is simplest) for c in candidates]
 
 
-def _tried(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> Candidate:
+def _candidate(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> Candidate:
     whole = fit(segments, structure, period_s)
     errors = held_out_errors(segments, structure, period_s, folds)
     return Candidate(
@@ -142,7 +141,7 @@ def _tried(segments: Sequence[Segment], structure: Structure, period_s: float, f
 
 
 def no_worse(fold_rms: Sequence[float], best: Sequence[float]) -> bool:
-    """Tell whether the folds' mean squares exceed the best one's by no more than one standard error of the excess."""
+    """Whether mean squares on the folds exceed the smallest by no more than one standard error of the excess."""
     worse = np.array(fold_rms) ** 2 - np.array(best) ** 2
     if worse.size < 2:
         return bool(worse.mean() <= 0.0)

@@ -1,4 +1,4 @@
-"""Two models side by side, coefficient by coefficient: what was identified beside what was printed."""
+"""Coefficients, gains and time constants of two models, compared."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Row:
     figure : str
         Which coefficient, gain or time constant, with its unit.
     found, std, reference : float
-        As identified, its standard error (NaN where the model file has no covariance), and in the other model.
+        Identified value, its standard error (NaN without a covariance), and the other model's value.
     """
 
     path: str
@@ -35,17 +35,17 @@ class Row:
 
     @property
     def deviations(self) -> float:
-        """How many standard errors the two are apart."""
+        """Difference in standard errors."""
         return (self.found - self.reference) / self.std if self.std > 0 else float("nan")
 
 
 def compare(found: ThermalModel, reference: ThermalModel) -> list[Row]:
-    """Put the paths of two models side by side, as functions of s with a highest denominator coefficient of 1.
+    """Compare the paths of two models as functions of s with a highest denominator coefficient of 1.
 
     Parameters
     ----------
     found, reference : ThermalModel
-        What was identified, and what it is held against.
+        The identified model and the reference.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def _figures(function: TransferFunction) -> dict[str, float]:
 
 
 def _standard_errors(path: Path, keys: list[str]) -> dict[str, float]:
-    """Carry the covariance of b and a over to the figures, by central differences."""
+    """Propagate the covariance of b and a to the figures by central differences."""
     if path.covariance is None:
         return dict.fromkeys(keys, float("nan"))
     covariance = np.array(path.covariance)

@@ -1,4 +1,4 @@
-"""The critical view of a calibration: what its functions do, and what the residual still knows."""
+"""Criticism of an identified model: responses of its paths, correlations of the residual, warnings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.signal import freqz
 from scipy.special import gammaincc
 
 from compensator.arrays import ComplexVector, Mask, Vector
-from compensator.data.runs import Run, noise_std
+from compensator.data.runs import Run
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
 from compensator.reasons import Caution
@@ -25,7 +25,7 @@ FREQUENCIES = 200
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathView:
-    """What a path does.
+    """Responses of a path.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class PathView:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualView:
-    """What a residual still knows.
+    """Correlations that are left in a residual.
 
     Parameters
     ----------
@@ -79,9 +79,9 @@ class ResidualView:
     limit : float
         99 % limit of white noise.
     white_chance : float
-        Chance of so much autocorrelation in white noise (Ljung and Box).
+        Probability of as much autocorrelation in white noise (Ljung and Box).
     cross : dict of str to (numpy.ndarray, float)
-        Correlation with each input at lags −LAGS … LAGS and its 99 % limit, both colours counted in.
+        Correlation with each input at lags −LAGS … LAGS and its 99 % limit, which allows for both autocorrelations.
     """
 
     name: str
@@ -92,7 +92,7 @@ class ResidualView:
 
 
 def view_path(path: PathFit, unit: str, period_s: float) -> PathView:
-    """Look at one path.
+    """Compute the responses of a path.
 
     Parameters
     ----------
@@ -139,14 +139,14 @@ def view_path(path: PathFit, unit: str, period_s: float) -> PathView:
 
 
 def view_residual(name: str, residuals: Sequence[Vector], inputs: dict[str, Sequence[Vector]]) -> ResidualView:
-    """Look at a residual.
+    """Compute the correlations of a residual.
 
     Parameters
     ----------
     name : str
         Of which fit.
     residuals : sequence of numpy.ndarray
-        One for each run; NaN where there is none.
+        One for each run; NaN where y is missing.
     inputs : dict of str to sequence of numpy.ndarray
         Inputs on the same samples.
     """
@@ -182,7 +182,7 @@ def _correlation(first: Sequence[Vector], second: Sequence[Vector]) -> Vector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Criticism:
-    """The critical view of a calibration.
+    """What an engineer has to know before signing a model.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ class Criticism:
     residuals : tuple of ResidualView
         Of the TTF's and the DTF's fit.
     warnings : tuple of Caution
-        In words, the gravest first.
+        The gravest first.
     """
 
     paths: tuple[PathView, ...]
@@ -200,12 +200,12 @@ class Criticism:
 
 
 def criticise(calibration: Calibration) -> Criticism:
-    """Look at a calibration as the one who has to sign it would.
+    """Compute responses, correlations and warnings of an identified model.
 
     Parameters
     ----------
     calibration : Calibration
-        What came out.
+        Result of the identification.
     """
     model = calibration.model
     units = {"TTF": "K/W", "DTF": model.dtf.unit, "TDTF": "um/K"}
@@ -226,7 +226,7 @@ def criticise(calibration: Calibration) -> Criticism:
 
 
 class _Warnings:
-    """Every warning is one method that returns it, or nothing."""
+    """Each method returns one kind of warning, or nothing."""
 
     def __init__(self, calibration: Calibration, paths: Sequence[PathView], residuals: Sequence[ResidualView]) -> None:
         self.calibration, self.residuals = calibration, residuals
@@ -255,7 +255,7 @@ class _Warnings:
             if part.role == "held out" and part.model.rms_um > part.nothing.rms_um:
                 return Caution(
                     "worse_than_nothing",
-                    f"On {part.name} (held out) the model is worse than none: {part.model.rms_um:.1f} "
+                    f"On {part.name} (held out) the model is worse than no compensation: {part.model.rms_um:.1f} "
                     f"against {part.nothing.rms_um:.1f} µm rms.",
                 )
         return None
@@ -269,12 +269,12 @@ class _Warnings:
         if swing < 2.0:
             return Caution(
                 "quiet_ambient",
-                f"The ambient moved by {swing:.1f} K only; {gain} and should not be trusted beyond that.",
+                f"The ambient changed by only {swing:.1f} K; {gain}: do not rely on it for larger changes.",
             )
         if path.gain_std > 0.3 * abs(path.gain):
             return Caution(
                 "undetermined_ambient",
-                f"The ambient's part is hardly determined, although it moved by {swing:.1f} K: {gain}.",
+                f"The TDTF is poorly determined although the ambient changed by {swing:.1f} K: {gain}.",
             )
         return None
 
@@ -284,8 +284,8 @@ class _Warnings:
         if longest * 60.0 < 3.0 * slowest:
             return Caution(
                 "short_record",
-                f"The longest record has {longest:.1f} h, the slowest time constant is {slowest / 60.0:.1f} h: what it "
-                "settles to is extrapolated.",
+                f"The longest record has {longest:.1f} h, the slowest time constant is {slowest / 60.0:.1f} h: the "
+                "steady state is extrapolated.",
             )
         return None
 
@@ -295,8 +295,8 @@ class _Warnings:
             return None
         return Caution(
             "drifting_mode",
-            f"The slowest mode is slower than the record ({main.longest_min / 60.0:.0f} h) and was held at its length: "
-            "something drifts there that the inputs do not explain, and free run beyond that is extrapolation.",
+            f"The slowest mode is slower than the record ({main.longest_min / 60.0:.0f} h) and was limited to it: "
+            "a drift is left that the inputs do not explain, and free run beyond the record is extrapolation.",
         )
 
     def common_cause(self) -> Caution | None:
@@ -309,8 +309,8 @@ class _Warnings:
             return None
         return Caution(
             "common_cause",
-            f"Drive and ambient moved together (correlation {together:.2f}): how the deformation divides between DTF "
-            "and TDTF is ambiguous.",
+            f"Drive and ambient changed together (correlation {together:.2f}): how much of the deformation belongs to "
+            "the DTF and how much to the TDTF is ambiguous.",
         )
 
     def undetermined_gain(self) -> list[Caution]:
@@ -318,7 +318,7 @@ class _Warnings:
             Caution(
                 "undetermined_gain",
                 f"The gain of the {name} at rest is {path.gain:.3g} ± {path.gain_std:.2g} {_shown(path.unit)}: "
-                "hardly determined.",
+                "poorly determined.",
             )
             for name, path in self.paths.items()
             if name != "TDTF" and path.gain_std > 0.3 * abs(path.gain)
@@ -334,7 +334,7 @@ class _Warnings:
                     Caution(
                         "zero_outside",
                         f"The {name} has a zero outside the unit circle (z = {worst.real:.3g}): its response starts "
-                        "the wrong way. Nothing inverts it, so nothing becomes unstable.",
+                        "in the wrong direction. It is never inverted, so stability is not affected.",
                     )
                 )
         return words
@@ -346,7 +346,7 @@ class _Warnings:
                 words.append(
                     Caution(
                         "turning_response",
-                        f"The {name}'s step response turns round: it peaks at {_peak(path):.3g} and settles at "
+                        f"The step response of the {name} reverses: it peaks at {_peak(path):.3g} and settles at "
                         f"{path.gain:.3g} {_shown(path.unit)}.",
                     )
                 )
@@ -360,8 +360,8 @@ class _Warnings:
                 words.append(
                     Caution(
                         "twin_modes",
-                        f"Two time constants of the {name} coincide at {twins[0]:.3g} min: their standard errors say "
-                        "nothing, and one mode less may do.",
+                        f"Two time constants of the {name} coincide at {twins[0]:.3g} min: their standard errors "
+                        "mean nothing, and one mode fewer may be enough.",
                     )
                 )
         return words
@@ -378,12 +378,12 @@ class _Warnings:
             return None
         return Caution(
             "inverse_noise",
-            f"The thermocouples' noise becomes {watts:.0f} W of noise in the heat, of {span:.0f} W in all.",
+            f"The noise of the thermocouples makes {watts:.0f} W of noise in a heat of {span:.0f} W.",
         )
 
     def coloured(self) -> Caution | None:
         main = self.calibration.deformation.main
-        noise = noise_std(np.concatenate([run.y_um for run in self.calibration.runs]))
+        noise = self.calibration.noise["y_um"]
         still = self.residuals[-1]
         known = {name: float(np.max(np.abs(values))) / limit for name, (values, limit) in still.cross.items()}
         largest = max(known, key=lambda name: known[name])
@@ -393,7 +393,7 @@ class _Warnings:
         return Caution(
             "coloured_residual",
             f"The residual ({main.sigma:.2f} µm rms, sensor noise {noise:.2f}) is not white{tail}: the model lacks "
-            "something. Standard errors count that in.",
+            "something. The standard errors allow for it.",
         )
 
     def narrow_range(self) -> Caution | None:
@@ -401,8 +401,8 @@ class _Warnings:
         t_low, t_high = self.calibration.model.validity["t_q_degc"]
         return Caution(
             "validity_range",
-            f"Valid for AT from {low:.0f} to {high:.0f} °C and T_Q from {t_low:.0f} to {t_high:.0f} °C (what was seen, "
-            "and a third more); outside, the service holds.",
+            f"Valid for AT from {low:.0f} to {high:.0f} °C and T_Q from {t_low:.0f} to {t_high:.0f} °C (the range of "
+            "the data and a third more); outside it the service holds the offset.",
         )
 
     def _pairs(self) -> list[tuple[Run, Mask]]:

@@ -1,11 +1,11 @@
-"""DTF and TDTF: the paper's four ways, each with its order chosen on held-out folds.
+"""DTF and TDTF by the paper's four methods, the order chosen on held-out folds.
 
-I to III take the ambient's share off the deformation first (the paper's equation 1),
+Methods I to III first subtract the ambient's share of the deformation (the paper's equation 1),
 
     δ_Q = δ_y − TDTF · ΔAT,
 
-with a TDTF that is given (I) or fitted to a test without any heat source (ETVE, ISO 230-3: the whole of it, II,
-or its end, III), and fit the DTF to what is left. IV fits both at once, with a common denominator.
+with a TDTF that is given (I) or fitted to a test without heat source (ETVE, ISO 230-3: the whole test, II, or its
+end, III), and fit the DTF to the rest. Method IV fits both together, with a common denominator.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from compensator.identify.settings import Settings
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
 from compensator.progress import Progress, unreported
 
-#: Modes of an ETVE that are tried; the paper's own had five.
+#: Numbers of modes considered for an ETVE; the paper's had five.
 ETVE_ORDERS = (1, 2, 3, 4, 5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathFit:
-    """A path with the fit that it comes from.
+    """A path and its fit.
 
     Parameters
     ----------
@@ -52,26 +52,26 @@ class PathFit:
 
     @classmethod
     def of(cls, name: str, result: OutputErrorFit, column: int = 0) -> PathFit:
-        """Take one input of a fit."""
+        """Return the path of one input of a fit."""
         return cls(name=name, fit=result, column=column, function=result.function(column))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeformationFit:
-    """What leads to the deformation.
+    """The fit of DTF and TDTF.
 
     Parameters
     ----------
     dtf, tdtf : PathFit
         The two paths.
     segments : tuple of Segment
-        What the DTF was fitted to, one for each run.
+        Data of the DTF's fit, one for each run.
     candidates : tuple of Candidate
-        Structures tried for the DTF (and TDTF, in method IV).
+        Structures considered for the DTF (and TDTF, in method IV).
     etve_candidates : tuple of Candidate
-        Structures tried for the TDTF on the ETVE.
+        Structures considered for the TDTF on the ETVE.
     remarks : tuple of str
-        What the engineer should know of how it came about.
+        Remarks for the engineer.
     """
 
     dtf: PathFit
@@ -83,7 +83,7 @@ class DeformationFit:
 
     @property
     def main(self) -> OutputErrorFit:
-        """The fit that has the DTF in it."""
+        """The fit of the DTF."""
         assert self.dtf.fit is not None
         return self.dtf.fit
 
@@ -107,7 +107,7 @@ def fit_deformation(
     used : sequence of array of bool
         Samples of each run that take part.
     drives : sequence of numpy.ndarray
-        What drives the DTF in each run: heat, W, or T_Q − AT, K.
+        Input of the DTF in each run: heat, W, or T_Q − AT, K.
     settings : Settings
         Method, orders, folds.
     period_s : float
@@ -120,7 +120,7 @@ def fit_deformation(
     Raises
     ------
     DataError
-        If the method needs an ETVE and there is none, or an order cannot be fitted.
+        If the method needs an ETVE and none is given, or an order cannot be fitted.
     """
     if settings.method == "IV":
         return _together(runs, used, drives, settings, period_s, progress)
@@ -179,14 +179,14 @@ def _together(
 
 
 def _terms(order: int) -> tuple[int, ...]:
-    """Return numbers of numerator terms worth trying: direct feed-through and every mode's own share."""
+    """Return the numbers of numerator terms to consider: one for each mode."""
     return (order,)
 
 
 def _chosen(
     data: Sequence[Segment], structures: Sequence[Structure], settings: Settings, period_s: float, progress: Progress
 ) -> tuple[list[Segment], list[Candidate], OutputErrorFit]:
-    """Settle how the runs start, choose a structure on the folds and fit it to everything."""
+    """Decide how the runs start, choose a structure on the folds and fit it to all data."""
     largest = structures[-1] if len(structures) == 1 else structures[len(structures) // 2]
     segments = settle_starts(data, largest, period_s, settings.folds)
     candidates = choose(segments, structures, period_s=period_s, folds=settings.folds, progress=progress)

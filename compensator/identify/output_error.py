@@ -1,7 +1,7 @@
-"""Output error with projected amplitudes: the one fit that every path and every effect is made with.
+"""Output error with projected amplitudes: the fit of every path.
 
-A path from input *u_j* is a rational function with real poles, which is what heat conduction has, and which
-makes it stable by construction: every time constant *τ_i* is positive, whatever the optimiser tries. With
+A path from input *u_j* is a rational function with real poles, as heat conduction has. Every time constant *τ_i* is
+positive, so that it is stable by construction. With
 Tustin's pole *p = (2τ − T) / (2τ + T)* and *Δ = 1 − z⁻¹*,
 
     y = Σ_j Σ_k c_jk Δᵏ z^(−nk_j) G u_j  +  Σ_k s_k Δᵏ G δ  +  o  +  e,      G = Π_i (1 − p_i) / (1 − p_i z⁻¹)
@@ -11,7 +11,7 @@ linearly and are solved for exactly at every step, so that only the few log time
 (variable projection). Their sensitivities are filters too, ∂G/∂p_i = −Δ G / ((1 − p_i)(1 − p_i z⁻¹)), so the
 Jacobian is analytic.
 
-*e* is the error of the free run: nothing measured of *y* is ever fed back, which is the difference to ARX.
+*e* is the error of the free run: measured *y* is never fed back, unlike in ARX.
 
 Source: Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares problems whose
 variables separate (1973), with Kaufman's Jacobian (1975); Ljung, System Identification
@@ -32,12 +32,12 @@ from compensator.arrays import Mask, Matrix, Vector
 from compensator.errors import DataError
 from compensator.model.transfer_function import SampledTransferFunction
 
-#: Amplitudes whose direction carries less than this share of the largest are left at zero.
+#: Directions of the amplitudes with less than this share of the largest singular value are left at zero.
 RANK_TOLERANCE = 1e-10
-#: An unknown initial state is held to be no larger than the output's own spread, with a weight of one sample
-#: whose noise is this share of that spread: nothing where the data knows it, everything where it does not.
+#: Prior of an unknown initial state: no larger than the output's spread, with the weight of one sample whose noise is
+#: this share of that spread. It matters only where the data does not determine the state.
 STATE_PRIOR = 1e-3
-#: Starts are abandoned once one more gains less than this share of the cost.
+#: Relative change of the cost at which a search ends; another start must gain more.
 _TOLERANCE = 1e-9
 
 
@@ -75,7 +75,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
-    """What is fitted: common denominator order, and numerator terms and delay of each input.
+    """Structure of a fit: common denominator order, and numerator terms and delay of each input.
 
     Parameters
     ----------
@@ -118,12 +118,12 @@ class Structure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputErrorFit:
-    """What a fit gives.
+    """Result of a fit.
 
     Parameters
     ----------
     structure : Structure
-        What was fitted.
+        Orders and delays.
     period_s : float
         Sample period, s.
     taus_min : numpy.ndarray, shape (order,)
@@ -135,17 +135,18 @@ class OutputErrorFit:
     nuisances : tuple of numpy.ndarray
         Of each segment: initial state *s* (where fitted), then the offset (where fitted).
     covariance : numpy.ndarray
-        Of (log τ, c), with the residual's colour counted in.
+        Of (log τ, c), times the variance inflation.
     residuals : tuple of numpy.ndarray
-        y − ŷ of each segment, NaN where y is missing; also where y was not used for the fit.
+        y − ŷ of each segment, also where y was not used; NaN where it is missing.
     sigma : float
         Standard deviation of the residual on the samples used.
-    colour : float
-        Spectral density of the residual at low frequencies over its variance: 1 for white noise.
+    variance_inflation : float
+        Spectral density of the residual at low frequencies over its variance: 1 for white noise. The effective sample
+        size is the number of samples over it.
     rank_deficit : int
         Directions of the amplitudes that the data does not determine.
     evaluations : int
-        Evaluations of the model that the search took.
+        Evaluations of the model in the search.
     """
 
     structure: Structure
@@ -157,7 +158,7 @@ class OutputErrorFit:
     covariance: Matrix
     residuals: tuple[Vector, ...]
     sigma: float
-    colour: float
+    variance_inflation: float
     rank_deficit: int
     evaluations: int
 
@@ -187,7 +188,7 @@ class OutputErrorFit:
         return self.simulate_with_std(inputs)[0]
 
     def simulate_with_std(self, inputs: npt.ArrayLike) -> tuple[Vector, Vector]:
-        """Compute the response from rest and the standard error that the parameters' give it, shape (n,) each."""
+        """Compute the response from rest and its standard error, shape (n,) each."""
         u = np.atleast_2d(np.asarray(inputs, dtype=float))
         poles = poles_of(self.taus_min, self.period_s)
         columns = _input_columns(u, poles, self.structure)
@@ -198,7 +199,7 @@ class OutputErrorFit:
         return response, np.sqrt(np.maximum(variance, 0.0))
 
     def free_decay(self, segment: int, n: int) -> Vector:
-        """Return what the fitted initial state of a segment adds to `n` samples, without its offset."""
+        """Return the share of a segment's fitted initial state in `n` samples, without its offset."""
         own = self.nuisances[segment]
         states = own[: own.size - int(self.structure.offset)]
         if states.size == 0:
@@ -250,7 +251,7 @@ def pole_slopes(poles: Vector, taus_min: Vector, period_s: float) -> Vector:
 
 
 def _through(poles: Vector, u: Matrix) -> Matrix:
-    """Filter by G; section by section, because the expanded polynomial of slow poles loses its digits."""
+    """Filter by G, section by section: the expanded polynomial of slow poles is ill-conditioned."""
     out = u
     for p in poles:
         out = lfilter([1.0 - p], [1.0, -p], out, axis=-1)
@@ -309,7 +310,7 @@ class _Problem:
         self._at: Vector | None = None
 
     def columns(self, poles: Vector) -> list[tuple[Matrix, Matrix]]:
-        """Return, for each segment, the columns of the amplitudes and of its own nuisances."""
+        """Return for each segment the columns of the amplitudes and of its nuisances."""
         return [
             (
                 _input_columns(segment.inputs, poles, self.structure),
@@ -319,7 +320,7 @@ class _Problem:
         ]
 
     def stacked(self, parts: Sequence[tuple[Matrix, Matrix]]) -> Matrix:
-        """Return the columns of all segments on the samples used, and below them the rows of the prior."""
+        """Return the columns of all segments on the samples used, followed by the rows of the prior."""
         width = self.structure.amplitudes
         own = [nuisance.shape[1] for _, nuisance in parts]
         table = np.zeros((self.y.size, width + sum(own)))
@@ -335,7 +336,7 @@ class _Problem:
         return table
 
     def solve(self, log_taus: Vector) -> None:
-        """Project at these log time constants, unless that was just done."""
+        """Project at these log time constants; a repeated call costs nothing."""
         if self._at is not None and np.array_equal(log_taus, self._at):
             return
         self._at = log_taus.copy()
@@ -355,7 +356,7 @@ class _Problem:
         self.residual = self.y - self.q @ projected
 
     def outputs(self) -> list[Vector]:
-        """Return the dynamic part of the prediction (no offset) of each segment, whole."""
+        """Return the dynamic part of the prediction (without offset) of each segment, on every sample."""
         width = self.structure.amplitudes
         result, column = [], width
         for inputs, nuisance in self.parts:
@@ -401,7 +402,7 @@ def fit_output_error(
     period_s : float
         Sample period, s.
     starts : sequence of sequence of float
-        Time constants to start from, min, each of length `structure.order`; the best end is taken.
+        Initial time constants, min, each of length `structure.order`; the best result counts.
 
     Returns
     -------
@@ -455,7 +456,7 @@ def fit_output_error(
 def _bounds(problem: _Problem, period_s: float) -> tuple[float, float]:
     """Return bounds of log τ: from where the pole would turn negative to the longest stretch that is used.
 
-    A mode slower than the data cannot be told from a ramp, and in free run a ramp goes on for ever.
+    A mode slower than the data cannot be distinguished from a ramp, and in free run a ramp grows without limit.
     """
     longest = max(_span(segment.used) for segment in problem.segments) * period_s / 60.0
     low = 0.51 * period_s / 60.0
@@ -480,8 +481,8 @@ def _result(problem: _Problem) -> OutputErrorFit:
     freedom = problem.count - coefficients.size - structure.order
     error = problem.residual[: problem.count]
     sigma = float(np.sqrt(error @ error / freedom))
-    colour = max(1.0, low_frequency_ratio([r[s.used] for r, s in zip(residuals, problem.segments, strict=True)]))
-    covariance = _covariance(problem, sigma * float(np.sqrt(colour)))
+    inflation = max(1.0, low_frequency_ratio([r[s.used] for r, s in zip(residuals, problem.segments, strict=True)]))
+    covariance = _covariance(problem, sigma * float(np.sqrt(inflation)))
     keep = structure.order + width
     return OutputErrorFit(
         structure=structure,
@@ -493,7 +494,7 @@ def _result(problem: _Problem) -> OutputErrorFit:
         covariance=covariance[:keep, :keep],
         residuals=tuple(residuals),
         sigma=sigma,
-        colour=colour,
+        variance_inflation=inflation,
         rank_deficit=problem.deficit,
         evaluations=problem.evaluations,
     )
@@ -510,11 +511,11 @@ def _covariance(problem: _Problem, sigma: float) -> Matrix:
 
 
 def low_frequency_ratio(residuals: Sequence[Vector]) -> float:
-    """Return the spectral density at low frequencies over the variance: how much a coloured residual misleads.
+    """Return the spectral density at low frequencies over the variance: the variance inflation of a coloured residual.
 
-    Standard errors assume white residuals. Slow parameters are determined by slow parts of the data, where a
-    coloured residual has more power than its variance says; this ratio is by how much. It is 1 + 2 Σ ρ_k with
-    Bartlett weights up to the lag where the correlation first dies out.
+    Standard errors assume white residuals. Slow parameters are determined by the low frequencies of the data, where a
+    coloured residual has more power than its variance suggests, by this ratio. It is 1 + 2 Σ ρ_k with Bartlett weights
+    up to the lag where the correlation first becomes insignificant.
     """
     total = float(sum(r @ r for r in residuals))
     if total == 0.0:

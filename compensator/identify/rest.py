@@ -1,4 +1,4 @@
-"""Whether a run starts at rest: a known zero is worth more than a fitted one, where it is true."""
+"""Whether a run starts at rest: a known initial state, where it is true, is better than a fitted one."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from compensator.identify.output_error import Segment, Structure
 
 
 def settle_starts(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> list[Segment]:
-    """Mark every segment that the data does not contradict to have started at rest.
+    """Mark the segments whose start from rest the data does not contradict.
 
-    Segment by segment, a start from rest is kept where the free-run error on held-out folds is not worse with it
-    than with a fitted initial state by more than one standard error. A test of significance would not do: with
-    little noise it rejects every start for what the structure cannot follow elsewhere.
+    Segment by segment, a start from rest is kept where it increases the free-run error on held-out folds over that
+    of a fitted initial state by no more than one standard error. A test of significance does not serve: at low noise
+    it rejects every start because of what the structure cannot follow elsewhere.
 
     Parameters
     ----------
     segments : sequence of Segment
-        What will be fitted.
+        Data.
     structure : Structure
-        What it will be fitted with.
+        Orders and delays of the fit.
     period_s : float
         Sample period, s.
     folds : int

@@ -1,4 +1,4 @@
-"""What a calibration is asked for."""
+"""Settings of an identification."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Method = Literal["I", "II", "III", "IV"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What a calibration is asked for.
+    """Settings of an identification.
 
     Parameters
     ----------
     kind : {"auto", "heat", "direct"}
-        With a TTF, or from T_Q − AT straight to the deformation; `auto` takes a TTF where the heat is known.
+        With a TTF, or from T_Q − AT to the deformation; `auto`: with a TTF where the heat is known.
     method : {"I", "II", "III", "IV"}
-        Where the TDTF comes from: given, first order (I); an ETVE (II); the end of an ETVE (III); fitted beside
-        the DTF with a common denominator (IV). I to III subtract the ambient's share before the DTF is fitted.
+        Where the TDTF comes from: given, first order (I); an ETVE (II); the end of an ETVE (III); fitted with
+        the DTF and a common denominator (IV). I to III subtract the ambient's share before the DTF is fitted.
     ttf : tuple of int
         nb, nf, nk of the TTF.
     order : tuple of int, optional
@@ -30,11 +30,11 @@ class Settings:
     given_tdtf : tuple of float, optional
         Gain, µm/K, and time constant, min, of method I.
     etve_end_h : float
-        How much of the ETVE's end method III takes, h.
+        Length of the ETVE's end for method III, h.
     folds : int
-        Number of blocks that take turns at being held out.
+        Number of held-out blocks.
     max_order : int
-        Largest number of modes tried.
+        Largest number of modes considered.
     """
 
     kind: Literal["auto", "heat", "direct"] = "auto"

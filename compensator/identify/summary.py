@@ -1,8 +1,9 @@
-"""A calibration in figures and in words: what the terminal, the JSON and the model file say of it."""
+"""Figures and text of an identification, for terminal, JSON and model file."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from compensator.identify.calibration import Calibration
@@ -10,14 +11,14 @@ from compensator.identify.criticism import Criticism
 
 
 def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
-    """Return everything that was found, as numbers and words.
+    """Return all figures, warnings and remarks.
 
     Parameters
     ----------
     calibration : Calibration
-        What came out.
+        Result of the identification.
     criticism : Criticism
-        The critical view of it.
+        Responses, correlations and warnings.
     """
     model = calibration.model
     result: dict[str, Any] = {
@@ -62,7 +63,7 @@ def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
 
 
 def verdict(calibration: Calibration) -> str:
-    """Return one sentence: how good the model is on data that took no part."""
+    """Return one sentence: the error on data that took no part in the fit."""
     held_out = [part for part in calibration.parts if part.role == "held out"]
     if held_out:
         worst = max(held_out, key=lambda part: part.model.rms_um)
@@ -74,8 +75,8 @@ def verdict(calibration: Calibration) -> str:
         )
     fitted = calibration.parts[0]
     return (
-        f"On blocks of time held out in turn: {calibration.folds_rms_um:.2f} µm rms in free run "
-        f"({fitted.nothing.rms_um:.1f} without compensation). No separate run judged it; name one with --validate."
+        f"On held-out blocks of time: {calibration.folds_rms_um:.2f} µm rms in free run "
+        f"({fitted.nothing.rms_um:.1f} without compensation). No separate run validates it; give one with --validate."
     )
 
 
@@ -85,7 +86,7 @@ def text(calibration: Calibration, criticism: Criticism) -> str:
     what = (
         "TTF, DTF, TDTF: heat from the temperatures"
         if model.kind == "heat"
-        else "direct: from T_Q − AT straight to the deformation, no heat known"
+        else "direct: from T_Q − AT to the deformation, heat unknown"
     )
     lines = [f"model {model.name} ({what}; method {calibration.settings.method})", "", verdict(calibration), ""]
     for path, fit in zip(criticism.paths, calibration.paths, strict=True):
@@ -96,8 +97,8 @@ def text(calibration: Calibration, criticism: Criticism) -> str:
         lines.append(f"{path.name:<5} gain {gain} {unit}; time constants {taus} min; {structure}")
     if calibration.temperature is not None:
         lines.append(
-            f"TTF   fit {calibration.ttf_fit_pct:.2f} %; its inverse is stable and makes "
-            f"{calibration.temperature.noise_gain_w_per_k:.0f} W of 1 K of noise"
+            f"TTF   fit {calibration.ttf_fit_pct:.2f} %; its inverse is stable; 1 K of noise "
+            f"becomes {calibration.temperature.noise_gain_w_per_k:.0f} W"
         )
     lines += ["", *_table(calibration)]
     warnings = [f"{warning} [{warning.code}]" for warning in criticism.warnings]
@@ -108,7 +109,7 @@ def text(calibration: Calibration, criticism: Criticism) -> str:
 
 
 def with_std(value: float, std: float) -> str:
-    """Return a value with its standard error, to two digits of the error, or with what stands for one.
+    """Return a value with its standard error, to two digits of the error; without one, the value alone.
 
     Examples
     --------
@@ -149,5 +150,16 @@ def _table(calibration: Calibration) -> list[str]:
     rows.append(["folds", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""])
     arx = calibration.arx_rms_um
     rows.append(["ARX, to compare", "fitted", "", "", f"{arx:.2f}" if math.isfinite(arx) else "unstable", "", "", ""])
+    return aligned(rows, left=2)
+
+
+def aligned(rows: Sequence[Sequence[str]], *, left: int) -> list[str]:
+    """Return the lines of a table of text; the first columns stand at the left.
+
+    Examples
+    --------
+    >>> aligned([["data", "h"], ["a", "10"]], left=1)
+    ['data   h', 'a     10']
+    """
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  ".join(f"{c:{'<' if i < 2 else '>'}{widths[i]}}" for i, c in enumerate(row)) for row in rows]
+    return ["  ".join(f"{c:{'<' if i < left else '>'}{widths[i]}}" for i, c in enumerate(row)) for row in rows]

@@ -20,20 +20,20 @@ from compensator.model.transfer_function import SampledTransferFunction
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TemperatureFit:
-    """A TTF and what is to be known about its inverse.
+    """A TTF and the properties of its inverse.
 
     Parameters
     ----------
     fit : OutputErrorFit
         Of heat to T_Q − AT.
     segments : tuple of Segment
-        What it was fitted to.
+        Data of the fit.
     held_out_k : float
         Root mean square of the free-run error on held-out folds, K.
     noise_gain_w_per_k : float
         Standard deviation of the inverse's output for white noise of 1 K on T_Q − AT, W/K.
     remark : str
-        What had to be changed to make the inverse usable; empty where nothing.
+        Change of the structure that made the inverse usable; empty without one.
     """
 
     fit: OutputErrorFit
@@ -48,7 +48,7 @@ class TemperatureFit:
         return self.fit.function()
 
     def heat(self, difference_k: Vector) -> Vector:
-        """Return the heat that the inverse makes of T_Q − AT, from rest, W."""
+        """Return the heat from T_Q − AT by the inverse, from rest, W."""
         f = self.function
         return np.asarray(lfilter(f.a, f.b, difference_k))
 
@@ -63,8 +63,8 @@ def fit_temperature(
 ) -> TemperatureFit:
     """Fit a TTF whose inverse is causal, stable and does not ring.
 
-    Where the structure asked for leads to an inverse that cannot run, the numerator is shortened term by term
-    until it can: a single term always can, and what that costs is seen in the fit.
+    Where the inverse of the requested structure cannot run, numerator terms are removed until it can. With a single
+    term it always can; the cost shows in the fit.
 
     Parameters
     ----------

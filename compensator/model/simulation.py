@@ -1,4 +1,4 @@
-"""Runs a model over measured data, free of any measured deformation."""
+"""A model in free run over measured data: measured deformation is never fed back."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ from compensator.errors import DataError
 from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
 
+#: Columns of a free run in the order of its CSV.
+COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_tdtf_um", "y_std_um")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scores:
-    """How well a prediction follows a measurement.
+    """Errors of a prediction.
 
     Parameters
     ----------
@@ -35,13 +38,12 @@ class Scores:
 def simulate(model: ThermalModel, record: Record, *, source: str = "") -> dict[str, Vector]:
     """Run a model over a record.
 
-    The first sample with both temperatures is the reference; the deformation, where it was measured, counts
-    from its own value there.
+    The first sample with both temperatures is the reference; measured deformation counts from its first value.
 
     Parameters
     ----------
     model : ThermalModel
-        What to run.
+        The model.
     record : Record
         Needs `t_q_degc` and `at_degc`.
     source : str
@@ -115,12 +117,11 @@ def scores(y: Vector, y_pred: Vector) -> Scores:
     )
 
 
-def csv_rows(columns: dict[str, Vector], names: tuple[str, ...]) -> Iterator[list[str]]:
-    """Yield a header and rows; a missing value is an empty cell, a column that is absent is left out."""
-    present = [name for name in names if name in columns]
-    yield present
+def csv_rows(columns: dict[str, Vector]) -> Iterator[list[str]]:
+    """Yield a header and rows; a missing value is an empty cell."""
+    yield list(columns)
     for i in range(columns["t_s"].size):
-        yield [_shown(columns[name][i]) for name in present]
+        yield [_shown(values[i]) for values in columns.values()]
 
 
 def _shown(value: float) -> str:

@@ -171,7 +171,10 @@ def _ranking(diagnosis: Diagnosis) -> Details:
 
 def _details(t: Vector, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Details:
     rows = [["extended model, SHA-256", model.sha256]]
-    rows += [[f"data: {d['file']}", d["sha256"]] for d in model.provenance.get("diagnosis", {}).get("data", [])]
+    rows += [
+        [f"data: {d.get('file') or d['table']}", d["sha256"]]
+        for d in model.provenance.get("diagnosis", {}).get("data", [])
+    ]
     figure = Figure(
         title="Residual of the fit to all data",
         x_label="time, h",

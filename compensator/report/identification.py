@@ -304,7 +304,7 @@ def _provenance(calibration: Calibration, model: ThermalModel) -> Block:
         ["SHA-256 of the model file", model.sha256],
     ]
     for entry in model.provenance.get("data", []):
-        rows.append([f"{entry['role']}: {entry['file']}", entry["sha256"]])
+        rows.append([f"{entry['role']}: {entry.get('file') or entry['table']}", entry["sha256"]])
     for name, (low, high) in model.validity.items():
         rows.append([f"valid for {name}", f"{low:g} to {high:g}"])
     for name, value in calibration.noise.items():

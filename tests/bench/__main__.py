@@ -6,6 +6,7 @@ python -m tests.bench speed diagnosis    some of it
 
 import sys
 
+from compensator.blas import in_one_thread
 from tests.bench import audit, diagnosis, faults, identification, machines, shop, speed, spindle
 from tests.bench.figures import surroundings, table
 
@@ -36,4 +37,4 @@ def main(chosen):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    in_one_thread(main, sys.argv[1:])

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from compensator.data.runs import runs_of
-from compensator.data.tables import load_data
+from compensator.data.measurement import read, runs_in
 from compensator.identify.arx import fit_arx
 from compensator.identify.calibration import calibrate
 from compensator.identify.choice import fit
@@ -205,7 +204,7 @@ def spindle():
     if not SPINDLE.exists():
         return [["the measured spindle is not here", "", "", ""]]
     roles = {"t_q_degc": "t5_degc", "at_degc": "t16_degc", "y_um": "ch3_um"}
-    runs = [run for record in load_data(SPINDLE, 60.0, roles).records for run, _ in runs_of("spindle", record)]
+    runs, _ = runs_in([read(SPINDLE, columns=roles)])
     result = calibrate(runs, Settings(), period_s=60.0, name="ch3", fit_until_s=20 * 3600.0)
     return [
         [part.role, f"{part.model.rms_um:.1f}", f"{part.nothing.rms_um:.1f}", f"{part.persistence.rms_um:.1f}"]

@@ -7,7 +7,8 @@ import pytest
 from mcap.writer import Writer
 
 from compensator.cli import main
-from compensator.data.tables import EXPORTED, load_data
+from compensator.data.measurement import read
+from compensator.data.table import EXPORTED
 from compensator.recording.reading import read_messages
 from tests.audit.made import MACHINE, Service, other_model
 
@@ -23,18 +24,18 @@ def test_an_exported_recording_holds_the_same_measurements(recording: Path, tmp_
     table = tmp_path / "day.csv"
     assert main(["export", str(recording), "--out", str(table)]) == 0
     assert set(EXPORTED) < set(table.read_text(encoding="utf-8").splitlines()[0].split(","))
-    (wanted,), (found,) = (load_data(path, 60.0).records for path in (recording, table))
+    (wanted,), (found,) = (read(path).at_period(60.0).records for path in (recording, table))
     assert wanted.columns.keys() == found.columns.keys() and "heat_w" not in found.columns
     for name, values in wanted.columns.items():
         np.testing.assert_array_equal(found.columns[name], values)
-    assert [one.code for one in load_data(table, 60.0).remarks] == ["estimates_left_out"]
+    assert [one.code for one in read(table).at_period(60.0).remarks] == ["estimates_left_out"]
 
 
 def test_a_heat_that_was_measured_is_the_known_heat(tmp_path: Path) -> None:
     table = tmp_path / "day.csv"
     head = "t_s,t_q_degc,at_degc,heat_measured_w,heat_w,y_pred_um,y_offset_um"
     table.write_text(f"{head}\n0,20,20,80,79.2,0,0\n60,21,20,81,79.9,1,-1\n")
-    assert load_data(table, 60.0).records[0].columns["heat_w"].tolist() == [80.0, 81.0]
+    assert read(table).at_period(60.0).records[0].columns["heat_w"].tolist() == [80.0, 81.0]
 
 
 def test_several_recordings_are_one_table_in_the_order_of_their_samples(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from compensator.data.record import SHORT_GAP_SAMPLES, Record
-from compensator.data.runs import SHORTEST_RUN, noise_std, runs_of, walk_std, without_wild
+from compensator.data.runs import SHORTEST_RUN, is_noise, noise_of, noise_std, runs_of, walk_std, without_wild
 
 N = 600
 
@@ -164,6 +164,16 @@ def test_noise_skips_what_is_missing_and_of_nothing_is_nothing():
     assert noise_std(noise) == pytest.approx(0.3, rel=0.1)
     assert noise_std(np.full(100, 3.0)) == 0.0
     assert noise_std(np.arange(5.0)) == 0.0
+
+
+def test_noise_of_runs_is_that_of_the_noisiest_and_noise_alone_is_seen():
+    quiet, loud = columns(), columns(1)
+    loud["y_um"] = loud["y_um"] + np.random.default_rng(9).normal(0.0, 2.0, N)
+    both = [run for c in (quiet, loud) for run, _ in runs(c)]
+    noise = noise_of(both)
+    assert noise["y_um"] == noise_std(both[1].y_um) == pytest.approx(2.0, rel=0.15)
+    assert noise["t_q_degc"] == max(noise_std(run.t_q_degc) for run in both)
+    assert is_noise(np.random.default_rng(10).normal(0.0, 1.0, 500)) and not is_noise(quiet["y_um"])
 
 
 def test_walk_is_told_apart_from_noise_and_does_not_cross_runs():

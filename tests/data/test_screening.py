@@ -138,7 +138,7 @@ def test_remarks_name_the_column():
     c = columns()
     c["y_um"][400] += 60.0
     said = [remark for _, remarks in runs_of("day.csv", Record(np.arange(720) * 60.0, c)) for remark in remarks]
-    assert [one.code for one in said] == ["wild_readings"] and "day.csv: y_um: 1 wild single reading(s)" in said[0]
+    assert [one.code for one in said] == ["wild_readings"] and "day.csv: y_um: 1 outlier(s) left out" in said[0]
 
 
 def test_noise_is_told_apart_from_steps_and_converter_steps():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from compensator.commands.identify import read_runs
+from compensator.data.measurement import read, runs_in
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.refit import refit
@@ -147,7 +147,7 @@ def test_the_measured_spindle_lacks_its_speed():
 @pytest.mark.skipif(not FILE.exists(), reason="the measured spindle's data is not here")
 def test_the_other_probes_do_not_become_inputs():
     roles = {"t_q_degc": "t5_degc", "at_degc": "t16_degc", "y_um": "ch3_um"}
-    runs = read_runs([FILE], roles, [], period_s=60.0)
+    runs, _ = runs_in([read(FILE, columns=roles)])
     evidence = evidence_of(calibrated(runs), runs)
     assert "spindle_rpm" in evidence.context.channels
     assert not [name for name in evidence.context.channels if name.startswith("ch")]

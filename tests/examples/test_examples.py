@@ -24,8 +24,6 @@ from compensator.recording.reading import read_messages, recordings
 from compensator.service.publisher import session_config
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "deploy/examples"
-#: Beside the clone, where whoever has the data puts it; it is no part of the project.
-SPINDLE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
 PREFIX = "shop/vmc-07"
 
 
@@ -150,16 +148,3 @@ def install(folder: Path) -> None:
         pytest.skip("npm reached no registry within a minute: the example in JavaScript was not run")
     if done.returncode:
         pytest.skip(f"npm could not install @mcap/core: the example in JavaScript was not run: {done.stderr[:200]}")
-
-
-@pytest.mark.skipif(not SPINDLE.exists(), reason="the measured spindle is not here")
-def test_the_walk_through_the_measured_spindle_ends_below_what_it_began_with(tmp_path: Path) -> None:
-    out = run([sys.executable, EXAMPLES / "measured_spindle.py", SPINDLE], tmp_path)
-    assert "- input spindle_rpm: " in out
-    said = re.search(r"without compensation ([\d.]+), two inputs ([\d.]+), extended model ([\d.]+)", out)
-    assert said is not None, out
-    nothing, two, extended = (float(value) for value in said.groups())
-    assert nothing > 35.0
-    assert extended < 0.25 * two
-    assert extended < 0.1 * nothing
-    assert (tmp_path / "spindle-out/diagnosis/report.html").exists()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from compensator.cli import main
 from compensator.config import parse_config
-from compensator.data.tables import load_data
+from compensator.data.measurement import read
 from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.recording.reading import recordings
@@ -242,7 +242,7 @@ def test_refusals_keep_no_memory(place: Path) -> None:
             path.write_bytes(mutated(seed, TABLE))
             refuse(lambda seed=seed: parse_config(mutated(seed, WHOLE), source="x"))  # type: ignore[misc]
             refuse(lambda seed=seed: parse_model(mutated(seed, read_model_bytes("quill")), source="x"))  # type: ignore[misc]
-            refuse(lambda: load_data(path, 60.0))
+            refuse(lambda: read(path).at_period(60.0))
         gc.collect()
 
     all_of(range(40))

@@ -11,32 +11,19 @@ import pytest
 from compensator.cli import main
 from compensator.demo.calibration import write_table
 from compensator.model.model_file import load_model
+from tests.api.tables import write_run
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W, published
 
 SPINDLE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
 
 
-def table(path, heat_w, seed, **changes):
-    heat, ambient, difference, y, _, _ = published(heat_w, seed)
-    at = 21.0 + ambient
-    columns = {
-        "t_s": np.arange(heat.size) * 60.0,
-        "t_q_degc": at + difference,
-        "at_degc": at,
-        "y_um": y,
-        "heat_w": heat,
-    }
-    write_table(path, columns | changes)
-    return path
-
-
 @pytest.fixture
 def calibration(tmp_path):
-    return table(tmp_path / "run.csv", CALIBRATION_W, 1)
+    return write_run(tmp_path / "run.csv", CALIBRATION_W, 1)
 
 
 def test_model_page_and_summary(tmp_path, calibration, capsys):
-    other = table(tmp_path / "other.csv", VALIDATION_W, 2)
+    other = write_run(tmp_path / "other.csv", VALIDATION_W, 2)
     out = tmp_path / "out" / "model.toml"
     arguments = ["identify", str(calibration), "--validate", str(other), "--out", str(out), "--order", "3", "3", "2"]
     assert main([*arguments, "--reference", "quill"]) == 0
@@ -81,7 +68,7 @@ def test_json_and_a_direct_model_where_nobody_knows_the_heat(tmp_path, capsys):
 
 
 def test_bad_data_gives_one_line_and_no_model(tmp_path, capsys):
-    bad = table(tmp_path / "bad.csv", CALIBRATION_W, 1, y_um=np.zeros(720))
+    bad = write_run(tmp_path / "bad.csv", CALIBRATION_W, 1, y_um=np.zeros(720))
     out = tmp_path / "model.toml"
     assert main(["identify", str(bad), "--out", str(out)]) == 2
     assert not out.exists()

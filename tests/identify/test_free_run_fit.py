@@ -110,7 +110,7 @@ def test_standard_errors_of_gain_and_time_constant_over_many_seeds():
     for seed in range(60):
         y = clean + np.random.default_rng(seed).normal(0.0, 2.0, 500)
         result = fit_output_error([Segment.of(u, y)], structure, period_s=60.0, starts=[[20.0]])
-        rows.append((*result.gain(), result.taus_min[0], result.taus_std_min[0], result.colour))
+        rows.append((*result.gain(), result.taus_min[0], result.taus_std_min[0], result.variance_inflation))
     gain, gain_std, tau, tau_std, colour = np.array(rows).T
     assert np.std(gain) == pytest.approx(np.mean(gain_std), rel=0.3)
     assert np.std(tau) == pytest.approx(np.mean(tau_std), rel=0.3)
@@ -128,7 +128,7 @@ def test_standard_errors_count_the_colour_in():
         white = np.random.default_rng(seed).normal(0.0, 2.0, 2000)
         y = clean + lfilter([np.sqrt(1 - 0.9**2)], [1.0, -0.9], white)
         result = fit_output_error([Segment.of(u, y)], structure, period_s=60.0, starts=[[20.0]])
-        rows.append((*result.gain(), result.colour))
+        rows.append((*result.gain(), result.variance_inflation))
     gain, gain_std, colour = np.array(rows).T
     assert np.median(colour) > 3.0
     assert 0.6 < np.mean(gain_std) / np.std(gain) < 2.5

@@ -82,8 +82,8 @@ def test_a_coloured_residual_widens_the_errors():
     white = rng.normal(0, 0.05, 720)
     red = lfilter([1.0], [1.0, -0.95], white) * np.sqrt(1 - 0.95**2)
     plain, coloured = (fit([Segment.of(heat, difference + e)], structure, 60.0) for e in (white, red))
-    assert plain.colour < 2.0
-    assert coloured.colour > 5.0
+    assert plain.variance_inflation < 2.0
+    assert coloured.variance_inflation > 5.0
     assert coloured.gain()[1] > 2.0 * plain.gain()[1]
 
 

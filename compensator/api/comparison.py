@@ -1,0 +1,188 @@
+"""`tc.compare`: models beside no compensation and persistence, on the same samples."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from compensator.api.files import ModelLike, model_of, page_in
+from compensator.arrays import Mask, Vector
+from compensator.blas import one_thread
+from compensator.data.frames import frame_of
+from compensator.data.measurement import measurements
+from compensator.data.record import require
+from compensator.display import html_table
+from compensator.errors import DataError, UsageError
+from compensator.identify.summary import aligned
+from compensator.model.simulation import Scores, scores, simulate
+
+if TYPE_CHECKING:
+    from compensator.api.plotting import Plot
+
+#: What every model is compared with.
+NOTHING, PERSISTENCE = "no compensation", "persistence"
+_HEAD = ["", "rms µm", "peak to peak µm", "fit %"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class ComparisonResult:
+    """Errors of models in free run on the same samples.
+
+    Parameters
+    ----------
+    scores : dict of str to Scores
+        Of each model by its name, of no compensation, and of persistence: the last Y measured before the samples.
+    residuals : dict of str to numpy.ndarray, shape (n,)
+        Measured − predicted of each, µm; NaN outside the samples.
+    t_h : numpy.ndarray, shape (n,)
+        Time, h; files follow each other.
+    from_h : float
+        Samples from this hour on were compared.
+    in_frame : bool
+        Whether tables are DataFrames.
+    """
+
+    scores: dict[str, Scores]
+    residuals: dict[str, Vector]
+    t_h: Vector
+    from_h: float
+    in_frame: bool = False
+
+    @property
+    def samples(self) -> int:
+        """Number of samples compared."""
+        return int(np.sum(np.isfinite(self.residuals[NOTHING])))
+
+    @property
+    def table(self) -> Any:
+        """The scores as columns by name; a DataFrame where a DataFrame came in."""
+        rows = list(self.scores.values())
+        columns = {field.name: [getattr(row, field.name) for row in rows] for field in dataclasses.fields(Scores)}
+        if self.in_frame:
+            return frame_of(columns, index=list(self.scores))
+        return {"name": list(self.scores), **columns}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all figures."""
+        found = {name: dataclasses.asdict(row) for name, row in self.scores.items()}
+        return {"from_h": self.from_h, "samples": self.samples, "scores": found}
+
+    def summary(self) -> str:
+        """Return the errors as a table of text."""
+        return "\n".join([self._words(), "", *aligned([_HEAD, *self._rows()], left=1)])
+
+    def page(self, path: str | os.PathLike[str]) -> Path:
+        """Write the page: .html, .pdf, or .png for its picture."""
+        return page_in(path, self.write_page)
+
+    def write_page(self, path: Path, also: Path | None = None) -> Path:
+        """Write the page as HTML, and in the format of another file too."""
+        from compensator.report.formats import write
+        from compensator.report.page import Figure, Line, Page, Table, write_page
+
+        lines = tuple(Line(name, self.t_h, values) for name, values in self.residuals.items())
+        figure = Figure(title="Error in free run", x_label="time, h", y_label="measured − predicted, µm", lines=lines)
+        table = Table(title="Errors on the same samples", head=_HEAD, rows=self._rows())
+        best = min(self.scores, key=lambda name: self.scores[name].rms_um)
+        words = f"Smallest error: {best}, {self.scores[best].rms_um:.2f} µm rms. {self._words()}."
+        page = Page(title="Comparison of models", verdict=words, blocks=[figure, table], tone="good")
+        if also is not None:
+            write(also, page)
+        return write_page(path, page)
+
+    def plot(self) -> Plot:
+        """Draw the error of each over time."""
+        from compensator.api.plotting import stacked
+
+        curves = [(name, self.t_h, values) for name, values in self.residuals.items()]
+        return stacked([("measured − predicted, µm", curves)])[0]
+
+    def __repr__(self) -> str:
+        return self.summary()
+
+    def _repr_html_(self) -> str:
+        return f"<p>{self._words()}</p>" + html_table(_HEAD, self._rows())
+
+    def _words(self) -> str:
+        return f"{self.samples} samples in free run" + (f" from {self.from_h:g} h on" if self.from_h else "")
+
+    def _rows(self) -> list[list[str]]:
+        return [
+            [name, f"{row.rms_um:.2f}", f"{row.peak_to_peak_um:.2f}", f"{row.fit_pct:.2f}"]
+            for name, row in self.scores.items()
+        ]
+
+
+@one_thread
+def compare(
+    models: Mapping[str, ModelLike], data: Any, *, columns: Mapping[str, str] | None = None, from_h: float = 0.0
+) -> ComparisonResult:
+    """Compare models in free run on the samples that all of them predict.
+
+    Parameters
+    ----------
+    models : mapping of str to (ThermalModel, path or name)
+        What to compare, by names of your own.
+    data : path, DataFrame, mapping of str to array_like, Measurement, or list of those
+        With T_Q, AT and measured Y; see `compensator.read`.
+    columns : mapping of str to str, optional
+        Column name for each role that has another name.
+    from_h : float
+        Compare from this hour of each file on; the models run from its start.
+
+    Returns
+    -------
+    ComparisonResult
+        rms, peak to peak and fit of each model, of no compensation, and of persistence.
+
+    Raises
+    ------
+    CompensatorError
+        If there is no model or no measured Y, or the models have different sample periods.
+    """
+    found = {name: model_of(model) for name, model in models.items()}
+    periods = {model.period_s for model in found.values()}
+    if len(periods) != 1:
+        raise UsageError(f"compare: {len(found)} model(s) of {len(periods)} sample periods, expected models of one")
+    measured = measurements(data, "data", columns)
+    times: list[Vector] = []
+    parts: dict[str, list[Vector]] = {name: [] for name in ("y", *found, NOTHING, PERSISTENCE)}
+    begin_h = 0.0
+    for one in measured:
+        for record in one.at_period(periods.copy().pop()).records:
+            require(one.name, record, ("t_q_degc", "at_degc", "y_um"))
+            runs = {name: simulate(model, record, source=one.name) for name, model in found.items()}
+            residuals = {name: run["residual_um"] for name, run in runs.items()}
+            y = next(iter(runs.values()))["y_um"]
+            known = np.all([np.isfinite(values) for values in (y, *residuals.values())], axis=0)
+            judged = known & (record.t_s >= from_h * 3600.0)
+            residuals |= {NOTHING: y, PERSISTENCE: y - _last_before(y, known, judged)}
+            parts["y"].append(np.where(judged, y, np.nan))
+            for name, values in residuals.items():
+                parts[name].append(np.where(judged, values, np.nan))
+            times.append(record.t_s / 3600.0 + begin_h)
+        begin_h += one.hours
+    joined = {name: np.concatenate(values) for name, values in parts.items()}
+    y = joined.pop("y")
+    if not np.isfinite(y).any():
+        raise DataError(f"{measured[0].name}: no y_um from {from_h:g} h on, expected measured Y")
+    return ComparisonResult(
+        scores={name: scores(y, y - residual) for name, residual in joined.items()},
+        residuals=joined,
+        t_h=np.concatenate(times),
+        from_h=from_h,
+        in_frame=any(one.in_frame for one in measured),
+    )
+
+
+def _last_before(y: Vector, known: Mask, judged: Mask) -> float:
+    """Return the last value measured before the samples judged, the first of all where there is none."""
+    before = y[known & (np.arange(y.size) < (int(np.argmax(judged)) if judged.any() else y.size))]
+    first = y[known][:1]
+    return float(before[-1] if before.size else first[0] if first.size else np.nan)

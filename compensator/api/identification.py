@@ -1,0 +1,163 @@
+"""`tc.identify`: from measured runs to a thermal model with its errors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from compensator import __version__
+from compensator.api.files import ModelLike, as_in_file, model_of
+from compensator.api.identification_result import IdentificationResult
+from compensator.blas import one_thread
+from compensator.data.measurement import PERIOD_S, Measurement, measurements, runs_in
+from compensator.data.screening import screen_temperatures
+from compensator.errors import UsageError
+from compensator.identify.calibration import calibrate
+from compensator.identify.comparison import compare
+from compensator.identify.criticism import criticise
+from compensator.identify.settings import Method, Settings
+from compensator.identify.summary import figures
+from compensator.progress import Progress, unreported
+
+#: What a model file keeps of the figures, beside where it comes from.
+_KEPT = ("method", "parts", "warnings", "remarks", "ttf")
+_DEFAULT = Settings()
+
+
+@one_thread
+def identify(
+    data: Any,
+    *,
+    validate: Any = (),
+    etve: Any = (),
+    columns: Mapping[str, str] | None = None,
+    name: str = "model",
+    kind: Literal["auto", "heat", "direct"] = "auto",
+    method: Method = "IV",
+    tdtf: Sequence[float] | None = None,
+    etve_end_h: float = _DEFAULT.etve_end_h,
+    ttf: Sequence[int] = _DEFAULT.ttf,
+    order: Sequence[int] | None = None,
+    drive: Literal["ttf", "known"] = "ttf",
+    folds: int = _DEFAULT.folds,
+    fit_until_h: float | None = None,
+    reference: ModelLike | None = None,
+    progress: Progress = unreported,
+) -> IdentificationResult:
+    """Identify a thermal model from measured runs.
+
+    Parameters
+    ----------
+    data : path, DataFrame, mapping of str to array_like, Measurement, or list of those
+        Runs that the model is fitted to; see `compensator.read`.
+    validate, etve : as `data`, optional
+        Runs that only judge the model; a test without heat source (methods II and III).
+    columns : mapping of str to str, optional
+        Column name for each role that has another name.
+    name : str
+        Name of the model.
+    kind : {"auto", "heat", "direct"}
+        With a TTF, or from T_Q − AT to the deformation; `auto`: with a TTF where `heat_w` is known.
+    method : {"I", "II", "III", "IV"}
+        TDTF given, from a whole ETVE, from its end, or fitted together with the DTF.
+    tdtf : (float, float), optional
+        Gain, µm/K, and time constant, min, of method I.
+    etve_end_h : float
+        Length of the end of the ETVE for method III, h.
+    ttf : (int, int, int)
+        nb, nf, nk of the TTF.
+    order : (int, int, int), optional
+        nf, nb of the DTF, nb of the TDTF; chosen on held-out blocks where it is not given.
+    drive : {"ttf", "known"}
+        Heat that the DTF is fitted with: from T_Q as in the service, or the known one.
+    folds : int
+        Number of held-out blocks.
+    fit_until_h : float, optional
+        Fit up to this hour; the rest is held out.
+    reference : model, optional
+        Another model to compare the coefficients with.
+    progress : callable
+        Called with the steps done and their number.
+
+    Returns
+    -------
+    IdentificationResult
+        Model, parameters, standard errors, errors in free run.
+
+    Raises
+    ------
+    CompensatorError
+        If the data or the options allow no model.
+    """
+    settings = Settings(
+        kind=kind,
+        method=method,
+        ttf=(int(ttf[0]), int(ttf[1]), int(ttf[2])),
+        order=(int(order[0]), int(order[1]), int(order[2])) if order else None,
+        drive=drive,
+        given_tdtf=(float(tdtf[0]), float(tdtf[1])) if tdtf else None,
+        etve_end_h=float(etve_end_h),
+        folds=folds,
+    )
+    sources = {
+        role: measurements(given, name, columns)
+        for role, name, given in (("fit", "data", data), ("etve", "etve", etve), ("validation", "validate", validate))
+    }
+    _check_validation(sources)
+    remarks: list[str] = []
+    runs = {}
+    for role, measured in sources.items():
+        runs[role], corrected = runs_in(measured, PERIOD_S)
+        remarks += corrected
+    for run in runs["validation"]:
+        screen_temperatures(run.name, [run], quiet_air=True)
+    calibration = calibrate(
+        runs["fit"],
+        settings,
+        period_s=PERIOD_S,
+        name=name,
+        etve=runs["etve"],
+        validation=runs["validation"],
+        fit_until_s=None if fit_until_h is None else fit_until_h * 3600.0,
+        provenance=_provenance(sources, settings, columns or {}, fit_until_h),
+        remarks=remarks,
+        progress=progress,
+    )
+    criticism = criticise(calibration)
+    found = figures(calibration, criticism)
+    model = as_in_file(calibration.model, {key: found[key] for key in _KEPT if key in found})
+    return IdentificationResult(
+        model=model,
+        calibration=calibration,
+        criticism=criticism,
+        comparison=tuple(compare(model, model_of(reference))) if reference is not None else (),
+        in_frame=any(measured.in_frame for measured in sources["fit"]),
+    )
+
+
+def _check_validation(sources: Mapping[str, Sequence[Measurement]]) -> None:
+    """Refuse to judge a model by what it was made of, wherever that was copied to."""
+    fitted = {origin.sha256 for role in ("fit", "etve") for measured in sources[role] for origin in measured.origins}
+    for measured in sources["validation"]:
+        for origin in measured.origins:
+            if origin.sha256 in fitted:
+                named = origin.path or origin.name
+                raise UsageError(f"--validate {named}: takes part in the fit, expected a run that does not")
+
+
+def _provenance(
+    sources: Mapping[str, Sequence[Measurement]],
+    settings: Settings,
+    columns: Mapping[str, str],
+    fit_until_h: float | None,
+) -> dict[str, Any]:
+    """Return where a model comes from: every source with its hash, and what was asked for."""
+    asked = {name: value for name, value in dataclasses.asdict(settings).items() if value is not None}
+    if fit_until_h is not None:
+        asked["fit_until_h"] = float(fit_until_h)
+    every = [(role, measured) for role, group in sources.items() for measured in group]
+    roles = [*columns.items(), *(pair for _, measured in every for pair in measured.roles.items())]
+    asked["columns"] = [f"{role}={name}" for role, name in dict.fromkeys(roles)]
+    data = [{"role": role} | origin.provenance() for role, measured in every for origin in measured.origins]
+    return {"source": f"compensator {__version__} identify", "data": data, "asked": asked}

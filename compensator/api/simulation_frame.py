@@ -1,0 +1,56 @@
+"""The columns of a free run as a DataFrame; loaded only where a DataFrame came in."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pandas
+
+from compensator.api.simulation import SimulationResult
+from compensator.data.frames import time_index
+from compensator.model.simulation import Scores
+from compensator.reasons import Caution
+
+
+class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
+    """A DataFrame of the columns, by time where the data had one; what is cut out of it is a plain DataFrame.
+
+    Parameters
+    ----------
+    result : SimulationResult
+        The same columns as arrays, with scores, remarks and `plot()`.
+    """
+
+    _metadata: ClassVar[list[str]] = ["result"]
+    result: SimulationResult
+
+    @classmethod
+    def of(cls, result: SimulationResult, start_utc_s: float | None) -> SimulationFrame:
+        """Make a DataFrame of a result; `start_utc_s` is the time of `t_s` = 0, s since 1970."""
+        frame = cls(result.columns, index=time_index(result["t_s"], start_utc_s))
+        frame.result = result
+        return frame
+
+    @property
+    def _constructor(self) -> Any:
+        return pandas.DataFrame
+
+    @property
+    def scores(self) -> Scores | None:
+        """Fit, rms and peak to peak of the residual, where Y was measured."""
+        return self.result.scores
+
+    @property
+    def remarks(self) -> tuple[Caution, ...]:
+        """What had to be corrected in the data, and what makes the prediction doubtful."""
+        return self.result.remarks
+
+    def summary(self) -> str:
+        """Return what `compensator simulate` prints."""
+        return self.result.summary()
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the columns as CSV, as `compensator simulate` does."""
+        return self.result.save(path)

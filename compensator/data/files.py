@@ -1,0 +1,159 @@
+"""Tables in files: CSV, MATLAB's MAT, and recordings."""
+
+from __future__ import annotations
+
+import csv
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compensator.data.table import Table, table_of
+from compensator.errors import DataError
+from compensator.messages import Sample, number
+from compensator.recording.reading import decode, read_messages
+
+#: How files begin that are mistaken for tables, and what to do with them.
+_OTHER_FILES = (
+    (b"PK\x03\x04", "a workbook (XLSX, ODS) or ZIP archive, expected a table; save it as CSV in UTF-8"),
+    (b"\xd0\xcf\x11\xe0", "an old workbook (XLS), expected a table; save it as CSV in UTF-8"),
+    (b"\x1f\x8b", "compressed (gzip), expected a table; unpack it first"),
+    (b"\x89MCAP0\r\n", "a recording by its content, expected a table; name it FILE.mcap"),
+    (b"MATLAB 5.0 MAT", "a MAT file by its content, expected a table; name it FILE.mat"),
+    (b"\xff\xfe", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
+    (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
+)
+#: How to save what only MATLAB can read.
+_AS_CSV = "in MATLAB, writetable(T, 'run.csv') saves a table T as CSV"
+
+
+def read_csv(path: Path, data: bytes) -> Table:
+    """Read a table from the bytes of a CSV file.
+
+    Raises
+    ------
+    DataError
+        One line that names file, row or column, value and what was expected.
+    """
+    if not data:
+        raise DataError(f"{path}: the file is empty, expected a header and data")
+    for begin, kind in _OTHER_FILES:
+        if data.startswith(begin):
+            raise DataError(f"{path}: {kind}")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(
+            f"{path}: not UTF-8 text ({error.reason} at byte {error.start}), expected a table: CSV in UTF-8"
+        ) from error
+    try:
+        lines = list(csv.reader(text.splitlines()))
+    except csv.Error as error:
+        raise DataError(f"{path}: not a CSV table: {error}") from error
+    if len(lines) < 2:
+        raise DataError(f"{path}: {len(lines)} row(s), expected a header and data")
+    header = _header(path, lines[0])
+    rows = [(row, cells) for row, cells in enumerate(lines[1:], start=2) if cells]
+    for row, cells in rows:
+        if len(cells) != len(header):
+            raise DataError(f"{path}: row {row}: {len(cells)} cells, expected {len(header)}")
+    columns = zip(*(cells for _, cells in rows), strict=True) if rows else ([] for _ in header)
+    # Cells stay the text that they are: numpy would cut or convert them.
+    arrays = {name: np.array(cells, dtype=object) for name, cells in zip(header, columns, strict=True)}
+    return table_of(str(path), arrays, rows=[row for row, _ in rows], has="the header has")
+
+
+def _header(path: Path, cells: Sequence[str]) -> list[str]:
+    header = [name.strip() for name in cells]
+    for name in header:
+        if header.count(name) > 1:
+            raise DataError(f"{path}: the header names column {name!r} twice, expected each name once")
+    if "t_s" not in header and "time_utc" not in header:
+        for separator, word in ((";", "semicolons"), ("\t", "tabs")):
+            if cells and separator in cells[0]:
+                raise DataError(f"{path}: {word} between its cells, expected commas, and a dot in numbers: 20.5")
+    return header
+
+
+def read_mat(path: Path) -> Table:
+    """Read a table from a MAT file: vectors of equal length, or one struct of such vectors.
+
+    Raises
+    ------
+    DataError
+        If the file is of version 7.3, holds an object such as a `table`, or no columns.
+    """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of objects that it cannot read; they are named below
+            content = loadmat(path, squeeze_me=True, mat_dtype=False)
+    except NotImplementedError as error:
+        raise DataError(
+            f"{path}: a MAT file of version 7.3 (HDF5), expected version 7: save(FILE, ..., '-v7'), or a CSV; {_AS_CSV}"
+        ) from error
+    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, MemoryError) as error:
+        raise DataError(f"{path}: not a MAT file that can be read ({str(error)[:80]}); {_AS_CSV}") from error
+    columns: Mapping[str, Any] = {name: value for name, value in content.items() if not name.startswith("__")}
+    while len(columns) == 1 and (fields := _fields(next(iter(columns.values())))):
+        columns = fields
+    vectors = {name: value for name, value in columns.items() if getattr(value, "ndim", 0) and value.size > 1}
+    if "t_s" not in vectors and "time_utc" not in vectors:
+        raise DataError(
+            f"{path}: no vector t_s or time_utc; it has: {', '.join(columns)[:100] or 'no variables'}. Save each "
+            "column as a vector, a table by S = table2struct(T, 'ToScalar', true); save(FILE, '-struct', 'S'); or as "
+            f"CSV: {_AS_CSV}"
+        )
+    return table_of(str(path), vectors)
+
+
+def _fields(value: Any) -> Mapping[str, Any]:
+    """Return the fields of a MATLAB struct, nothing of anything else."""
+    names = getattr(getattr(value, "dtype", None), "names", None)
+    return {name: value[name].item() for name in names} if names and value.size == 1 else {}
+
+
+def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> Table:
+    """Read recordings that follow each other as one table; each has the columns that the roles name.
+
+    Raises
+    ------
+    DataError
+        If one is no recording, has no samples, or lacks a column.
+    """
+    tables = [_read_recording(path).with_roles(roles) for path in paths]
+    names = dict.fromkeys(name for table in tables for name in table.columns)
+    t_s = np.concatenate([table.t_s for table in tables])
+    order = np.argsort(t_s, kind="stable")
+    columns = {
+        name: np.concatenate([table.columns.get(name, np.full(table.t_s.size, np.nan)) for table in tables])[order]
+        for name in names
+    }
+    t_s = t_s[order]
+    return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
+
+
+def _read_recording(path: Path) -> Table:
+    """Return the samples of a recording; their time counts from 1970."""
+    times: list[int] = []
+    samples: list[dict[str, float]] = []
+    for record in read_messages(path, ("sample",)):
+        sample = decode(record, path)
+        assert isinstance(sample, Sample)
+        times.append(sample.time_utc_ns)
+        samples.append(
+            {
+                name: number(channel.mean) if channel.quality == "good" else math.nan
+                for name, channel in sample.channels.items()
+            }
+        )
+    if not samples:
+        raise DataError(f"{path}: no samples in it")
+    names = dict.fromkeys(name for row in samples for name in row)
+    columns = {name: np.array([row.get(name, math.nan) for row in samples]) for name in names}
+    return Table(name=str(path), t_s=np.array(times) / 1e9, columns=columns, rows=range(2, len(times) + 2))

@@ -1,0 +1,123 @@
+"""From a table to records at the model's sample period: averaged, sorted, split at long gaps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from compensator.arrays import Indices, Mask, Vector
+from compensator.data.record import SHORT_GAP_SAMPLES, Data, Record
+from compensator.data.table import Table
+from compensator.errors import DataError
+from compensator.reasons import Caution
+
+#: Larger numbers are no measurements, and their powers overflow.
+LARGEST = 1e30
+#: Longest table, in samples of the model: eleven years of minutes.
+MOST_SAMPLES = 6_000_000
+
+
+def to_grid(table: Table, period_s: float) -> Data:
+    """Average a table to a sample period; report gaps and rows out of order, split at long gaps.
+
+    Parameters
+    ----------
+    table : Table
+        As it was read.
+    period_s : float
+        Sample period of the model, s.
+
+    Raises
+    ------
+    DataError
+        If a value or the time cannot be a measurement's.
+    """
+    _check_size(table, period_s)
+    remarks = []
+    t_s = table.t_s
+    order = np.argsort(t_s, kind="stable")
+    backwards = np.diff(t_s) < 0
+    if backwards.any():
+        row, count = table.rows[int(np.argmax(backwards)) + 1], int(np.sum(backwards))
+        remarks.append(Caution("rows_sorted", f"{table.name}: row {row}: {count} row(s) out of order; sorted by time."))
+    t_s = t_s[order] - t_s.min()
+    slot = (
+        np.round(t_s / period_s).astype(int)
+        if _spacing(t_s) >= period_s
+        else np.floor(t_s / period_s + 1e-9).astype(int)
+    )
+    n = int(slot[-1]) + 1
+    columns = {name: _mean_by_slot(slot, values[order], n) for name, values in table.columns.items()}
+    present = np.zeros(n, dtype=bool)
+    present[slot] = True
+    records = []
+    start = 0
+    for first, last in _gaps(present):
+        gap = f"{table.name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}"
+        if last - first <= SHORT_GAP_SAMPLES:
+            remarks.append(Caution("gap_bridged", f"{gap}; bridged."))
+        else:
+            remarks.append(Caution("gap_splits", f"{gap}; the record is split there."))
+            records.append((start, first))
+            start = last
+    records.append((start, n))
+    return Data(
+        records=tuple(
+            Record(
+                t_s=np.arange(a, b, dtype=np.float64) * period_s, columns={name: v[a:b] for name, v in columns.items()}
+            )
+            for a, b in records
+        ),
+        remarks=tuple(remarks),
+    )
+
+
+def _check_size(table: Table, period_s: float) -> None:
+    """Refuse values and times that are slips of the pen: their squares, or their rows, would not fit into memory.
+
+    Raises
+    ------
+    DataError
+        Naming the row, or the rows' distance.
+    """
+    name, t_s = table.name, table.t_s
+    for column, values in (("time", t_s), *table.columns.items()):
+        large = np.abs(values) > LARGEST
+        if large.any():
+            i = int(np.argmax(large))
+            raise DataError(
+                f"{name}: row {table.rows[i]}: {column} = {values[i]:g}, expected a number below {LARGEST:g}"
+            )
+    apart_s = float(np.median(np.abs(np.diff(t_s)))) if t_s.size > 1 else 0.0
+    if apart_s > SHORT_GAP_SAMPLES * period_s:
+        raise DataError(
+            f"{name}: its rows are {apart_s:g} s apart, expected at most {period_s:g} s: is the time in seconds?"
+        )
+    samples = float(t_s.max() - t_s.min()) / period_s
+    if samples > MOST_SAMPLES:
+        row = table.rows[int(np.argmax(np.abs(t_s - np.median(t_s))))]
+        raise DataError(
+            f"{name}: row {row}: its time makes {samples:.3g} samples of {period_s:g} s, "
+            f"expected at most {MOST_SAMPLES}"
+        )
+
+
+def _spacing(t_s: Vector) -> float:
+    steps = np.diff(t_s)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) * (1 + 1e-9) if steps.size else math.inf
+
+
+def _mean_by_slot(slot: Indices, values: Vector, n: int) -> Vector:
+    good = ~np.isnan(values)
+    total = np.bincount(slot[good], weights=values[good], minlength=n)
+    count = np.bincount(slot[good], minlength=n)
+    mean = np.full(n, np.nan)
+    mean[count > 0] = total[count > 0] / count[count > 0]
+    return mean
+
+
+def _gaps(present: Mask) -> list[tuple[int, int]]:
+    edges = np.diff(np.concatenate(([1], present.astype(int), [1])))
+    return list(zip(np.flatnonzero(edges == -1).tolist(), np.flatnonzero(edges == 1).tolist(), strict=True))

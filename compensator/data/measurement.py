@@ -1,0 +1,268 @@
+"""DATA: whatever holds measurements, read once and handed to every verb."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compensator.data.files import read_csv, read_mat, read_recordings
+from compensator.data.frames import hash_of, is_frame, table_in_memory
+from compensator.data.gridding import to_grid
+from compensator.data.record import Data, require
+from compensator.data.runs import SHORTEST_RUN, Run, runs_of
+from compensator.data.table import Table
+from compensator.display import html_table
+from compensator.errors import DataError
+from compensator.reasons import Caution
+
+#: Sample period of the models made, s: the service's.
+PERIOD_S = 60.0
+_NEEDED = ("t_q_degc", "at_degc", "y_um")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """Where a table comes from.
+
+    Parameters
+    ----------
+    name : str
+        The file's name, or the role of what was in memory, such as `data 2`.
+    sha256 : str
+        Of the file's bytes; of the values of what was in memory.
+    path : pathlib.Path, optional
+        The file.
+    size : tuple of (int, tuple of str)
+        Number of rows, and columns, of what was in memory.
+    """
+
+    name: str
+    sha256: str
+    path: Path | None = None
+    size: tuple[int, tuple[str, ...]] = (0, ())
+
+    def provenance(self) -> dict[str, Any]:
+        """Return what a model file says of it."""
+        if self.path is not None:
+            return {"file": self.name, "sha256": self.sha256}
+        return {"table": self.name, "rows": self.size[0], "columns": list(self.size[1]), "sha256": self.sha256}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class Measurement:
+    """Measured data as it was read: one table, or recordings that follow each other.
+
+    Parameters
+    ----------
+    table : Table
+        What was measured, in columns named by role.
+    label : str
+        Name of its runs: the file's, without its folder.
+    origins : tuple of Origin
+        Files, or the table in memory.
+    roles : dict of str to str
+        Columns that had other names.
+    remarks : tuple of Caution
+        What reading left out.
+    in_frame : bool
+        Whether it was a pandas DataFrame; tables of results then are, too.
+    """
+
+    table: Table
+    label: str
+    origins: tuple[Origin, ...]
+    roles: Mapping[str, str] = field(default_factory=dict)
+    remarks: tuple[Caution, ...] = ()
+    in_frame: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        return self.table.name
+
+    @property
+    def hours(self) -> float:
+        """Time from the first row to the last, h."""
+        return float(np.ptp(self.table.t_s)) / 3600.0
+
+    def at_period(self, period_s: float) -> Data:
+        """Return the records at a sample period, s, with what had to be corrected.
+
+        Raises
+        ------
+        DataError
+            If a value or the time cannot be a measurement's.
+        """
+        data = to_grid(self.table, period_s)
+        return Data(records=data.records, remarks=(*self.remarks, *data.remarks))
+
+    def __repr__(self) -> str:
+        rows = [": ".join(row) for row in self._rows()]
+        return "\n".join([f"{self.name}:", *(f"  {row}" for row in rows)])
+
+    def _repr_html_(self) -> str:
+        return html_table([self.name, ""], self._rows())
+
+    def _rows(self) -> list[list[str]]:
+        t_s, columns = self.table.t_s, self.table.columns
+        apart = f" of {np.median(np.abs(np.diff(t_s))):g} s" if t_s.size > 1 else ""
+        missing = {name: 100.0 * float(np.mean(np.isnan(values))) for name, values in columns.items()}
+        names = [f"{name} ({share:.0f} % missing)" if share >= 0.5 else name for name, share in missing.items()]
+        rows = [["span", f"{self.hours:.2f} h"], ["samples", f"{t_s.size}{apart}"], ["columns", ", ".join(names)]]
+        try:
+            remarks = [remark.marked for remark in self.at_period(PERIOD_S).remarks]
+        except DataError as error:
+            remarks = [str(error)]
+        return rows + [["remark", remark] for remark in remarks]
+
+
+def read(data: Any, *, columns: Mapping[str, str] | None = None, name: str = "data") -> Measurement:
+    """Read measured data.
+
+    Parameters
+    ----------
+    data : path, DataFrame, mapping of str to array_like, Measurement, or sequence of paths
+        A table (CSV or MAT), a recording or several that follow each other, or a table in memory. Its time is `t_s`, s,
+        or `time_utc`; NaN is missing.
+    columns : mapping of str to str, optional
+        Column name for each role that has another name: `{"t_q_degc": "t5"}`.
+    name : str
+        What messages call data that is no file.
+
+    Raises
+    ------
+    DataError
+        One line that names file, row or column, value and what was expected.
+
+    Examples
+    --------
+    >>> read({"t_s": [0, 60], "t5": [20.0, 20.5], "at_degc": [20.0, 20.1]}, columns={"t_q_degc": "t5"})
+    data:
+      span: 0.02 h
+      samples: 2 of 60 s
+      columns: at_degc, t_q_degc
+    """
+    found = measurements(data, name, columns)
+    if len(found) != 1:
+        raise DataError(f"{name}: {len(found)} tables, expected one; hand several runs over as a list")
+    return found[0]
+
+
+def measurements(data: Any, role: str, columns: Mapping[str, str] | None = None) -> list[Measurement]:
+    """Read a DATA argument: one source or a list of them.
+
+    Recordings follow each other and are one; they come after the tables.
+
+    Parameters
+    ----------
+    data, columns
+        As :func:`read`, and lists of them.
+    role : str
+        What messages call data that is no file; numbered where there are several.
+
+    Raises
+    ------
+    DataError
+        As :func:`read`.
+    """
+    several = isinstance(data, Sequence) and not isinstance(data, (str, bytes))
+    sources = list(data) if several else [] if data is None else [data]
+    roles = dict(columns or {})
+    found, recordings = [], []
+    for number, source in enumerate(sources, start=1):
+        name = f"{role} {number}" if len(sources) > 1 else role
+        if isinstance(source, Measurement):
+            found.append(source)
+        elif isinstance(source, (str, os.PathLike)):
+            path = Path(source)
+            if path.suffix == ".mcap":
+                recordings.append(path)
+            else:
+                found.append(_of_file(path, roles))
+        elif isinstance(source, Mapping) or is_frame(source):
+            found.append(_in_memory(name, source, roles))
+        else:
+            raise DataError(
+                f"{name}: {type(source).__name__}, expected a path, a DataFrame, a dict of arrays, or a list of those"
+            )
+    if recordings:
+        table = read_recordings(recordings, roles)
+        origins = tuple(_origin(path, path.read_bytes()) for path in recordings)
+        found.append(Measurement(table=table, label=recordings[0].name, origins=origins, roles=roles))
+    return found
+
+
+def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}; expected a table or a recording") from error
+    table, remarks = (read_mat(path) if path.suffix == ".mat" else read_csv(path, data)).measurements_only()
+    table, origins = table.with_roles(roles), (_origin(path, data),)
+    return Measurement(table=table, label=path.name, origins=origins, roles=roles, remarks=remarks)
+
+
+def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
+    table, remarks = table_in_memory(name, source).measurements_only()
+    origin = Origin(name=name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
+    return Measurement(
+        table=table.with_roles(roles),
+        label=name,
+        origins=(origin,),
+        roles=roles,
+        remarks=remarks,
+        in_frame=is_frame(source),
+    )
+
+
+def _origin(path: Path, data: bytes) -> Origin:
+    return Origin(name=path.name, sha256=hashlib.sha256(data).hexdigest(), path=path)
+
+
+def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[list[Run], list[Caution]]:
+    """Return the runs of measurements, and what had to be corrected.
+
+    Parameters
+    ----------
+    data : sequence of Measurement
+        With T_Q, AT and Y.
+    period_s : float
+        Sample period of the model, s.
+
+    Raises
+    ------
+    DataError
+        If a column is missing, or there is no stretch long enough for a run.
+    """
+    gridded = [(measured, measured.at_period(period_s)) for measured in data]
+    runs: list[Run] = []
+    remarks: list[Caution] = []
+    for measured, part in gridded:
+        remarks += part.remarks
+        for record in part.records:
+            require(measured.name, record, _NEEDED)
+            for run, corrected in runs_of(measured.label, record):
+                runs.append(run)
+                remarks += corrected
+    if not runs and gridded:
+        raise DataError(_without_runs(gridded[0][0].name, gridded[0][1], period_s))
+    return runs, remarks
+
+
+def _without_runs(name: str, data: Data, period_s: float) -> str:
+    """Say why data holds nothing to work with."""
+    size = sum(record.t_s.size for record in data.records)
+    for column in ("t_q_degc", "at_degc", "heat_w"):
+        missing = sum(int(np.isnan(r.columns[column]).sum()) for r in data.records if column in r.columns)
+        if missing > size // 2:
+            return f"{name}: {column} is missing in {missing} of {size} samples, expected it in most of them"
+    return (
+        f"{name}: {size * period_s / 60.0:.0f} min of data in {len(data.records)} part(s), expected at least one of "
+        f"{SHORTEST_RUN * period_s / 60.0:.0f} min without a long gap, and 120 min in all for a model"
+    )

@@ -1,0 +1,216 @@
+"""Tables as they were read: a time, and columns of numbers by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from compensator.arrays import Vector
+from compensator.errors import DataError, UsageError
+from compensator.reasons import Caution
+
+ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
+
+#: Columns of an exported recording that the service computed.
+EXPORTED = (
+    "seq",
+    "heat_w",
+    "y_dtf_um",
+    "y_tdtf_um",
+    "y_pred_um",
+    "y_std_um",
+    "residual_um",
+    "y_offset_um",
+    "y_offset_rate_um_per_min",
+    "y_offset_std_um",
+    "state",
+    "reasons",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A table as it was read.
+
+    Parameters
+    ----------
+    name : str
+        Name for messages.
+    t_s : numpy.ndarray, shape (n,)
+        Time of each row from the first row, s.
+    columns : dict of str to numpy.ndarray, shape (n,)
+        Numeric columns by name; NaN where missing.
+    rows : sequence of int
+        Number of each row as its user counts it, for messages.
+    start_utc_s : float, optional
+        Time of the first row, s since 1970, where the table has `time_utc`.
+    """
+
+    name: str
+    t_s: Vector
+    columns: dict[str, Vector]
+    rows: Sequence[int]
+    start_utc_s: float | None = None
+
+    def with_roles(self, roles: Mapping[str, str]) -> Table:
+        """Return the table with a role's name for columns of other names.
+
+        Raises
+        ------
+        DataError
+            If there is no such role or column.
+        """
+        for role, name in roles.items():
+            where = f"{self.name}: --column {role}={name}: "
+            if role not in ROLES:
+                raise DataError(f"{where}expected a role of {', '.join(ROLES)}")
+            if name not in self.columns:
+                raise DataError(f"{where}no such column, expected one of: {', '.join(self.columns)}")
+        others = {name: values for name, values in self.columns.items() if name not in roles.values()}
+        return replace(self, columns=others | {role: self.columns[name] for role, name in roles.items()})
+
+    def measurements_only(self) -> tuple[Table, tuple[Caution, ...]]:
+        """Leave out of an exported recording what the service computed.
+
+        Its heat is the model's own estimate: a model fitted to it as to a measured heat would reproduce itself.
+        """
+        if not {"y_pred_um", "y_offset_um"} <= self.columns.keys():
+            return self, ()
+        kept = {name: values for name, values in self.columns.items() if name not in EXPORTED}
+        if "heat_measured_w" in kept:
+            kept["heat_w"] = kept.pop("heat_measured_w")
+        words = f"{self.name}: an exported recording; the service's estimates and offsets are left out, with heat_w."
+        return replace(self, columns=kept), (Caution("estimates_left_out", words),)
+
+
+def table_of(name: str, cells: Mapping[str, Any], *, rows: Sequence[int] | None = None, has: str = "it has") -> Table:
+    """Make a table of columns of cells: text as in a CSV, numbers, or times.
+
+    Parameters
+    ----------
+    name : str
+        Name for messages.
+    cells : mapping of str to array_like, shape (n,)
+        Columns by name; `t_s` or `time_utc` among them. A column that is not numeric is left out unless it has a role.
+    rows : sequence of int, optional
+        Number of each row for messages; from 0 where it is not given.
+    has : str
+        Words before the names of the columns in a message.
+
+    Raises
+    ------
+    DataError
+        One line that names row or column, value and what was expected.
+
+    Examples
+    --------
+    >>> table = table_of("data", {"t_s": [60.0, 120.0], "y_um": ["1.5", ""]})
+    >>> table.t_s, table.columns["y_um"]
+    (array([ 0., 60.]), array([1.5, nan]))
+    """
+    time_column = next((column for column in ("t_s", "time_utc") if column in cells), None)
+    if time_column is None:
+        raise DataError(f"{name}: no column t_s or time_utc; {has}: {', '.join(cells)[:100]}")
+    arrays = {column: _flat(name, column, values) for column, values in cells.items()}
+    size = arrays[time_column].size
+    if size == 0:
+        raise DataError(f"{name}: no rows in it, expected data")
+    rows = range(size) if rows is None else rows
+    numbers: dict[str, Vector] = {}
+    for column, values in arrays.items():
+        if values.size != size:
+            raise DataError(f"{name}: {column} has {values.size} values, {time_column} {size}, expected equally many")
+        if column in (time_column, "time_utc"):
+            continue
+        if (converted := _numbers(name, column, values, rows)) is not None:
+            numbers[column] = converted
+    reader = _numbers if time_column == "t_s" else _seconds
+    time = reader(name, time_column, arrays[time_column], rows)
+    assert time is not None
+    if np.isnan(time).any():
+        raise DataError(f"{name}: row {rows[int(np.argmax(np.isnan(time)))]}: time is missing")
+    start = float(time[0]) if time_column == "time_utc" else None
+    return Table(name=name, t_s=time - time[0], columns=numbers, rows=rows, start_utc_s=start)
+
+
+def _flat(name: str, column: str, values: Any) -> np.ndarray[Any, Any]:
+    """Return a column as an array of one axis; MATLAB's are of two."""
+    array = np.asarray(np.ma.filled(values.astype(float), np.nan) if np.ma.isMaskedArray(values) else values)
+    if array.ndim != 1 and array.size != max(array.shape, default=0):
+        raise DataError(f"{name}: {column} has the shape {array.shape}, expected one value for each row")
+    return array.ravel()
+
+
+def _numbers(name: str, column: str, values: np.ndarray[Any, Any], rows: Sequence[int]) -> Vector | None:
+    """Return a column as numbers, None where it holds something else and has no role."""
+    if values.dtype.kind in "biuf":
+        numbers = values.astype(np.float64)
+    else:
+        numbers = np.empty(values.size)
+        for i, cell in enumerate(values.tolist()):
+            try:
+                numbers[i] = _number(cell)
+            except (ValueError, TypeError, OverflowError) as error:
+                if column not in (*ROLES, "t_s"):
+                    return None
+                where = f"{name}: row {rows[i]}: {column}"
+                raise DataError(f"{where} = {str(cell).strip()[:40]!r}, expected a number") from error
+    if np.isinf(numbers).any():
+        i = int(np.argmax(np.isinf(numbers)))
+        raise DataError(f"{name}: row {rows[i]}: {column} = {numbers[i]}, expected a finite number")
+    return numbers
+
+
+def _number(cell: Any) -> float:
+    if cell is None:
+        return math.nan
+    return float(cell) if not isinstance(cell, str) or cell.strip() else math.nan
+
+
+def _seconds(name: str, column: str, values: np.ndarray[Any, Any], rows: Sequence[int]) -> Vector:
+    """Return times as seconds since 1970; a time without a zone is UTC."""
+    if values.dtype.kind == "M":
+        whole = values.astype("datetime64[us]")
+        return np.where(np.isnat(whole), np.nan, whole.astype(np.int64) / 1e6)
+    seconds = np.empty(values.size)
+    for i, cell in enumerate(values.tolist()):
+        try:
+            seconds[i] = _timestamp(cell)
+        except (ValueError, TypeError, OverflowError) as error:
+            where = f"{name}: row {rows[i]}: {column} = {str(cell).strip()[:40]!r}"
+            raise DataError(f"{where}, expected a time such as 2025-11-21T08:00:00Z") from error
+    return seconds
+
+
+def _timestamp(cell: Any) -> float:
+    if cell is None or (isinstance(cell, str) and not cell.strip()):
+        return math.nan
+    time = cell if isinstance(cell, datetime) else datetime.fromisoformat(cell.strip())
+    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+
+
+def roles_of(pairs: Sequence[str]) -> dict[str, str]:
+    """Split `--column ROLE=NAME`.
+
+    Raises
+    ------
+    UsageError
+        If one of them is no such pair.
+
+    Examples
+    --------
+    >>> roles_of(["t_q_degc=t5_degc"])
+    {'t_q_degc': 't5_degc'}
+    """
+    roles = {}
+    for pair in pairs:
+        role, equals, name = pair.partition("=")
+        if not equals or not role or not name:
+            raise UsageError(f"--column {pair}: expected ROLE=NAME, such as t_q_degc=t5_degc")
+        roles[role] = name
+    return roles

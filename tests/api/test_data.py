@@ -1,0 +1,179 @@
+"""DATA as a path, a dict, a DataFrame, a MAT file, or a list of them; what is refused, and in which words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import savemat
+
+import compensator as tc
+from compensator.data.measurement import measurements
+from tests.api.tables import START, arrays, by_time, frame, write_run
+from tests.identify.quill_runs import CALIBRATION_W
+
+SMALL = {"t_s": [0.0, 60.0, 120.0], "t_q_degc": [20.0, 21.0, 22.0], "at_degc": [20.0, 20.0, 20.1]}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("data") / "run.csv", CALIBRATION_W, 1)
+
+
+def records(data: object, **options: object) -> list[dict[str, np.ndarray]]:
+    return [{"t_s": r.t_s, **r.columns} for r in tc.read(data, **options).at_period(60.0).records]
+
+
+def same(found: list[dict[str, np.ndarray]], wanted: list[dict[str, np.ndarray]]) -> None:
+    assert [list(one) for one in found] == [list(one) for one in wanted]
+    for one, other in zip(found, wanted, strict=True):
+        for name, values in other.items():
+            np.testing.assert_array_equal(one[name], values)
+
+
+def test_a_dict_a_dataframe_and_a_datetime_index_are_what_the_file_is(run: Path) -> None:
+    wanted = records(run)
+    same(records(arrays(run)), wanted)
+    same(records({name: values.tolist() for name, values in arrays(run).items()}), wanted)
+    same(records(frame(run)), wanted)
+    same(records(frame(run).set_index("t_s")), [{name: one[name] for name in one} for one in wanted])
+    same(records(by_time(run)), wanted)
+    same(records(by_time(run).tz_localize(None)), wanted)
+
+
+def test_times_in_text_and_in_zones_are_utc_in_a_file_and_in_memory(tmp_path: Path) -> None:
+    # The night in which Central Europe loses an hour: a time without a zone is UTC and nothing is missing.
+    times = pd.date_range("2026-03-29T00:30:00", periods=120, freq="min")
+    t_q = 20.0 + np.arange(120) / 10.0
+    table = pd.DataFrame({"time_utc": times, "t_q_degc": t_q, "at_degc": 20.0})
+    table.to_csv(tmp_path / "night.csv", index=False)
+    wanted = records(tmp_path / "night.csv")
+    assert [one["t_s"][-1] for one in wanted] == [119 * 60.0]
+    same(records(table), wanted)
+    zoned = table.assign(time_utc=times.tz_localize("UTC").tz_convert("Europe/Berlin"))
+    same(records(zoned), wanted)
+    same(records(table.assign(time_utc=[t.isoformat() + "Z" for t in times])), wanted)
+    same(records({"time_utc": times.to_numpy(), "t_q_degc": t_q, "at_degc": np.full(120, 20.0)}), wanted)
+    same(records({"time_utc": times.to_pydatetime().tolist(), "t_q_degc": t_q, "at_degc": [20.0] * 120}), wanted)
+
+
+def test_missing_values_of_every_make_are_missing() -> None:
+    nullable = pd.DataFrame(SMALL).assign(y_um=pd.array([1, None, 3], dtype="Int64"), fan=[None, 1.0, "2"], note="warm")
+    ((record,),) = [records(nullable)]
+    np.testing.assert_array_equal(record["y_um"], [1.0, np.nan, 3.0])
+    np.testing.assert_array_equal(record["fan"], [np.nan, 1.0, 2.0])
+    assert "note" not in record
+    masked = np.ma.masked_equal([1.0, -9999.0, 3.0], -9999.0)
+    np.testing.assert_array_equal(records(SMALL | {"y_um": masked})[0]["y_um"], [1.0, np.nan, 3.0])
+    np.testing.assert_array_equal(records(SMALL | {"y_um": [1, None, ""]})[0]["y_um"], [1.0, np.nan, np.nan])
+
+
+def test_columns_give_roles_in_files_and_in_memory(tmp_path: Path) -> None:
+    renamed = pd.DataFrame(SMALL).rename(columns={"t_q_degc": "t5", "at_degc": "room"})
+    renamed.to_csv(tmp_path / "run.csv", index=False)
+    columns = {"t_q_degc": "t5", "at_degc": "room"}
+    for data in (tmp_path / "run.csv", str(tmp_path / "run.csv"), renamed, renamed.to_dict("list")):
+        assert set(tc.read(data, columns=columns).table.columns) == {"t_q_degc", "at_degc"}
+    with pytest.raises(tc.CompensatorError, match=r"^data: --column t_q_degc=t9: no such column, expected one of: t5"):
+        tc.read(renamed, columns={"t_q_degc": "t9"})
+
+
+def test_a_run_shows_itself() -> None:
+    table = pd.DataFrame(SMALL | {"y_um": [1.0, np.nan, 2.0]})
+    table.loc[3] = {"t_s": 720.0, "t_q_degc": 22.0, "at_degc": 20.0, "y_um": 2.0}
+    run = tc.read(table, name="<press>")
+    said = repr(run)
+    for words in ("<press>", "0.20 h", "4 of 60 s", "t_q_degc, at_degc, y_um (25 % missing)", "gap of 9 sample(s)"):
+        assert words in said
+    page = run._repr_html_()
+    assert "&lt;press&gt;" in page and "<press>" not in page and "0.20 h" in page
+
+
+def test_a_list_is_several_runs_and_recordings_of_it_are_one(run: Path) -> None:
+    found = measurements([frame(run), run, tc.read(arrays(run), name="mine")], "data")
+    assert [one.label for one in found] == ["data 1", "run.csv", "mine"]
+    assert measurements((), "etve") == [] == measurements(None, "etve")
+    with pytest.raises(tc.CompensatorError, match="2 tables, expected one"):
+        tc.read([run, run])
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (7, "data: int, expected a path, a DataFrame, a dict of arrays, or a list of those"),
+        (np.zeros((3, 3)), "data: ndarray, expected a path"),
+        ([SMALL, 7], "data 2: int, expected a path"),
+        ({"y_um": [1.0]}, "data: no column t_s or time_utc; it has: y_um"),
+        ({"t_s": [], "y_um": []}, "data: no rows in it"),
+        (SMALL | {"y_um": [1.0]}, "data: y_um has 1 values, t_s 3, expected equally many"),
+        (SMALL | {"y_um": np.zeros((3, 2))}, "data: y_um has the shape (3, 2), expected one value for each row"),
+        (SMALL | {"y_um": [1.0, 2.0, "x"]}, "data: row 2: y_um = 'x', expected a number"),
+        (SMALL | {"y_um": [1.0, np.inf, 2.0]}, "data: row 1: y_um = inf, expected a finite number"),
+        (SMALL | {"t_s": [0.0, np.nan, 120.0]}, "data: row 1: time is missing"),
+        ({"time_utc": ["soon"], "y_um": [1.0]}, "data: row 0: time_utc = 'soon', expected a time such as 2025"),
+        (pd.DataFrame([[0.0, 1.0, 1.0]], columns=["t_s", "y_um", "y_um"]), "data: column 'y_um' is there twice"),
+        ("absent.csv", "absent.csv: No such file"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_is_no_data_is_refused_in_one_line(data: object, words: str) -> None:
+    with pytest.raises(tc.CompensatorError) as refused:
+        measurements(data, "data")
+    assert words in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_the_rows_of_a_file_are_counted_as_an_editor_does(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("t_s,y_um\n0,1\n\n60,x\n")
+    with pytest.raises(tc.CompensatorError, match=r"row 4: y_um = 'x', expected a number"):
+        tc.read(path)
+    path.write_text("t_s,y_um\n\n")
+    with pytest.raises(tc.CompensatorError, match="no rows in it"):
+        tc.read(path)
+
+
+@pytest.mark.parametrize("as_struct", [False, True])
+def test_vectors_and_structs_of_matlab_are_tables(tmp_path: Path, run: Path, as_struct: bool) -> None:
+    wanted = {name: values[:, None] for name, values in arrays(run).items()}
+    path = tmp_path / "run.mat"
+    savemat(path, {"run": wanted} if as_struct else {**wanted, "Ts": 60.0, "note": "a scalar and a text beside them"})
+    same(records(path), records(run))
+
+
+def test_matlab_s_times_in_text_are_read(tmp_path: Path) -> None:
+    times = [f"2026-01-01T00:{minute:02}:00Z" for minute in range(3)]
+    for cells in (np.array(times), np.array(times, dtype=object)):
+        savemat(tmp_path / "run.mat", {"time_utc": cells, "y_um": [1.0, 2.0, 3.0]})
+        assert records(tmp_path / "run.mat")[0]["t_s"].tolist() == [0.0, 60.0, 120.0]
+
+
+def test_what_matlab_alone_reads_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    path = tmp_path / "run.mat"
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + b"\0" * 8 + b"\x00\x02IM"
+    path.write_bytes(head.ljust(512, b"\0") + b"\x89HDF\r\n\x1a\n" + b"\0" * 512)
+    with pytest.raises(tc.CompensatorError, match=r"run.mat: a MAT file of version 7.3 .* writetable"):
+        tc.read(path)
+    for content in (b"", b"no MAT file at all, whatever its name", path.read_bytes()[:100]):
+        path.write_bytes(content)
+        with pytest.raises(tc.CompensatorError, match=r"run\.mat: "):
+            tc.read(path)
+    savemat(path, {"gain": 3.0})
+    with pytest.raises(tc.CompensatorError, match=r"no vector t_s or time_utc; it has: gain.*table2struct.*writetable"):
+        tc.read(path)
+    path.rename(tmp_path / "run.csv")
+    with pytest.raises(tc.CompensatorError, match=r"name it FILE.mat"):
+        tc.read(tmp_path / "run.csv")
+
+
+def test_tables_of_results_are_dataframes_where_one_came_in(run: Path) -> None:
+    out = tc.simulate("quill", by_time(run))
+    assert isinstance(out, pd.DataFrame)
+    assert out.index[0] == START and out.index[-1] == START + pd.Timedelta(719, "min")
+    assert isinstance(tc.simulate("quill", frame(run)).index, pd.RangeIndex)
+    assert isinstance(out["y_pred_um"].to_numpy(), np.ndarray) and type(out.head()) is pd.DataFrame
+    plain = tc.simulate("quill", arrays(run))
+    assert isinstance(plain["y_pred_um"], np.ndarray)
+    assert list(plain) == list(out.columns) and plain.scores == out.scores
+    assert isinstance(tc.compare({"quill": "quill"}, frame(run)).table, pd.DataFrame)
