@@ -19,8 +19,8 @@ from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation
 from compensator.service.model_store import ModelStore, sha256_of
-from compensator.service.retrace import WARM_UP, samples_between, warm_up
 from compensator.service.state import ZeroMode
+from compensator.service.warm_up import WARM_UP, warm_up
 
 #: Longest payload of a command that brings a model, bytes.
 LONGEST_MODEL = 1_000_000
@@ -126,14 +126,13 @@ class Prepared:
     known: bool
 
     def catch_up(self, sample: Sample, zero: ZeroMode | None) -> None:
-        """Take a sample that came while the model was warmed up; one that is in the recording is left out."""
-        seq, time_ns = self.compensation.last
+        """Run a sample that came during the warm-up; one that is in the recording is left out."""
+        seq, _ = self.compensation.last
         if sample.seq <= seq:
             return
-        if seq >= 0 and sample.seq > seq + 1:
-            # The disk did not take what is between.
-            period_s = self.compensation.model.period_s
-            self.compensation.pause(samples_between(time_ns, sample.time_utc_ns, period_s))
+        if seq >= 0:
+            # Numbers between were not on disk in time for the warm-up.
+            self.compensation.pause(sample.seq - seq - 1)
         if zero is not None:
             self.compensation.zero(zero)
         self.compensation.process(sample)

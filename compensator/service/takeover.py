@@ -11,6 +11,7 @@ from typing import Any
 
 from compensator.clock import Clock
 from compensator.errors import CompensatorError
+from compensator.events import EventKind
 from compensator.service.adoption import Adoption, Prepared, Wanted
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.journal import Journal
@@ -66,10 +67,10 @@ class Takeover:
             return
         # The text of the model is not repeated here: it travels in the recording that begins with it.
         data = {"sha256": wanted.sha256, "force": wanted.force}
-        self._journal.note("command", wanted.action, data | sent_by(sender))
+        self._journal.note("command", wanted.action, data | {"command": wanted.action} | sent_by(sender))
         self._adopting = _Adopting(wanted, reply)
         self._adopting.task = asyncio.create_task(self._prepare(self._adoption, self._adopting))
-        self._adopting.task.add_done_callback(self._tell_refusal)
+        self._adopting.task.add_done_callback(self._answer_refusal)
 
     def follow(self, outcome: Outcome) -> None:
         """Take note of a sample that comes while a model is made ready."""
@@ -85,9 +86,8 @@ class Takeover:
         prepared = adopting.prepared
         new = prepared.compensation
         for outcome in adopting.since:
-            zeroed = any(kind == "zero" for kind, _ in outcome.notes)
-            how = "rest" if outcome.estimate.y_base_um == 0.0 else "warm"
-            prepared.catch_up(outcome.sample, how if zeroed else None)  # type: ignore[arg-type]
+            zero = next((note.data["mode"] for note in outcome.notes if note.kind == EventKind.ZERO), None)
+            prepared.catch_up(outcome.sample, zero)
         difference = new.target_um - old.target_um
         new.succeed(old)
         self._journal.start_new_file(prepared.data)
@@ -140,7 +140,7 @@ class Takeover:
             }
         )
 
-    def _tell_refusal(self, task: asyncio.Task[None]) -> None:
+    def _answer_refusal(self, task: asyncio.Task[None]) -> None:
         """Answer that nothing comes of it, whatever the reason: the running model goes on."""
         adopting, error = self._adopting, None if task.cancelled() else task.exception()
         if adopting is None or error is None:

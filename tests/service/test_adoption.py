@@ -18,7 +18,7 @@ from compensator.recording.reading import recordings
 from compensator.service.adoption import Adoption
 from compensator.service.compensation import Outcome
 from compensator.service.model_store import ModelStore, sha256_of
-from compensator.service.retrace import opening_of
+from compensator.service.replay import opening_of
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.test_restart import QUILL, STRONGER
 

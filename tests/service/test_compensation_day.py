@@ -206,7 +206,7 @@ async def test_commands_hold_resume_zero(bench: Bench) -> None:
     # The machine is warm there: its stored heat goes on, only the deformation counts from here.
     zero = bench.outcomes[161 - 1]
     assert number(zero.estimate.y_um) == pytest.approx(0.0, abs=1e-9)
-    assert any("warm" in text for kind, text in zero.notes if kind == "zero")
+    assert any(note.data["mode"] == "warm" for note in zero.notes if note.kind == "zero")
     assert abs(number(zero.estimate.y_pred_um)) < 1.0
     settled = bench.outcomes[200:]
     assert np.std([number(o.estimate.residual_um) for o in settled]) < 0.7

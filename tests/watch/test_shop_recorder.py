@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from compensator import durable
 from compensator.cli import main
 from compensator.clock import NS
 from compensator.errors import DataError
+from compensator.recording import live_file
 from compensator.watch import shop_recorder
 from compensator.watch.shop_file import compact
 from compensator.watch.shop_recorder import ShopRecorder
@@ -152,7 +152,7 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path, monkeypatch
             raise OSError(28, "No space left on device")
         sync(descriptor)
 
-    monkeypatch.setattr(durable.os, "fsync", fsync)
+    monkeypatch.setattr(live_file.os, "fsync", fsync)
     monkeypatch.setattr(shop_recorder, "SYNC_S", 0.02)
     with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
         recorder.take(KEY + "y/offset", offset(1))
