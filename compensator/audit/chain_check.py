@@ -79,10 +79,9 @@ class ChainCheck:
             if not records:
                 self._next = sequence + 1
                 return
-        value, number, entries = self.head, self._next, []
+        result, value, number, entries = self._result, self.head, self._next, []
         whole = True
-        for record in records:
-            topic, its_number, its_time, its_body = record
+        for topic, its_number, its_time, its_body in records:
             before = value
             value = _sha256(b"%b%b%b" % (value, _PREFIX[topic], its_body)).digest()
             entries.append(f'{{"topic":"{topic}","sequence":{its_number},"sha256":"{value.hex()}"}}')
@@ -90,11 +89,11 @@ class ChainCheck:
             number += 1
             if topic == "seal":
                 self._before_last = before
-                self._seal(before, record)
+                self._seal(before, Record(topic, its_number, its_time, its_body))
             else:
-                self._result.seal, self._result.sealed_signed = "", False
-                self._result.unsigned_behind += 1
-        self._result.records += len(records)
+                result.seal, result.sealed_signed = "", False
+                result.unsigned_behind += 1
+        result.records += len(records)
         expected = (
             f'{{"schema":{SCHEMA},"machine":{self._machine},"time_utc_ns":{time_ns},"before":"{self.head.hex()}",'
             f'"parts":[],"records":[{",".join(entries)}]}}'

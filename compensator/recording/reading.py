@@ -97,17 +97,19 @@ def groups_of(container: Container) -> Iterator[Group]:
         Where it cannot be read any further; everything before that was yielded.
     """
     records: list[Record] = []
-    chained: bool | None = None
+    end = ""
     try:
         for record in records_of(container):
-            if chained is None:
-                chained = any(channel.topic == "/chain" for channel in container.contents.channels.values())
-            if record.topic == "chain" and chained:
+            topic = record.topic
+            if not end:
+                topics = {channel.topic for channel in container.contents.channels.values()}
+                end = "chain" if "/chain" in topics else "offset"
+            if topic == end == "chain":
                 yield Group(records, record, True)
                 records = []
                 continue
             records.append(record)
-            if record.topic == "offset" and not chained:
+            if topic == end:
                 yield Group(records, None, True)
                 records = []
     except Damaged:
