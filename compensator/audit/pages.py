@@ -82,7 +82,9 @@ def verdict(found: Audit) -> str:
         return f"Not proven: {' and '.join(said)} in {files} with {found.samples} samples."
     if _partly(found):
         return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
-    words = f"Proven: {found.samples} samples in {files} are as they were written, and the replay reproduces every offset"
+    words = (
+        f"Proven: {found.samples} samples in {files} are as they were written, and the replay reproduces every offset"
+    )
     return words + (", signed by the key given." if found.signed else "; no signature was checked.")
 
 

@@ -146,7 +146,7 @@ class Recorder:
             self._give_up()
             raise
         self._live, self._reason, self._last = None, reason, live.head
-        self._finisher.put(live.path, live.time_ns)
+        self._finisher.enqueue(live.path, live.time_ns)
 
     def _give_up(self) -> None:
         """Leave the file as it was after the last sync; what it took since then was not whole."""
@@ -198,7 +198,7 @@ class Recorder:
         if self._reason in ("start", "failure"):
             # A kill leaves files that are not finished: at a start any of them, after a failure the last.
             for path in previous if self._reason == "start" else previous[-1:]:
-                self._finisher.put(path, time_utc_ns)
+                self._finisher.enqueue(path, time_utc_ns)
 
     def _names(self, time_utc_ns: int, newest: Path | None) -> Iterator[Path]:
         """Yield names for a new file by machine and UTC time."""
