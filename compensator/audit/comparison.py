@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from compensator.audit.findings import utc
 from compensator.clock import NS
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind
-from compensator.messages import number
+from compensator.messages import EstimateMessage, Offset, number
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Caution
 from compensator.recording.container import Container, Contents
@@ -35,26 +33,6 @@ COLUMNS = (
     "other_residual_um",
     "other_state",
 )
-
-
-class _Estimate(msgspec.Struct):
-    """What is needed of a recorded estimate."""
-
-    t_q_ref_degc: float | None
-    at_ref_degc: float | None
-    y_ref_um: float | None
-    y_base_um: float
-    y_um: float | None
-    residual_um: float | None
-
-
-class _Offset(msgspec.Struct):
-    """What is needed of a recorded offset."""
-
-    y_offset_um: float | None
-
-
-_ESTIMATE, _OFFSET = msgspec.json.Decoder(_Estimate), msgspec.json.Decoder(_Offset)
 
 
 @dataclass(slots=True)
@@ -100,21 +78,25 @@ class Comparison:
             "remark_codes": [remark.code for remark in self.remarks],
         }
 
+    def rows(self) -> dict[str, Spread]:
+        """Return the figures with their names, in the order in which they are shown."""
+        return {
+            f"residual, {self.recorded} (recorded)": self.residual_before,
+            f"residual, {self.other}": self.residual_after,
+            f"left with the offset, {self.recorded} (recorded)": self.left_before,
+            f"left with the offset, {self.other}": self.left_after,
+            f"offset of {self.other} − recorded offset": self.offsets,
+        }
+
     def text(self) -> str:
         """Return a table for people."""
-        rows = [
-            (f"residual, {self.recorded} (recorded)", self.residual_before),
-            (f"residual, {self.other}", self.residual_after),
-            (f"left with the offset, {self.recorded} (recorded)", self.left_before),
-            (f"left with the offset, {self.other}", self.left_after),
-            (f"offset of {self.other} − recorded offset", self.offsets),
-        ]
-        width = max(len(name) for name, _ in rows)
+        rows = self.rows()
+        width = max(map(len, rows))
         lines = [
             f"{self.samples} samples; y_um was measured in {self.residual_before.samples} of them",
             f"{'':<{width}} {'rms µm':>9} {'peak µm':>9} {'samples':>9}  worst at",
         ]
-        for name, spread in rows:
+        for name, spread in rows.items():
             figures = f"{spread.rms:9.3f} {abs(spread.peak):9.3f}" if spread.samples else f"{'–':>9} {'–':>9}"
             worst = worst_utc(spread) if spread.samples else "–"
             lines.append(f"{name:<{width}} {figures} {spread.samples:9d}  {worst}")
@@ -176,14 +158,14 @@ class _Run:
 
     def add(self, step: Step, contents: Contents) -> None:
         """Run one group."""
-        estimate, offset = step.decode(_ESTIMATE, "estimate"), step.decode(_OFFSET, "offset")
+        estimate, offset = step.estimate, step.offset
         if self._free is None and (step.sample is None or estimate is None):
             return
         result = self._ready(step, contents, estimate).run(step)
         if isinstance(result, Outcome) and estimate is not None and offset is not None:
             self._compare(estimate, offset, result)
 
-    def _ready(self, step: Step, contents: Contents, estimate: _Estimate | None) -> FreeRun:
+    def _ready(self, step: Step, contents: Contents, estimate: EstimateMessage | None) -> FreeRun:
         """Return the run with the other model and the configuration of the file."""
         parts = [contents.attachments.get(name) for name in ("config.toml", "model.toml")]
         data, model = (part.data if part else b"" for part in parts)
@@ -202,7 +184,7 @@ class _Run:
             self._begin(self._free.compensation, step, estimate)
         return self._free
 
-    def _begin(self, compensation: Compensation, step: Step, estimate: _Estimate) -> None:
+    def _begin(self, compensation: Compensation, step: Step, estimate: EstimateMessage) -> None:
         """Begin with the recorded zero where the first sample sets none."""
         zero = any(event.kind == EventKind.ZERO for event in step.events)
         if estimate.t_q_ref_degc is None or estimate.at_ref_degc is None or zero:
@@ -219,7 +201,7 @@ class _Run:
         )
         self._result.remarks.append(Caution("begins_running", figures))
 
-    def _compare(self, estimate: _Estimate, offset: _Offset, outcome: Outcome) -> None:
+    def _compare(self, estimate: EstimateMessage, offset: Offset, outcome: Outcome) -> None:
         result, sample = self._result, outcome.sample
         at_s = sample.time_utc_ns / NS
         y, other_y = number(estimate.y_um), number(outcome.estimate.y_um)

@@ -348,13 +348,7 @@ def _before_and_after(found: Comparison) -> Table:
     return Table(
         title="Before and after",
         head=["", "rms µm", "largest µm", "samples", "largest at"],
-        rows=[
-            row(f"residual, {found.recorded} (recorded)", found.residual_before),
-            row(f"residual, {found.other}", found.residual_after),
-            row(f"left with the offset, {found.recorded} (recorded)", found.left_before),
-            row(f"left with the offset, {found.other}", found.left_after),
-            row(f"offset of {found.other} − recorded offset", found.offsets),
-        ],
+        rows=[row(name, spread) for name, spread in found.rows().items()],
         note="Residual: measured − predicted. Every recorded sample went through the service's own compensation with "
         "the other model, limits and losses included.",
     )

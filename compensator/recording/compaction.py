@@ -18,7 +18,6 @@ from mcap.exceptions import McapError
 from mcap.reader import McapReader, make_reader
 from mcap.writer import CompressionType, Writer
 
-from compensator import __version__
 from compensator.errors import DataError
 from compensator.recording import chain
 from compensator.recording.container import (
@@ -30,7 +29,7 @@ from compensator.recording.container import (
     Message,
     Torn,
 )
-from compensator.recording.live_file import sync_folder
+from compensator.recording.live_file import Opening, sync_folder
 
 #: Number of messages after which a patient copy lets other threads go first, and for how long, s.
 TURN, MOMENT_S = 64, 0.0005
@@ -50,10 +49,9 @@ class Copy:
 
     def __init__(self, contents: Contents, writer: Writer) -> None:
         self.contents, self._writer = contents, writer
-        self._begun = False
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._opening = Opening(writer)
         #: Topics by number of the channel, as far as they were met.
-        self.topics: dict[int, str] = {}
+        self.topics = self._opening.topics
         self._digest = hashlib.sha256()
         #: Messages in the copy, and whether the original ends within a record.
         self.messages, self.torn = 0, False
@@ -61,7 +59,7 @@ class Copy:
     def add(self, message: Message) -> None:
         """Copy one message."""
         if message.channel not in self.topics:
-            self._register()
+            self._opening.write(self.contents)
         publish_ns = int.from_bytes(message.body[12:PAYLOAD], "little")
         self._writer.add_message(
             message.channel, message.log_time_ns, message.body[PAYLOAD:], publish_ns, sequence=message.sequence
@@ -71,34 +69,12 @@ class Copy:
 
     def finish(self) -> None:
         """Write the end."""
-        self._register()
+        self._opening.write(self.contents)
         self._writer.finish()  # type: ignore[no-untyped-call]
 
     def digest(self) -> str:
         """Return the hash over everything in the copy."""
         return _with_parts(self._digest, self.contents)
-
-    def _register(self) -> None:
-        """Write what was met since the last message; the numbers of channels stay."""
-        contents, writer = self.contents, self._writer
-        if not self._begun:
-            writer.start(profile="", library=contents.library or f"compensator {__version__}")
-        for number, channel in contents.channels.items():
-            if number in self.topics:
-                continue
-            schema = (channel.schema_name, channel.schema_encoding, channel.schema)
-            if channel.schema_name and schema not in self._schemas:
-                self._schemas[schema] = writer.register_schema(*schema)
-            schema_number = self._schemas.get(schema, 0)
-            if number != writer.register_channel(channel.topic, channel.encoding, schema_number, channel.metadata):
-                raise DataError(f"channel {number} {channel.topic}: expected the numbers that the recorder gives")
-            self.topics[number] = channel.topic.lstrip("/")
-        if not self._begun:
-            self._begun = True
-            for name, table in contents.metadata.items():
-                writer.add_metadata(name, table)
-            for part in contents.attachments.values():
-                writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
 
 
 def rewrite(

@@ -11,6 +11,10 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
+from compensator import __version__
+from compensator.errors import DataError
+from compensator.recording.container import Contents
+
 
 @dataclass(slots=True)
 class _Sink:
@@ -83,6 +87,52 @@ class LiveFile:
                 self.path.unlink()
                 cut = True
         return cut
+
+
+class Opening:
+    """Writes what a file opens with: channels under their numbers, metadata, attachments.
+
+    Parameters
+    ----------
+    writer : Writer
+        Of the file.
+    """
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._begun = False
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        #: Topics that were written, without the slash, by number of the channel.
+        self.topics: dict[int, str] = {}
+
+    def write(self, contents: Contents) -> None:
+        """Write what was not written yet; behind the first call these are further channels.
+
+        Raises
+        ------
+        DataError
+            If a channel has not the number that it gets here.
+        """
+        writer = self._writer
+        if not self._begun:
+            writer.start(profile="", library=contents.library or f"compensator {__version__}")
+        for number, channel in contents.channels.items():
+            if number in self.topics:
+                continue
+            schema = (channel.schema_name, channel.schema_encoding, channel.schema)
+            if channel.schema_name and schema not in self._schemas:
+                self._schemas[schema] = writer.register_schema(*schema)
+            schema_number = self._schemas.get(schema, 0)
+            if number != writer.register_channel(channel.topic, channel.encoding, schema_number, channel.metadata):
+                raise DataError(f"channel {number} {channel.topic}: expected the numbers that the recorder gives")
+            self.topics[number] = channel.topic.lstrip("/")
+        if self._begun:
+            return
+        self._begun = True
+        for name, table in contents.metadata.items():
+            writer.add_metadata(name, table)
+        for part in contents.attachments.values():
+            writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
 
 
 def _create(paths: Iterable[Path]) -> tuple[Path, int]:

@@ -23,7 +23,7 @@ from compensator.messages import MESSAGES, encode, shipped_schema
 from compensator.recording import chain
 from compensator.recording.container import Attachment, Channel, Contents
 from compensator.recording.finishing import Finisher, Retention
-from compensator.recording.live_file import LiveFile, sync_folder
+from compensator.recording.live_file import LiveFile, Opening, sync_folder
 from compensator.recording.reading import end_of_chain, recordings
 from compensator.recording.signature import Signer
 
@@ -233,16 +233,12 @@ class _Live(LiveFile):
     def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
         """Write what the file opens with."""
         contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
-        self.writer.start(profile="", library=f"compensator {__version__}")
-        for topic in TOPICS:
-            name, data, about = MESSAGES[topic].__name__, shipped_schema(topic), {"machine": self._machine}
-            schema = self.writer.register_schema(name, "jsonschema", data)
-            number = self.writer.register_channel(f"/{topic}", "json", schema, about)
-            self._channels[topic] = number
-            contents.channels[number] = Channel(f"/{topic}", "json", about, name, "jsonschema", data)
-        self.writer.add_metadata("run", metadata)
-        for part in attachments:
-            self.writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
+        for number, topic in enumerate(TOPICS, 1):
+            about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
+            contents.channels[number] = Channel(f"/{topic}", "json", about, kind, "jsonschema", schema)
+        opening = Opening(self.writer)
+        opening.write(contents)
+        self._channels = {topic: number for number, topic in opening.topics.items()}
         self._write("chain", self._chain.begin(chain.parts_of(contents), self.time_ns))
 
     def add(self, records: Iterable[tuple[str, bytes]], time_ns: int) -> None:

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
@@ -34,8 +34,6 @@ from compensator.recording.container import Container, Contents, Damaged
 from compensator.recording.reading import Record, decode_with, groups_of
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.state import ZeroMode
-
-_T = TypeVar("_T")
 
 _SAMPLE, _EVENT = msgspec.json.Decoder(Sample), msgspec.json.Decoder(Event)
 _ESTIMATE, _OFFSET = msgspec.json.Decoder(EstimateMessage), msgspec.json.Decoder(Offset)
@@ -68,12 +66,14 @@ class Step:
     @property
     def estimate(self) -> EstimateMessage | None:
         """What the model made of the sample."""
-        return self.decode(_ESTIMATE, "estimate")
+        record = self.records.get("estimate")
+        return None if record is None else decode_with(_ESTIMATE, record, self.file)
 
     @property
     def offset(self) -> Offset | None:
         """What was published."""
-        return self.decode(_OFFSET, "offset")
+        record = self.records.get("offset")
+        return None if record is None else decode_with(_OFFSET, record, self.file)
 
     @property
     def zero(self) -> ZeroMode | None:
@@ -83,17 +83,6 @@ class Step:
             return None
         estimate = self.estimate
         return None if estimate is None else "rest" if estimate.y_base_um == 0.0 else "warm"
-
-    def decode(self, decoder: msgspec.json.Decoder[_T], topic: str) -> _T | None:
-        """Decode one of its messages, or a part of it; None where it is missing.
-
-        Raises
-        ------
-        DataError
-            If it is not what its schema says.
-        """
-        record = self.records.get(topic)
-        return None if record is None else decode_with(decoder, record, self.file)
 
 
 def step_of(records: Sequence[Record], contents: Contents, file: str) -> Step:
