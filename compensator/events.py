@@ -1,6 +1,6 @@
 """Events: their kinds, the data of each, and how programs read them.
 
-`Event.text` is one line for people and may be worded anew at any time. Programs read `kind` and `data` alone. Version
+`Event.text` is one line for people, whose words may change. Programs read `kind` and `data` alone. Version
 0.1.0 recorded some events with a text only; what is needed to read those stands at the end of this module.
 """
 
@@ -143,7 +143,7 @@ class RecordingData(_Data, frozen=True, kw_only=True):
     bytes: int | None = None
 
     @property
-    def needs_nobody(self) -> bool:
+    def is_resolved(self) -> bool:
         """Whether nothing has to be done about it."""
         if self.code is None:
             return self.lost is not None or bool(self.removed)

@@ -180,7 +180,7 @@ def _proven(found: Audit) -> Table:
             f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end",
         ],
         ["What was before the first file", open_, "it was not given"],
-        ["The sensors told the truth", open_, "no recording can show that"],
+        ["The sensors measured what was there", open_, "no recording can show that"],
     ]
     return Table(title="What was proven, and what was not", head=["statement", "outcome", "how"], rows=rows)
 
@@ -349,8 +349,8 @@ def _before_and_after(found: Comparison) -> Table:
         title="Before and after",
         head=["", "rms µm", "largest µm", "samples", "largest at"],
         rows=[row(name, spread) for name, spread in found.rows().items()],
-        note="Residual: measured − predicted. Every recorded sample went through the service's own compensation with "
-        "the other model, limits and losses included.",
+        note="Residual: measured − predicted. Every recorded sample was run through the service's own compensation "
+        "with the other model, limits and losses included.",
     )
 
 

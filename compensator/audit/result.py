@@ -20,7 +20,7 @@ class RecordingAudit:
     size : int
         Bytes.
     original, machine, began, previous_file : str
-        As its metadata say: the name that it was begun with, the machine, why it began, the file before.
+        From its metadata: the name that it was begun with, the machine, why it began, the previous file.
     previous, last : str
         Value of the hash chain that it goes on from, and the one it hands on; empty where it has no chain.
     end : End

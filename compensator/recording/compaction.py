@@ -80,7 +80,7 @@ class Copy:
 def rewrite(
     path: Path, copy_of: Callable[[Contents, Writer], Copy] = Copy, *, patient: bool = False, chained: bool = False
 ) -> Copy | None:
-    """Put a compact copy in the place of a recording that nobody writes to.
+    """Replace a finished or abandoned live recording by a compact copy.
 
     Every whole message of a torn file is kept.
 
@@ -103,7 +103,7 @@ def rewrite(
     Raises
     ------
     OSError
-        If the disk does not take the copy; the file stays as it is.
+        If the copy cannot be written; the file stays as it is.
     DataError
         If the file is damaged, or the copy does not read back as what was copied; it stays as it is.
     """

@@ -1,8 +1,8 @@
 """Reads an MCAP file from front to back: live or finished, chunked or not, whole, torn or damaged.
 
 The `mcap` library writes our files, and checks them when they are finished. An audit of a year reads millions of
-records, trusts none of them and must tell a torn end from damage, so it reads the framing itself: one record after
-the other, no index, lengths bounded before anything is allocated.
+records, trusts none of them and must distinguish a torn end from damage, so it reads the framing itself: one record
+after the other, no index, lengths bounded before anything is allocated.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class Retention:
     keep_days : float, optional
         Finished recordings that began longer ago are removed.
     keep_mb : float, optional
-        The oldest finished recordings are removed while all of them take more, MB (10⁶ bytes).
+        The oldest finished recordings are removed while all of them are larger together, MB (10⁶ bytes).
     """
 
     keep_days: float | None = None
@@ -47,7 +47,7 @@ class Retention:
 
 
 class Finisher:
-    """Makes files compact that nobody writes to any more.
+    """Makes finished files compact and removes the oldest ones.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class Finisher:
             self._begin([(job, now_ns) for job in jobs])
 
     def make_room(self, now_ns: int) -> None:
-        """Have what is beyond the retention removed in the background: the disk does not take the recording.
+        """Remove what exceeds the retention, in the background: the disk is full for the recording.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class Finisher:
             self._remarks = [*self._remarks[-99:], (text, data.table())]
 
     def _remove_oldest(self, now_ns: int) -> bool:
-        """Remove what is beyond the retention, and tell whether something was.
+        """Remove what exceeds the retention; return whether something was removed.
 
         The newest two stay: the one that is being written, and the finished one that the next start needs.
         """
@@ -190,7 +190,7 @@ def _began_ns(path: Path, machine: str) -> int:
 
 
 def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) -> str:
-    """Put a compact copy in the place of a machine's recording that nobody writes to.
+    """Replace a machine's live recording by a compact copy.
 
     A torn end is finished: its whole records get their place in a `/chain` message, and a seal says `recovered`.
 

@@ -1,4 +1,4 @@
-"""Files that a kill or a power cut cannot take back: live MCAP files, synced as a whole, and names that stay."""
+"""Live MCAP files, of which a kill or a power cut loses nothing that was synced, and names that stay."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ class LiveFile:
     Parameters
     ----------
     paths : iterable of pathlib.Path
-        Names to try; the first that nobody has is taken.
+        Names to try; the first free one is used.
 
     Raises
     ------
     OSError
-        If the disk does not take it, or every name is taken.
+        If the file cannot be made, or every name is in use.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:
@@ -68,13 +68,13 @@ class LiveFile:
         self.synced = self._sink.size
 
     def finish(self) -> None:
-        """Write the end and close the file; from here on others may take it over."""
+        """Write the end and close the file; from here on it may be made compact."""
         self.writer.finish()  # type: ignore[no-untyped-call]
         self.sync()
         os.close(self._descriptor)
 
     def give_up(self) -> bool:
-        """Cut off what is not whole and close the file; tell whether the disk took that."""
+        """Cut off what is not whole and close the file; return whether the disk allowed it."""
         cut = True
         try:
             os.ftruncate(self._descriptor, self.synced)
@@ -142,10 +142,10 @@ def _create(paths: Iterable[Path]) -> tuple[Path, int]:
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except FileExistsError:
             continue
-        # Held until the file is finished, so that nobody takes it for one that was left behind.
+        # Held until the file is finished, so that no other program mistakes it for one that was left behind.
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path, descriptor
-    raise OSError(f"{path}: it and every name before it is taken")
+    raise OSError(f"{path}: it and every name before it is in use")
 
 
 def sync_folder(folder: Path) -> None:
@@ -154,7 +154,7 @@ def sync_folder(folder: Path) -> None:
     Raises
     ------
     OSError
-        If the disk does not take it.
+        If it cannot be synced.
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:

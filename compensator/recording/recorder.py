@@ -92,8 +92,8 @@ class Recorder:
         Raises
         ------
         OSError
-            If the disk does not take them. What was written since the last sync is cut off again, the file is given
-            up, and the next call starts a new one.
+            If they cannot be written. What was written since the last sync is cut off again, the file is given up,
+            and the next call starts a new one.
         """
         day = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%d")
         try:
@@ -125,12 +125,12 @@ class Recorder:
         Raises
         ------
         OSError
-            If the disk does not take the end of the file; the file is given up, and the next write opens a new one.
+            If the end of the file cannot be written; the file is given up, and the next write opens a new one.
         """
         self._finish("new")
 
     def remarks(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return what happened to finished files since the last call: text and data, to be said as events."""
+        """Return what happened to finished files since the last call: text and data of events."""
         return self._finisher.remarks()
 
     # ------------------------------------------------------------------ beginning and end of a file
@@ -205,7 +205,7 @@ class Recorder:
         stamp = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
         number = 0
         if newest is not None:
-            # Names tell in which order files were begun, also where the clock was set back between them.
+            # Names show the order in which files were begun, also where the clock was set back between them.
             last, _, suffix = newest.stem.removeprefix(f"{self._machine}_").partition("-")
             if last >= stamp:
                 stamp, number = last, int(suffix or 0) + 1

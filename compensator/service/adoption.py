@@ -1,4 +1,4 @@
-"""Takes another model over while the service runs: checks it, warms it up on the recordings, keeps it.
+"""Prepares another model while the service runs: checks it, warms it up on the recordings, stores it.
 
 All of this runs on a thread of its own and lets samples go first; the swap itself lies between two samples and is the
 daemon's.
@@ -25,12 +25,12 @@ from compensator.service.warm_up import WARM_UP, warm_up
 #: Longest payload of a command that brings a model, bytes.
 LONGEST_MODEL = 1_000_000
 #: After so many samples of a warm-up the thread sleeps for a moment, so that it never holds a sample up.
-TURN = 10
+LET_OTHERS = 10
 MOMENT_S = 0.001
 
 
 def check_model(config: Config, data: bytes, *, source: str) -> ThermalModel:
-    """Make a model of its file and check that the service of a configuration can run it.
+    """Read a model file and check that the service of a configuration can run it.
 
     Raises
     ------
@@ -66,7 +66,7 @@ class Wanted:
     text : str
         The model file, empty where it is in the store already.
     force : bool
-        Take it even where the recordings do not determine its state.
+        Adopt it even where the recordings do not determine its state.
     """
 
     action: str
@@ -103,7 +103,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prepared:
-    """A model that is ready to be taken over.
+    """A model that is ready to be adopted.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ class Adoption:
         self._store = store
 
     def prepare(self, wanted: Wanted, running: ThermalModel, zero: dict[str, float] | None, now_ns: int) -> Prepared:
-        """Make the model ready and keep it for the next start; takes its time.
+        """Make the model ready and store it for the next start; this takes a while.
 
         Parameters
         ----------
@@ -203,7 +203,7 @@ class Adoption:
             compensation = Compensation(self._config, model)
             return Prepared(data=data, compensation=compensation, samples=0, minutes=0.0, known=True)
         try:
-            warm = warm_up(self._folder, self._config, model, let_others=_turns())
+            warm = warm_up(self._folder, self._config, model, let_others=_let_others())
         except DataError as error:
             if not force:
                 raise ServiceError(f"model {model.name}: no warm-up: {error}; {_ADVICE}") from error
@@ -222,17 +222,17 @@ class Adoption:
         )
 
 
-_ADVICE = "wait, zero the machine at rest, or take it all the same with --force"
+_ADVICE = "wait, zero the machine at rest, or adopt it nevertheless with --force"
 
 
-def _turns() -> Callable[[], None]:
-    """Return what lets the service's own thread go first, every few samples."""
+def _let_others() -> Callable[[], None]:
+    """Return a function that lets the thread of the service run first, every few samples."""
     count = 0
 
-    def turn() -> None:
+    def pause() -> None:
         nonlocal count
         count += 1
-        if count % TURN == 0:
+        if count % LET_OTHERS == 0:
             time.sleep(MOMENT_S)
 
-    return turn
+    return pause

@@ -251,7 +251,7 @@ class FreeRun:
         #: Number and time of the last sample or held offset, −1 and 0 before the first.
         self.seq, self.time_ns = -1, 0
         self._file = ""
-        #: Offset before a sample of a torn end: nobody got the offset of that sample.
+        #: Offset before a sample of a torn end, whose own offset was not published.
         self._before_torn_um: float | None = None
 
     def run(self, step: Step, *, commands: bool = True) -> Outcome | Offset | None:

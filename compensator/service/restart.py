@@ -34,7 +34,7 @@ class Resumed:
     compensation : Compensation
         As it was, or at its first start.
     notes : list of Note
-        Events that say how.
+        Events that describe it.
     """
 
     compensation: Compensation
@@ -81,7 +81,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: Early | None = None
     model : ThermalModel
         The present model.
     early : Early, optional
-        The last offset that was published while the disk did not take it.
+        The last offset that was published while the disk failed.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: Early | None = None
         compensation.go_on_from(early.y_offset_um, model_changed=compensation.is_under_way)
         resumed.note(
             f"goes on from the offset {early.y_offset_um:.3f} µm of sample {early.seq}, "
-            "which was published while the disk did not take it",
+            "which was published while the disk failed",
             early_seq=early.seq,
             offset_um=early.y_offset_um,
         )
@@ -189,7 +189,7 @@ def _go_on(resumed: Resumed, last: _LastFile, compensation: Compensation, differ
             differing=differing,
         )
     if last.samples:
-        # Not from the offset of a torn last sample, which nobody got.
+        # Not from the offset of a torn last sample, which was not published.
         compensation.go_on_from(last.offset_um, model_changed=compensation.is_under_way)
     seq, _ = compensation.last
     resumed.compensation = compensation
@@ -214,7 +214,7 @@ def _warm(
         if last.operator_hold:
             resumed.compensation.hold()
         resumed.note(
-            f"{why}; the state cannot be brought over ({error}): it begins as at a first start", begun_anew=True
+            f"{why}; the state cannot be carried over ({error}): it begins as at a first start", begun_anew=True
         )
         return
     resumed.compensation = warm.compensation

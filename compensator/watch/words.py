@@ -71,7 +71,7 @@ def to_do(event: Event) -> str:
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
         return " ".join(dict.fromkeys(in_words(code).do for code in codes)) if state not in ("", "ok") else ""
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
-    if recording is not None and recording.needs_nobody:
+    if recording is not None and recording.is_resolved:
         return ""
     return _DO.get(event.kind, "")
 
