@@ -200,7 +200,7 @@ class Container:
         return self._base + self._at
 
     def survey(self, *, whole: bool) -> Contents:
-        """Read for what stands beside the messages, as far as the file goes, and return it.
+        """Read attachments, metadata and channels, as far as the file goes, and return them.
 
         Parameters
         ----------

@@ -34,12 +34,12 @@ _NAMES = {
 }
 _THINGS = {CHUNK_INDEX: "chunk", ATTACHMENT_INDEX: "attachment", METADATA_INDEX: "metadata table"}
 
-#: What an entry says of what it leads to, in words.
+#: How an entry describes what it leads to, by name.
 _Entry = dict[str, Any]
 
 
 class Index:
-    """Notes what is in a file, and what its index says of it."""
+    """Compares what is in a file with its index."""
 
     def __init__(self) -> None:
         #: Part of the index that is wrong, and what is wrong with it: the first `KEPT`, and the number of all.
@@ -319,7 +319,7 @@ class Index:
 
 
 def _entry_of(kind: int, fields: Fields) -> tuple[int, _Entry]:
-    """Return where an entry leads, and what it says of what stands there."""
+    """Return where an entry leads, and how it describes what is there."""
     entry: _Entry = {}
     if kind == CHUNK_INDEX:
         entry["first message (ns)"], entry["last message (ns)"] = fields.number("<Q"), fields.number("<Q")

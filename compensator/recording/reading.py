@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import msgspec
 
 from compensator.errors import DataError
-from compensator.messages import MESSAGES, Chain, Offset, Sample, Seal
+from compensator.messages import MESSAGES, Chain, Offset, Sample
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
 
@@ -222,58 +221,29 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
     return sorted(began, key=began.__getitem__)
 
 
-@dataclass(frozen=True, slots=True)
-class ChainEnd:
-    """Where the hash chain of a file ends.
+def last_value(path: Path) -> bytes:
+    """Return the value with which the chain of the next file begins, empty where a file has no chain.
 
-    Parameters
-    ----------
-    value : bytes
-        Value at its last whole record; the chain of the next file begins with it. A seal that was set afterwards,
-        when a torn end was finished, does not count: the next file was begun without it.
-    unlisted : int
-        Number of whole records behind the last `/chain` message.
-    sealed : str
-        Reason of the seal that it ends with, empty where it ends without one.
-    whole : bool
-        Whether the file has its end.
-    chunked : bool
-        Whether it is compact.
-    """
-
-    value: bytes
-    unlisted: int
-    sealed: str
-    whole: bool
-    chunked: bool
-
-
-def end_of_chain(path: Path) -> ChainEnd | None:
-    """Follow the hash chain of a file to its end; None where it has none.
+    It is that of the last whole record, but not of a seal that was added afterwards, when a torn end was finished: the
+    next file was begun without it.
 
     Raises
     ------
     DataError
         If it is not an MCAP file.
     """
-    value, before_seal, unlisted, sealed = b"", b"", 0, ""
+    value, before_seal, recovered = b"", b"", False
     with Container(path) as container, suppress(Damaged, msgspec.MsgspecError, ValueError):
-        contents = container.contents
         for record in records_of(container):
-            if record.topic == "chain":
-                if not value:
-                    first = msgspec.json.decode(record.data, type=Chain)
-                    value = chain.opening(bytes.fromhex(first.before), chain.parts_of(contents))
-                unlisted = 0
-                continue
-            if not value:
-                return None
-            before_seal, value = value, chain.link(value, record.topic, record.body)
-            unlisted += 1
-            sealed = msgspec.json.decode(record.data, type=Seal).reason if record.topic == "seal" else ""
-    if not value:
-        return None
-    return ChainEnd(before_seal if sealed == "recovered" else value, unlisted, sealed, contents.ended, contents.chunked)
+            if record.topic == "chain" and not value:
+                first = msgspec.json.decode(record.data, type=Chain)
+                value = chain.opening(bytes.fromhex(first.before), chain.parts_of(container.contents))
+            elif record.topic != "chain" and not value:
+                break
+            elif record.topic != "chain":
+                before_seal, value = value, chain.link(value, record.topic, record.body)
+                recovered = record.topic == "seal" and b'"reason":"recovered"' in record.body
+    return before_seal if recovered else value
 
 
 def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:

@@ -24,7 +24,7 @@ from compensator.recording import chain
 from compensator.recording.container import Attachment, Channel, Contents
 from compensator.recording.finishing import Finisher, Retention
 from compensator.recording.live_file import LiveFile, Opening, sync_folder
-from compensator.recording.reading import end_of_chain, recordings
+from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 
 #: Topics of a recording; `chain` and `seal` come from the recorder itself.
@@ -149,7 +149,7 @@ class Recorder:
         self._finisher.enqueue(live.path, live.time_ns)
 
     def _give_up(self) -> None:
-        """Leave the file as it was after the last sync; what it took since then was not whole."""
+        """Leave the file as it was after the last sync; what was written since then was not whole."""
         live, self._live = self._live, None
         self._reason = "failure"
         # Read from the file when the next one opens: only it knows what it took.
@@ -170,8 +170,7 @@ class Recorder:
         previous = recordings(self._folder, self._machine)
         before = self._last
         if previous and not before:
-            end = end_of_chain(previous[-1])
-            before = end.value if end else b""
+            before = last_value(previous[-1])
         names = self._names(time_utc_ns, previous[-1] if previous else None)
         live = self._live = _Live(names, self._machine, before or chain.NOTHING, time_utc_ns)
         self.path = live.path

@@ -20,7 +20,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation
 from compensator.service.model_store import ModelStore, sha256_of
 from compensator.service.state import ZeroMode
-from compensator.service.warm_up import WARM_UP, warm_up
+from compensator.service.warm_up import WARM_UP, WarmUp, warm_up
 
 #: Longest payload of a command that brings a model, bytes.
 LONGEST_MODEL = 1_000_000
@@ -109,33 +109,25 @@ class Prepared:
     ----------
     data : bytes
         The model file.
-    compensation : Compensation
-        Warmed up to the last recorded sample.
-    samples : int
-        Number of samples of the warm-up.
-    minutes : float
-        Time that they span, min.
-    known : bool
-        Whether they determine the state.
+    warm : WarmUp
+        Its compensation at the last recorded sample.
     """
 
     data: bytes
-    compensation: Compensation
-    samples: int
-    minutes: float
-    known: bool
+    warm: WarmUp
 
     def catch_up(self, sample: Sample, zero: ZeroMode | None) -> None:
         """Run a sample that came during the warm-up; one that is in the recording is left out."""
-        seq, _ = self.compensation.last
+        compensation = self.warm.compensation
+        seq, _ = compensation.last
         if sample.seq <= seq:
             return
         if seq >= 0:
             # Numbers between were not on disk in time for the warm-up.
-            self.compensation.pause(sample.seq - seq - 1)
+            compensation.pause(sample.seq - seq - 1)
         if zero is not None:
-            self.compensation.zero(zero)
-        self.compensation.process(sample)
+            compensation.zero(zero)
+        compensation.process(sample)
 
 
 class Adoption:
@@ -183,7 +175,7 @@ class Adoption:
             raise ServiceError(
                 f"model {model.name}: sample_period_s = {model.period_s:g}, the service runs at {running.period_s:g} s"
             )
-        prepared = self._warmed(data, model, zero, wanted.force)
+        prepared = Prepared(data=data, warm=self._warmed(model, zero, wanted.force))
         if wanted.action == "back":
             self._store.back(name=model.name, time_utc_ns=now_ns)
         else:
@@ -198,10 +190,10 @@ class Adoption:
             raise ServiceError("back: the configured model is in use, there is none before it")
         return before
 
-    def _warmed(self, data: bytes, model: ThermalModel, zero: dict[str, float] | None, force: bool) -> Prepared:
+    def _warmed(self, model: ThermalModel, zero: dict[str, float] | None, force: bool) -> WarmUp:
         if zero is None:
             compensation = Compensation(self._config, model)
-            return Prepared(data=data, compensation=compensation, samples=0, minutes=0.0, known=True)
+            return WarmUp(compensation=compensation, samples=0, minutes=0.0, known=True)
         try:
             warm = warm_up(self._folder, self._config, model, let_others=_let_others())
         except DataError as error:
@@ -209,7 +201,7 @@ class Adoption:
                 raise ServiceError(f"model {model.name}: no warm-up: {error}; {_ADVICE}") from error
             compensation = Compensation(self._config, model)
             compensation.begin(**zero)
-            return Prepared(data=data, compensation=compensation, samples=0, minutes=0.0, known=False)
+            return WarmUp(compensation=compensation, samples=0, minutes=0.0, known=False)
         if not warm.known and not force:
             slowest = warm.compensation.slowest_min
             raise ServiceError(
@@ -217,9 +209,7 @@ class Adoption:
                 f"time constant is {slowest / 60.0:.1f} h and {WARM_UP:g} of them are wanted; its offset would be "
                 f"known to ±{warm.compensation.std_um:.1f} µm only (standard deviation); {_ADVICE}"
             )
-        return Prepared(
-            data=data, compensation=warm.compensation, samples=warm.samples, minutes=warm.minutes, known=warm.known
-        )
+        return warm
 
 
 _ADVICE = "wait, zero the machine at rest, or adopt it nevertheless with --force"

@@ -84,7 +84,7 @@ class Takeover:
             return old
         self._adopting = None
         prepared = adopting.prepared
-        new = prepared.compensation
+        new = prepared.warm.compensation
         for outcome in adopting.since:
             zero = next((note.data["mode"] for note in outcome.notes if note.kind == EventKind.ZERO), None)
             prepared.catch_up(outcome.sample, zero)
@@ -95,15 +95,13 @@ class Takeover:
         self._journal.note(
             "adopt",
             f"model {named[0]} replaces {named[1]}, "
-            f"warm-up {prepared.minutes / 60.0:.1f} h, the offset moves by {difference:+.2f} µm",
+            f"warm-up {prepared.warm.minutes / 60.0:.1f} h, the offset moves by {difference:+.2f} µm",
             {
                 "ok": True,
                 "action": adopting.wanted.action,
                 "old_sha256": old.model.sha256,
                 "new_sha256": new.model.sha256,
-                "warm_up_min": prepared.minutes,
-                "warm_up_samples": prepared.samples,
-                "state_known": prepared.known,
+                **prepared.warm.figures(),
                 "difference_um": difference,
                 "y_std_um": new.std_um,
             },
@@ -124,19 +122,17 @@ class Takeover:
         zero = running.zero_that_stands if running.has_reference else None
         prepared = await asyncio.to_thread(adoption.prepare, adopting.wanted, running.model, zero, self._clock.utc_ns())
         adopting.prepared = prepared
-        model = prepared.compensation.model
-        how = f"warmed up on {prepared.samples} sample(s) of {prepared.minutes / 60.0:.1f} h"
-        if not prepared.known:
-            how += f", too little to know its state: standard deviation {prepared.compensation.std_um:.1f} µm for now"
+        warm, model = prepared.warm, prepared.warm.compensation.model
+        how = f"warmed up on {warm.samples} sample(s) of {warm.minutes / 60.0:.1f} h"
+        if not warm.known:
+            how += f", too little to know its state: standard deviation {warm.compensation.std_um:.1f} µm for now"
         adopting.reply.set_result(
             {
                 "ok": True,
                 "text": f"model {model.name} ({model.sha256[:12]}) is adopted with the next sample, {how}",
                 "model": model.name,
                 "model_sha256": model.sha256,
-                "warm_up_min": prepared.minutes,
-                "warm_up_samples": prepared.samples,
-                "state_known": prepared.known,
+                **prepared.warm.figures(),
             }
         )
 

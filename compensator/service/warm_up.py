@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -47,6 +48,10 @@ class WarmUp:
     samples: int
     minutes: float
     known: bool
+
+    def figures(self) -> dict[str, Any]:
+        """Return its extent for events and answers."""
+        return {"warm_up_min": self.minutes, "warm_up_samples": self.samples, "state_known": self.known}
 
 
 def warm_up(

@@ -12,9 +12,10 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import MESSAGES, Offset, number, schemas, shipped_schema
-from compensator.recording.reading import decode, end_of_chain, first_sequence, last_sequence, read_messages, recordings
+from compensator.recording.reading import decode, first_sequence, last_sequence, read_messages, recordings
 from drivers.errors import DeviceTimeout
 from drivers.reading import Quality, Reading
+from tests.audit.tampering import end_of_chain
 from tests.service.simulated import START_NS, Bench, config
 
 MISSING = Reading.bad(Quality.OPEN, "wire broken")

@@ -16,9 +16,9 @@ from compensator.audit.series import audit
 from compensator.errors import DataError
 from compensator.recording import compaction, finishing
 from compensator.recording.finishing import Finisher, Retention, compact
-from compensator.recording.reading import end_of_chain, read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from tests.audit.made import MACHINE, MINUTE_NS, Service
-from tests.audit.tampering import lines_of, rewrite
+from tests.audit.tampering import end_of_chain, lines_of, rewrite
 from tests.service.simulated import START_NS
 
 DAY_NS = 1440 * MINUTE_NS
