@@ -1,4 +1,4 @@
-"""Files that a kill or a power cut cannot take back: live MCAP files, synced as a whole, and names that stay."""
+"""Live MCAP files, of which a kill or a power cut loses nothing that was synced, and names that stay."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
+
+from compensator import __version__
+from compensator.errors import DataError
+from compensator.recording.container import Contents
 
 
 @dataclass(slots=True)
@@ -38,12 +42,12 @@ class LiveFile:
     Parameters
     ----------
     paths : iterable of pathlib.Path
-        Names to try; the first that nobody has is taken.
+        Names to try; the first free one is used.
 
     Raises
     ------
     OSError
-        If the disk does not take it, or every name is taken.
+        If the file cannot be made, or every name is in use.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:
@@ -64,13 +68,13 @@ class LiveFile:
         self.synced = self._sink.size
 
     def finish(self) -> None:
-        """Write the end and close the file; from here on others may take it over."""
+        """Write the end and close the file; from here on it may be made compact."""
         self.writer.finish()  # type: ignore[no-untyped-call]
         self.sync()
         os.close(self._descriptor)
 
     def give_up(self) -> bool:
-        """Cut off what is not whole and close the file; tell whether the disk took that."""
+        """Cut off what is not whole and close the file; return whether the disk allowed it."""
         cut = True
         try:
             os.ftruncate(self._descriptor, self.synced)
@@ -85,6 +89,52 @@ class LiveFile:
         return cut
 
 
+class Opening:
+    """Writes what a file opens with: channels under their numbers, metadata, attachments.
+
+    Parameters
+    ----------
+    writer : Writer
+        Of the file.
+    """
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._begun = False
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        #: Topics that were written, without the slash, by number of the channel.
+        self.topics: dict[int, str] = {}
+
+    def write(self, contents: Contents) -> None:
+        """Write what was not written yet; behind the first call these are further channels.
+
+        Raises
+        ------
+        DataError
+            If a channel has not the number that it gets here.
+        """
+        writer = self._writer
+        if not self._begun:
+            writer.start(profile="", library=contents.library or f"compensator {__version__}")
+        for number, channel in contents.channels.items():
+            if number in self.topics:
+                continue
+            schema = (channel.schema_name, channel.schema_encoding, channel.schema)
+            if channel.schema_name and schema not in self._schemas:
+                self._schemas[schema] = writer.register_schema(*schema)
+            schema_number = self._schemas.get(schema, 0)
+            if number != writer.register_channel(channel.topic, channel.encoding, schema_number, channel.metadata):
+                raise DataError(f"channel {number} {channel.topic}: expected the numbers that the recorder gives")
+            self.topics[number] = channel.topic.lstrip("/")
+        if self._begun:
+            return
+        self._begun = True
+        for name, table in contents.metadata.items():
+            writer.add_metadata(name, table)
+        for part in contents.attachments.values():
+            writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
+
+
 def _create(paths: Iterable[Path]) -> tuple[Path, int]:
     path = None
     for path in paths:
@@ -92,10 +142,10 @@ def _create(paths: Iterable[Path]) -> tuple[Path, int]:
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except FileExistsError:
             continue
-        # Held until the file is finished, so that nobody takes it for one that was left behind.
+        # Held until the file is finished, so that no other program mistakes it for one that was left behind.
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path, descriptor
-    raise OSError(f"{path}: it and every name before it is taken")
+    raise OSError(f"{path}: it and every name before it is in use")
 
 
 def sync_folder(folder: Path) -> None:
@@ -104,7 +154,7 @@ def sync_folder(folder: Path) -> None:
     Raises
     ------
     OSError
-        If the disk does not take it.
+        If it cannot be synced.
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:

@@ -23,8 +23,8 @@ from compensator.messages import MESSAGES, encode, shipped_schema
 from compensator.recording import chain
 from compensator.recording.container import Attachment, Channel, Contents
 from compensator.recording.finishing import Finisher, Retention
-from compensator.recording.live_file import LiveFile, sync_folder
-from compensator.recording.reading import end_of_chain, recordings
+from compensator.recording.live_file import LiveFile, Opening, sync_folder
+from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 
 #: Topics of a recording; `chain` and `seal` come from the recorder itself.
@@ -92,8 +92,8 @@ class Recorder:
         Raises
         ------
         OSError
-            If the disk does not take them. What was written since the last sync is cut off again, the file is given
-            up, and the next call starts a new one.
+            If they cannot be written. What was written since the last sync is cut off again, the file is given up,
+            and the next call starts a new one.
         """
         day = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%d")
         try:
@@ -125,12 +125,12 @@ class Recorder:
         Raises
         ------
         OSError
-            If the disk does not take the end of the file; the file is given up, and the next write opens a new one.
+            If the end of the file cannot be written; the file is given up, and the next write opens a new one.
         """
         self._finish("new")
 
     def remarks(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return what happened to finished files since the last call: text and data, to be said as events."""
+        """Return what happened to finished files since the last call: text and data of events."""
         return self._finisher.remarks()
 
     # ------------------------------------------------------------------ beginning and end of a file
@@ -146,10 +146,10 @@ class Recorder:
             self._give_up()
             raise
         self._live, self._reason, self._last = None, reason, live.head
-        self._finisher.put(live.path, live.time_ns)
+        self._finisher.enqueue(live.path, live.time_ns)
 
     def _give_up(self) -> None:
-        """Leave the file as it was after the last sync; what it took since then was not whole."""
+        """Leave the file as it was after the last sync; what was written since then was not whole."""
         live, self._live = self._live, None
         self._reason = "failure"
         # Read from the file when the next one opens: only it knows what it took.
@@ -170,8 +170,7 @@ class Recorder:
         previous = recordings(self._folder, self._machine)
         before = self._last
         if previous and not before:
-            end = end_of_chain(previous[-1])
-            before = end.value if end else b""
+            before = last_value(previous[-1])
         names = self._names(time_utc_ns, previous[-1] if previous else None)
         live = self._live = _Live(names, self._machine, before or chain.NOTHING, time_utc_ns)
         self.path = live.path
@@ -198,14 +197,14 @@ class Recorder:
         if self._reason in ("start", "failure"):
             # A kill leaves files that are not finished: at a start any of them, after a failure the last.
             for path in previous if self._reason == "start" else previous[-1:]:
-                self._finisher.put(path, time_utc_ns)
+                self._finisher.enqueue(path, time_utc_ns)
 
     def _names(self, time_utc_ns: int, newest: Path | None) -> Iterator[Path]:
         """Yield names for a new file by machine and UTC time."""
         stamp = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
         number = 0
         if newest is not None:
-            # Names tell in which order files were begun, also where the clock was set back between them.
+            # Names show the order in which files were begun, also where the clock was set back between them.
             last, _, suffix = newest.stem.removeprefix(f"{self._machine}_").partition("-")
             if last >= stamp:
                 stamp, number = last, int(suffix or 0) + 1
@@ -233,16 +232,12 @@ class _Live(LiveFile):
     def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
         """Write what the file opens with."""
         contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
-        self.writer.start(profile="", library=f"compensator {__version__}")
-        for topic in TOPICS:
-            name, data, about = MESSAGES[topic].__name__, shipped_schema(topic), {"machine": self._machine}
-            schema = self.writer.register_schema(name, "jsonschema", data)
-            number = self.writer.register_channel(f"/{topic}", "json", schema, about)
-            self._channels[topic] = number
-            contents.channels[number] = Channel(f"/{topic}", "json", about, name, "jsonschema", data)
-        self.writer.add_metadata("run", metadata)
-        for part in attachments:
-            self.writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
+        for number, topic in enumerate(TOPICS, 1):
+            about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
+            contents.channels[number] = Channel(f"/{topic}", "json", about, kind, "jsonschema", schema)
+        opening = Opening(self.writer)
+        opening.write(contents)
+        self._channels = {topic: number for number, topic in opening.topics.items()}
         self._write("chain", self._chain.begin(chain.parts_of(contents), self.time_ns))
 
     def add(self, records: Iterable[tuple[str, bytes]], time_ns: int) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any
 
 import drivers
 from compensator.certificates import check_files
 from compensator.clock import Clock, SystemClock
 from compensator.config import LoadedConfig, load_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
+from compensator.events import EventKind, Note
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Caution
@@ -183,7 +183,7 @@ async def run_service(
         early = note.read(config.limits.offset_max_um)
         resumed = resume(loaded, model, early)
         first = first_sequence(folder, config.machine.name, clock.utc_ns(), model.period_s)
-        checks: tuple[str, str, dict[str, Any]] = ("plausibility", resumed.compensation.plausibility.describe(), {})
+        checks = Note(EventKind.PLAUSIBILITY, resumed.compensation.plausibility.describe(), {})
         daemon = Daemon(
             config=config,
             compensation=resumed.compensation,

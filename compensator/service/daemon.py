@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from compensator import __version__
-from compensator.clock import Clock
+from compensator.clock import NS, Clock
 from compensator.config import Config
+from compensator.events import Note, PauseData
 from compensator.messages import SCHEMA, Offset, Sample, Status, encode
 from compensator.service.adoption import Adoption
 from compensator.service.commands import Commands
@@ -23,7 +24,6 @@ from compensator.service.grid import Grid
 from compensator.service.journal import Entry, Journal
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.publisher import UNNAMED, Reply, Sender
-from compensator.service.retrace import samples_between
 from compensator.service.sampling import ChannelCollector
 from compensator.service.takeover import Takeover
 from drivers.errors import DriverError
@@ -95,8 +95,8 @@ class Daemon:
         Sequence number of the first sample.
     adoption : Adoption, optional
         Prepares other models; without it the commands `adopt` and `back` are refused.
-    notes : sequence of (str, str, dict)
-        Events of what went before: kind, text and data.
+    notes : sequence of Note
+        Events of what went before.
     early : OffsetCheckpoint, optional
         Where an offset is noted that is published before it is on disk.
     """
@@ -112,7 +112,7 @@ class Daemon:
         clock: Clock,
         first_sequence: int,
         adoption: Adoption | None = None,
-        notes: Sequence[tuple[str, str, dict[str, Any]]] = (),
+        notes: Sequence[Note] = (),
         early: OffsetCheckpoint | None = None,
     ) -> None:
         self._config = config
@@ -303,8 +303,8 @@ class Daemon:
         self._broken_off = False
         if broke_off:  # once for all that broke off in a row
             self._journal.start_new_file()
-        for kind, text in outcome.notes:
-            self._journal.note(kind, text)
+        for note in outcome.notes:
+            self._journal.note(*note)
         self._tell_state(self._journal.expected(outcome.offset))
         sample, estimate = encode(outcome.sample), encode(outcome.estimate)
         entry = self._journal.put(label_ns, state, sample=sample, estimate=estimate, offset=outcome.offset)
@@ -347,15 +347,14 @@ class Daemon:
         if not first or last_ns == 0:
             return
         period_s = self._compensation.model.period_s
-        missing, bridged = samples_between(last_ns, label_ns, period_s), self._compensation.bridge_max_min
+        missing = max(round((label_ns - last_ns) / (period_s * NS)) - 1, 0)
+        bridged = self._compensation.bridge_max_min
         minutes = missing * period_s / 60.0
-        data: dict[str, Any] = {"missing": missing, "minutes": minutes, "bridged": minutes <= bridged}
         text = f"{missing} sample(s) are missing between the last recording and now; "
         if label_ns <= last_ns:
             text = (
                 "the wall clock stands before the end of the last recording: how long the service was away is unknown"
             )
-            data = {"missing": None, "minutes": None, "bridged": False}
             self._compensation.pause_of_unknown_length()
         else:
             self._compensation.pause(missing)
@@ -364,7 +363,14 @@ class Daemon:
                 if minutes <= bridged
                 else f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
             )
-        self._journal.note("restart", text, data | {"y_std_um": self._compensation.std_um})
+        known, std = label_ns > last_ns, self._compensation.std_um
+        data = PauseData(
+            missing=missing if known else None,
+            minutes=minutes if known else None,
+            bridged=known and minutes <= bridged,
+            y_std_um=std,
+        )
+        self._journal.note("restart", text, data.table())
 
     def _status(self, outcome: Outcome) -> Status:
         model = self._compensation.model

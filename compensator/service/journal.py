@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from compensator.clock import Clock
+from compensator.events import RecordingCode, RecordingData
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
 from compensator.reasons import Caution
 from compensator.service.offset_checkpoint import OffsetCheckpoint
-from compensator.service.recording_thread import FAILED, WAITING_EVENTS, Group, RecordingThread
+from compensator.service.recording_thread import FAILED, LATE, WAITING_EVENTS, Group, RecordingThread
 
 log = logging.getLogger("compensator")
 
@@ -86,7 +87,7 @@ class Journal:
         """Name of the recording, empty where there is none."""
         return self._recorder.path.name if self._recorder.path else ""
 
-    def note(self, kind: str, text: str, data: dict[str, Any] | None = None) -> None:
+    def note(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
         """Keep an event for the recording and publish it."""
         event = Event(
             schema=SCHEMA,
@@ -95,7 +96,7 @@ class Journal:
             time_utc_ns=self._clock.utc_ns(),
             kind=kind,
             text=text,
-            data=data or {},
+            data=dict(data or {}),
         )
         # Bounded, so that a loop that cannot record costs no memory.
         self._events = [*self._events[1 - WAITING_EVENTS :], event]
@@ -175,7 +176,8 @@ class Journal:
 
     def _tell_disk(self, reason: str, in_flight: bool, error: BaseException | None) -> None:
         """Note once when the disk does not take the recording, and once when it does again."""
-        data = {"published_early": self.sequence, "reason": reason} if in_flight else {}
+        early = {"published_early": self.sequence, "reason": reason} if in_flight else {}
+        data = {"code": RecordingCode.DISK_LATE if reason == LATE else RecordingCode.DISK_FAILED, **early}
         if reason and (reason != self._reason or in_flight):
             if error is not None and not isinstance(error, OSError):
                 log.error("internal error", exc_info=error)
@@ -187,7 +189,7 @@ class Journal:
         elif self._reason and not reason:
             lost, self._thread.lost = self._thread.lost, 0
             text = f"{DISK_BACK}; " + (f"{lost} sample(s) were not recorded" if lost else "nothing was lost")
-            self.note("recording", text, {"lost": lost})
+            self.note("recording", text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
         self._reason, self._error = reason, error or self._error
 
     def start_new_file(self, model: bytes | None = None) -> None:
@@ -207,6 +209,7 @@ class Journal:
             log.error("%d sample(s) are not on disk, which did not take them", self._thread.waiting)
         error = closing.exception()
         if isinstance(error, OSError):
-            self.note("recording", f"the recording could not be finished: {error}")
+            data = RecordingData(code=RecordingCode.NOT_FINISHED)
+            self.note("recording", f"the recording could not be finished: {error}", data.table())
         elif error is not None:
             raise error

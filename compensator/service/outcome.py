@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from compensator.events import Note
 from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, State, number
 from compensator.model.engine import Estimate, Reference
 from compensator.model.thermal_model import ThermalModel
@@ -28,14 +29,14 @@ class Outcome:
         What the model makes of it.
     offset : Offset
         What is to be published.
-    notes : tuple of (str, str)
-        Events: kind and text.
+    notes : tuple of Note
+        Events of this sample.
     """
 
     sample: Sample
     estimate: EstimateMessage
     offset: Offset
-    notes: tuple[tuple[str, str], ...]
+    notes: tuple[Note, ...]
 
 
 @dataclass(slots=True)

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from typing import Literal, NamedTuple
 
 from compensator.clock import NS
+from compensator.events import EventKind, RecordingData, data_of
 from compensator.messages import Event
 from compensator.reasons import explain
 
@@ -71,8 +72,8 @@ def to_do(event: Event) -> str:
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
         return " ".join(dict.fromkeys(in_words(code).do for code in codes)) if state not in ("", "ok") else ""
-    # The disk works again, or old recordings were removed as configured.
-    if event.kind == "recording" and event.data.keys() & {"lost", "removed"}:
+    recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
+    if recording is not None and recording.is_resolved:
         return ""
     return _DO.get(event.kind, "")
 

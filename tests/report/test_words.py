@@ -10,8 +10,7 @@ from typing import get_args
 import pytest
 
 import compensator
-from compensator.audit.findings import Kind
-from compensator.audit.recording_audit import End
+from compensator.audit.findings import End, Kind
 from compensator.cli import main
 from compensator.messages import State
 from compensator.reasons import WORDS, Caution
@@ -61,7 +60,7 @@ def test_no_code_is_left_over() -> None:
 
 def test_every_code_that_is_shown_has_its_sentences() -> None:
     assert len(cautions()) >= 18
-    assert cautions() | set(get_args(State)) | set(get_args(Kind)) | set(get_args(End)) <= set(WORDS)
+    assert cautions() | set(get_args(State)) | set(Kind) | set(End) <= set(WORDS)
     for code, (means, do) in WORDS.items():
         assert means.endswith(".") and do.endswith(".") and means != do, code
 
