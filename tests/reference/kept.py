@@ -365,10 +365,12 @@ def exported(scene: str, out: Path) -> dict[str, Any]:
 
 
 def model_table(path: Path) -> dict[str, Any]:
-    """Return a model file as a table: what it computes with, not where it comes from."""
+    """Return a model file as a table: what it computes with, without words and without where it comes from."""
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     table.pop("provenance", None)
     for part in table["paths"].values():
         if "covariance" in part:
             part["covariance"] = [value for row in part["covariance"] for value in row]
+    for effect in table.get("effect", []):
+        effect.pop("explanation", None)
     return table
