@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from compensator.errors import ConfigError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: A certificate that ends within so many days is said.
 SOON_DAYS = 30.0
@@ -120,17 +120,17 @@ def common_name_of(path: Path) -> str:
     return _common_name(_read(str(path), "certificate", path, x509.load_pem_x509_certificates)[0])
 
 
-def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[Caution]:
+def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[Remark]:
     """Return what is to be said of a certificate that can be used."""
     if certificate is None:
-        return [Caution("certificates_unread", "Certificates are not looked into without the package cryptography.")]
+        return [Remark("certificates_unread", "Certificates are not looked into without the package cryptography.")]
     days = (certificate.ends - now).total_seconds() / 86400.0
     if days >= SOON_DAYS:
         return []
     figures = (
         f"The certificate of {certificate.common_name!r} ends on {certificate.ends:%Y-%m-%d}, in {days:.0f} day(s)."
     )
-    return [Caution("certificate_ends", figures)]
+    return [Remark("certificate_ends", figures)]
 
 
 def _read(source: str, name: str, path: Path, load: Callable[[bytes], Any]) -> Any:

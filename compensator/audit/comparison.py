@@ -19,7 +19,7 @@ from compensator.config import Config
 from compensator.errors import DataError, ServiceError
 from compensator.messages import Event, Sample, number
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.recording.container import PAYLOAD, Container
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome
@@ -75,7 +75,7 @@ class Comparison:
         The other offset − the recorded one.
     samples : int
         Number of samples.
-    remarks : list of Caution
+    remarks : list of Remark
         What the figures depend on.
     """
 
@@ -87,7 +87,7 @@ class Comparison:
     left_after: Spread
     offsets: Spread
     samples: int
-    remarks: list[Caution]
+    remarks: list[Remark]
 
     def as_json(self) -> dict[str, Any]:
         """Return it as it stands in the result of `--json`."""
@@ -240,7 +240,7 @@ class _Run:
                 f"{file}: begins on a running machine, of which the other model knows no more than the zero; "
                 f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
             )
-            self._result.remarks.append(Caution("begins_running", figures))
+            self._result.remarks.append(Remark("begins_running", figures))
         self._compensation, self._config, self._last_ns = compensation, data, 0
         return compensation
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from compensator.audit.findings import Difference, Finding, Kind, utc
 from compensator.audit.recording_audit import RecordingAudit, audit_recording
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.recording.chain import NOTHING
 from compensator.recording.signature import Verifier
 
@@ -32,7 +32,7 @@ class Audit:
         How many there are.
     difference : Difference, optional
         The first sample that comes out differently.
-    remarks : tuple of Caution
+    remarks : tuple of Remark
         What is worth knowing and not wrong.
     signed : bool
         Whether signatures were checked against a key.
@@ -42,7 +42,7 @@ class Audit:
     findings: tuple[Finding, ...]
     findings_count: int
     difference: Difference | None
-    remarks: tuple[Caution, ...]
+    remarks: tuple[Remark, ...]
     signed: bool
 
     @property
@@ -199,7 +199,7 @@ class _Judge:
         self._newest = {file.machine: file.file for file in files}
         self._signed = signed
         self.own: dict[str, list[Finding]] = {}
-        self.remarks: list[Caution] = []
+        self.remarks: list[Remark] = []
 
     def _find(self, kind: Kind, file: RecordingAudit, text: str) -> None:
         self.own.setdefault(file.file, []).append(Finding(kind=kind, file=file.file, text=text))
@@ -210,14 +210,14 @@ class _Judge:
             self._find("reordered", file, f"its name is that of another file: it was begun as {file.original}")
         if file.not_worked_out:
             self.remarks.append(
-                Caution("not_worked_out", f"{file.file}: not all samples were worked out again: {file.not_worked_out}.")
+                Remark("not_worked_out", f"{file.file}: not all samples were worked out again: {file.not_worked_out}.")
             )
         if not file.last and file.end in ("open", "torn"):
-            self.remarks.append(Caution("torn", f"{file.file}: torn before anything was recorded."))
+            self.remarks.append(Remark("torn", f"{file.file}: torn before anything was recorded."))
             return
         if file.end == "recovered":
             self.remarks.append(
-                Caution("recovered", f"{file.file}: the service was ended hard; every whole record was kept.")
+                Remark("recovered", f"{file.file}: the service was ended hard; every whole record was kept.")
             )
         elif file.end in ("open", "torn"):
             what = "within a group of records" if file.end == "torn" else "behind a whole group of records"
@@ -226,14 +226,14 @@ class _Judge:
                 "; that no more was there cannot be known until the next file names its last value" if newest else ""
             )
             text = f"{file.file}: has no end, {what}: still being written, or ended hard{known}."
-            self.remarks.append(Caution("torn", text) if file.end == "torn" else Caution("open", text))
+            self.remarks.append(Remark("torn", text) if file.end == "torn" else Remark("open", text))
         if file.skipped:
             self.remarks.append(
-                Caution("samples_missing", f"{file.file}: {file.skipped} sample(s) between others were not recorded.")
+                Remark("samples_missing", f"{file.file}: {file.skipped} sample(s) between others were not recorded.")
             )
         if file.early:
             text = f"{file.early} offset(s) were published before they were on disk, which was slow or failed"
-            self.remarks.append(Caution("published_early", f"{file.file}: {text}."))
+            self.remarks.append(Remark("published_early", f"{file.file}: {text}."))
         self._seals(file)
 
     def _seals(self, file: RecordingAudit) -> None:
@@ -244,14 +244,14 @@ class _Judge:
                 self._find("unsigned", file, "has no hash chain, so nothing is signed")
             elif file.unsigned_behind:
                 self.remarks.append(
-                    Caution(
+                    Remark(
                         "unsigned_behind", f"{file.file}: {file.unsigned_behind} record(s) behind the last signature."
                     )
                 )
         elif file.signed:
             keys = ", ".join(key[:16] for key in file.keys)
             self.remarks.append(
-                Caution("signature_not_checked", f"{file.file}: signed by {keys}…, not checked (no --public-key).")
+                Remark("signature_not_checked", f"{file.file}: signed by {keys}…, not checked (no --public-key).")
             )
 
     def joint(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
@@ -274,7 +274,7 @@ class _Judge:
             return
         if not after.previous_file:
             self.remarks.append(
-                Caution(
+                Remark(
                     "begins_new_chain",
                     f"{after.file}: begins a new chain; it says that no recording was there before it.",
                 )
@@ -304,7 +304,7 @@ class _Judge:
             lost = (
                 "which the limit of what is kept removed" if file.previous_file in self._removed else "not given here"
             )
-            self.remarks.append(Caution("before_not_given", f"{file.file}: begins after {file.previous_file}, {lost}."))
+            self.remarks.append(Remark("before_not_given", f"{file.file}: begins after {file.previous_file}, {lost}."))
 
     def _state(self, before: RecordingAudit, after: RecordingAudit) -> None:
         """In one run, the state that a file opens with is that which the file before ended with."""

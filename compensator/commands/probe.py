@@ -8,7 +8,7 @@ import logging
 from typing import Any
 
 from compensator.commands import Answer
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.service.composition import load, read_once
 from compensator.service.presence import is_used
 from drivers.errors import DriverError
@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     config = loaded.config
     warnings = []
     if is_used(loaded.resolve(config.recording.folder), config.machine.name):
-        warnings.append(Caution("service_runs", f"The service of {config.machine.name} runs and has the devices."))
+        warnings.append(Remark("service_runs", f"The service of {config.machine.name} runs and has the devices."))
     for warning in warnings:
         log.warning("%s: warning: %s", arguments.config, warning.marked)
     units = {name: dict(device.units) for name, device in fleet.devices.items()}

@@ -15,7 +15,7 @@ import zenoh
 from compensator.certificates import check_files, remarks
 from compensator.commands import Answer
 from compensator.errors import ConfigError, ServiceError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.service.session import ConfigFile, files_of, get, in_words, put, read_config_file
 
 log = logging.getLogger("compensator")
@@ -85,7 +85,7 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
     if not enabled:
         if access.get("rules") or access.get("policies"):
             raise ConfigError(f"{path}: access_control/enabled: expected true beside rules; without it none applies")
-        caution = Caution("no_access_list", "No access list: whoever connects may publish and command everything.")
+        caution = Remark("no_access_list", "No access list: whoever connects may publish and command everything.")
         log.warning("%s: warning: %s", path, caution.marked)
         return
     if access.get("default_permission") != "deny":

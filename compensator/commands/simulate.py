@@ -19,7 +19,7 @@ from compensator.data.tables import load_data, roles_of
 from compensator.model.model_file import load_model
 from compensator.model.simulation import csv_rows, scores, simulate
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 log = logging.getLogger("compensator")
 
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     return Answer(result, text)
 
 
-def doubts(source: str, model: ThermalModel, record: Record) -> list[Caution]:
+def doubts(source: str, model: ThermalModel, record: Record) -> list[Remark]:
     """Return what makes a prediction from these temperatures doubtful.
 
     Parameters
@@ -84,10 +84,10 @@ def doubts(source: str, model: ThermalModel, record: Record) -> list[Caution]:
         known = values[~np.isnan(values)]
         check_scale(source, name, values)
         if name == "t_q_degc" and known.size >= DEAD_SAMPLES and np.ptp(known) == 0.0:
-            found.append(Caution("stuck", f"{source}: {name} = {known[0]:g} in every row."))
+            found.append(Remark("stuck", f"{source}: {name} = {known[0]:g} in every row."))
         low, high = model.validity.get(name, (-np.inf, np.inf))
         outside = int(np.sum((known < low) | (known > high)))
         if outside:
             said = f"{source}: {name} lies outside {low:g} to {high:g} °C in {outside} of {known.size} samples."
-            found.append(Caution("outside_validity", said))
+            found.append(Remark("outside_validity", said))
     return found

@@ -15,7 +15,7 @@ from compensator.arrays import Indices, Mask, Vector
 from compensator.data.record import SHORT_GAP_SAMPLES, Data, Record
 from compensator.errors import DataError, UsageError
 from compensator.messages import Sample, number
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.recording.reading import decode, read_messages
 
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
@@ -127,7 +127,7 @@ def roles_of(pairs: Sequence[str]) -> dict[str, str]:
     return roles
 
 
-def _measured_alone(path: Path, columns: dict[str, Vector]) -> tuple[dict[str, Vector], tuple[Caution, ...]]:
+def _measured_alone(path: Path, columns: dict[str, Vector]) -> tuple[dict[str, Vector], tuple[Remark, ...]]:
     """Leave out of an exported recording what the service made of the measurements.
 
     Its heat is the model's own estimate: a model fitted to that as if somebody had measured it would find itself again.
@@ -138,7 +138,7 @@ def _measured_alone(path: Path, columns: dict[str, Vector]) -> tuple[dict[str, V
     if "heat_measured_w" in kept:
         kept["heat_w"] = kept.pop("heat_measured_w")
     said = f"{path}: an exported recording; what the service estimated and published is left out, heat_w with it."
-    return kept, (Caution("estimates_left_out", said),)
+    return kept, (Remark("estimates_left_out", said),)
 
 
 def _with_roles(path: Path, columns: dict[str, Vector], roles: Mapping[str, str]) -> dict[str, Vector]:
@@ -245,7 +245,7 @@ def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: floa
     disordered = int(np.sum(np.diff(t_s) < 0))
     if disordered:
         row = int(np.argmax(np.diff(t_s) < 0)) + 3
-        remarks.append(Caution("rows_sorted", f"{path}: row {row}: {disordered} row(s) out of order; sorted by time."))
+        remarks.append(Remark("rows_sorted", f"{path}: row {row}: {disordered} row(s) out of order; sorted by time."))
     t_s = t_s[order] - t_s.min()
     slot = (
         np.round(t_s / period_s).astype(int)
@@ -262,9 +262,9 @@ def _gridded(path: Path, t_s: Vector, columns: dict[str, Vector], period_s: floa
         length = last - first
         gap = f"{path}: gap of {length} sample(s) from t_s = {first * period_s:g}"
         if length <= SHORT_GAP_SAMPLES:
-            remarks.append(Caution("gap_bridged", f"{gap}; bridged."))
+            remarks.append(Remark("gap_bridged", f"{gap}; bridged."))
         else:
-            remarks.append(Caution("gap_splits", f"{gap}; the record is split there."))
+            remarks.append(Remark("gap_splits", f"{gap}; the record is split there."))
             records.append((start, first))
             start = last
     records.append((start, n))

@@ -30,7 +30,7 @@ from compensator.diagnose.refit import Refit, Tried, refit
 from compensator.model.simulation import scores
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.progress import ExecutorMap, Progress
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
@@ -147,7 +147,7 @@ def _extended(model: ThermalModel, whole: Refit, effects: tuple[Effect, ...]) ->
     )
 
 
-def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, ...]:
+def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Remark, ...]:
     if not helps:
         return ()
     paths = [("DTF", model.dtf, whole.dtf)]
@@ -158,7 +158,7 @@ def _words(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, ...
         for name, old, new in paths
     )
     return (
-        Caution(
+        Remark(
             "fitted_anew",
             "The first model was calibrated while this acted and misses much of its own data, so its paths were fitted "
             f"anew beside it; gains went: {gains}.",

@@ -37,7 +37,7 @@ from compensator.model.effects.unobserved import Unobserved
 from compensator.model.simulation import scores
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: A model whose paths were fitted anew is taken instead of a search's answer where it leaves no more than this share.
 ANEW_LEAVES = 0.5
@@ -185,10 +185,10 @@ def _stated(model: ThermalModel, after_um: float, noise_um: float, kept_out: Seq
     return max(model.y_std_um, float(np.sqrt(left)))
 
 
-def _rounded(everything: Sequence[Effect]) -> tuple[Caution, ...]:
+def _rounded(everything: Sequence[Effect]) -> tuple[Remark, ...]:
     """Say that something unnamed is deployed beside what is named."""
     return tuple(
-        Caution(
+        Remark(
             "rounded_off",
             "What the effect leaves is rounded off by a row of lags on heat and ambient "
             f"({float(np.std(e.wave)):.2g} µm rms), an effect of the kind dynamics in model.toml.",

@@ -13,7 +13,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.joint import Part
 from compensator.model.simulation import Scores
 from compensator.model.thermal_model import EffectTable, ThermalModel
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 
@@ -98,7 +98,7 @@ class Diagnosis:
         The same, each block by a search without it.
     tried : tuple of (str, float)
         Explanations of the largest effect and the rms that each leaves, µm, best first.
-    warnings : tuple of Caution
+    warnings : tuple of Remark
         In words.
     """
 
@@ -115,7 +115,7 @@ class Diagnosis:
     held_out_before: Vector
     held_out_after: Vector
     tried: tuple[tuple[str, float], ...]
-    warnings: tuple[Caution, ...]
+    warnings: tuple[Remark, ...]
 
 
 def rms_of(values: Vector) -> float:
@@ -144,13 +144,13 @@ def how_to_tell_apart(first: Part, second: Part) -> str:
     return f"{one.capitalize()}, then {two}; watch Y for {hours:.0f} h each: only one of the two moves it."
 
 
-def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[Caution, ...]:
+def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[Remark, ...]:
     """Say what to mind of the effects that were found."""
     words = []
     rms_before, rms_after = rms_of(before), rms_of(after)
     if effects and rms_after > rms_before:
         words.append(
-            Caution(
+            Remark(
                 "made_worse",
                 f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so "
                 "the model was left as it is.",
@@ -160,10 +160,10 @@ def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tup
         loose = [name for name, std in effect.std.items() if std > abs(effect.part.named[name]) > 0.0]
         if loose:
             said = f"{effect.part.hypothesis.kind}: {', '.join(loose)} is hardly determined."
-            words.append(Caution("hardly_determined", said))
+            words.append(Remark("hardly_determined", said))
         if effect.rivals:
             names = ", ".join(" ".join(filter(None, rival.part.hypothesis.place)) for rival in effect.rivals)
-            words.append(Caution("nearly_as_good", f"{effect.part.hypothesis.kind}: nearly as good would be {names}."))
+            words.append(Remark("nearly_as_good", f"{effect.part.hypothesis.kind}: nearly as good would be {names}."))
     return tuple(words)
 
 

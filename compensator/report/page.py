@@ -16,7 +16,7 @@ from itertools import count
 from pathlib import Path
 from typing import Literal
 
-from compensator.reasons import Caution, explain
+from compensator.reasons import Remark, explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 
@@ -110,12 +110,12 @@ class Words:
     kind: Literal["warning", "plain"] = "plain"
 
 
-def warnings_of(cautions: Iterable[Caution]) -> Words:
+def warnings_of(cautions: Iterable[Remark]) -> Words:
     """Return warnings as a block; each leads to its sentences at the end of the page."""
     return Words(title="Warnings", lines=[sentence_of(said) for said in cautions], kind="warning")
 
 
-def sentence_of(caution: Caution) -> Cell:
+def sentence_of(caution: Remark) -> Cell:
     """Return a warning or remark as a line; its code leads to its sentences at the end of the page."""
     return (str(caution), " ", Code(caution.code))
 

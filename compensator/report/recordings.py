@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
-from compensator.reasons import Caution, explain
+from compensator.reasons import Remark, explain
 from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
 from compensator.report.page import (
@@ -145,12 +145,12 @@ def _beside_stated(whole: Period) -> str:
     )
 
 
-def _beyond(whole: Period) -> Caution | None:
+def _beyond(whole: Period) -> Remark | None:
     """Say where more is left than the service itself expects; nothing where Y was not measured."""
     if not (whole.left.samples and 0.0 < _BEYOND * whole.std.rms < whole.left.rms):
         return None
     said = f"With the correction {_short(whole.left.rms)} rms are left, the service states {_short(whole.std.rms)}."
-    return Caution("left_beyond_stated", said)
+    return Remark("left_beyond_stated", said)
 
 
 def _short(value_um: float) -> str:

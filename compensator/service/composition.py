@@ -14,7 +14,7 @@ from compensator.config import LoadedConfig, load_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.recording.finishing import Retention
 from compensator.recording.reading import first_sequence
 from compensator.recording.recorder import Recorder
@@ -101,7 +101,7 @@ def _adopted(loaded: LoadedConfig, configured: bytes, model: ThermalModel) -> tu
         return data, check_model(loaded.config, data, source="adopted model")
     except CompensatorError as error:
         figures = f"The adopted model cannot be used, the configured one stands in: {error}."
-        log.warning("%s", Caution("adopted_unusable", figures).marked)
+        log.warning("%s", Remark("adopted_unusable", figures).marked)
         return configured, model
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from compensator.certificates import check_files, remarks
 from compensator.config import LoadedConfig, Zenoh
 from compensator.errors import ConfigError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.service.session import tls_files
 
 #: Numbers that go by the order in which adapters are plugged in or found.
@@ -19,7 +19,7 @@ _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 _BY_ID = Path("/dev/serial/by-id")
 
 
-def precautions(loaded: LoadedConfig, now: datetime.datetime | None = None) -> list[Caution]:
+def precautions(loaded: LoadedConfig, now: datetime.datetime | None = None) -> list[Remark]:
     """Return warnings, each in one line.
 
     Parameters
@@ -48,7 +48,7 @@ def precautions(loaded: LoadedConfig, now: datetime.datetime | None = None) -> l
     return found
 
 
-def _numbered(line: Mapping[str, Any]) -> Caution | None:
+def _numbered(line: Mapping[str, Any]) -> Remark | None:
     """Say that a serial port has no name of its own."""
     port = str(line.get("port", ""))
     if not _NUMBERED.fullmatch(port):
@@ -56,16 +56,16 @@ def _numbered(line: Mapping[str, Any]) -> Caution | None:
     lasting = [link for link in sorted(_BY_ID.glob("*")) if link.resolve() == Path(port).resolve()]
     stays = f" The name of it that stays is {lasting[0]}." if lasting else ""
     figures = f"Line {line.get('name')!r}: port {port} goes by the order of plugging in, and may be another adapter's "
-    return Caution("numbered_port", f"{figures}after a restart.{stays}")
+    return Remark("numbered_port", f"{figures}after a restart.{stays}")
 
 
-def _open_doors(zenoh: Zenoh) -> list[Caution]:
+def _open_doors(zenoh: Zenoh) -> list[Remark]:
     """Say where somebody on the network may speak for the machine or its operator."""
     found = []
     outside = [endpoint for endpoint in zenoh.listen if not zenoh.is_loopback(endpoint)]
     if outside:
         found.append(
-            Caution(
+            Remark(
                 "open_listen",
                 f"zenoh.listen {', '.join(outside)}: whoever reaches it can publish "
                 f"offsets and send commands in any name.",
@@ -74,11 +74,11 @@ def _open_doors(zenoh: Zenoh) -> list[Caution]:
     outside = [endpoint for endpoint in zenoh.connect if not zenoh.is_loopback(endpoint)]
     if outside and not zenoh.secured():
         found.append(
-            Caution(
+            Remark(
                 "unsecured_connect", f"zenoh.connect {', '.join(outside)}: neither encrypted nor proven who is there."
             )
         )
     if zenoh.unproven_commands and not zenoh.on_loopback():
         figures = "zenoh.unproven_commands: commands are taken of which nobody proves who sent them."
-        found.append(Caution("unproven_commands", figures))
+        found.append(Remark("unproven_commands", figures))
     return found

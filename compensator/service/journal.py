@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from compensator.clock import Clock
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.recording_thread import FAILED, WAITING_EVENTS, Group, RecordingThread
 
@@ -202,7 +202,7 @@ class Journal:
         closing = asyncio.wrap_future(self._thread.close())
         while not (await asyncio.wait([closing], timeout=CLOSING_S))[0]:
             figures = f"The recording is being finished: the disk has not taken it for {CLOSING_S:g} s."
-            log.warning("%s", Caution("disk_finishing", figures).marked)
+            log.warning("%s", Remark("disk_finishing", figures).marked)
         if self._thread.waiting:
             log.error("%d sample(s) are not on disk, which did not take them", self._thread.waiting)
         error = closing.exception()

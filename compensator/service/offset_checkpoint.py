@@ -19,7 +19,7 @@ from pathlib import Path
 import msgspec
 
 from compensator.messages import Offset, number
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 log = logging.getLogger("compensator")
 
@@ -79,7 +79,7 @@ class OffsetCheckpoint:
             part.replace(self.path)
         except OSError as error:
             if self._there:
-                caution = Caution("note_not_kept", f"{self.path}: a kill now would lose the offset: {error}.")
+                caution = Remark("note_not_kept", f"{self.path}: a kill now would lose the offset: {error}.")
                 log.warning("%s", caution.marked)
             self._there = False
             with suppress(OSError):
@@ -92,7 +92,7 @@ class OffsetCheckpoint:
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
-            log.warning("%s", Caution("note_not_removed", f"{self.path}: cannot be removed: {error}.").marked)
+            log.warning("%s", Remark("note_not_removed", f"{self.path}: cannot be removed: {error}.").marked)
 
     def read(self, offset_max_um: float) -> Early | None:
         """Return the note, None where there is none that this user wrote and a service could have published.
@@ -123,4 +123,4 @@ class OffsetCheckpoint:
         return early
 
     def _refused(self, why: str) -> None:
-        log.warning("%s", Caution("note_refused", f"{self.path}: does not count: {why}.").marked)
+        log.warning("%s", Remark("note_refused", f"{self.path}: does not count: {why}.").marked)

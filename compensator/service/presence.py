@@ -22,7 +22,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.service.session import put, session_config
 
 log = logging.getLogger("compensator")
@@ -64,7 +64,7 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
             raise ServiceError(f"{path}: held by another service of {machine}, which goes on; this one ends") from error
         except OSError as error:
             figures = f"{path}: cannot be locked, so a second service is not noticed here: {error}."
-            log.warning("%s", Caution("not_locked", figures).marked)
+            log.warning("%s", Remark("not_locked", figures).marked)
         yield
 
 
@@ -128,7 +128,7 @@ def sole_voice(settings: Zenoh) -> Iterator[None]:
                 if settings.mode == "client":  # it can say nothing either
                     raise
                 figures = "zenoh: nobody is reached, so whether another service is alive elsewhere is not known."
-                log.warning("%s", Caution("others_unknown", figures).marked)
+                log.warning("%s", Remark("others_unknown", figures).marked)
             else:
                 held.callback(_claim(session, settings.prefix).undeclare)
         yield

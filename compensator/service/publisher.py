@@ -19,7 +19,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.service.presence import sole_voice
 from compensator.service.session import in_words, session_config, tell_links
 
@@ -111,7 +111,7 @@ class Publisher:
             words = f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})"
             if self._settings.mode != "client":
                 raise ServiceError(words) from error
-            caution = Caution("router_not_reached", f"{words.rstrip('.')}; it is tried again.")
+            caution = Remark("router_not_reached", f"{words.rstrip('.')}; it is tried again.")
             log.warning("%s", caution.marked)
             self._waiting = threading.Thread(target=self._begin_later, name="zenoh-router", daemon=True)
             self._waiting.start()

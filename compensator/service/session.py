@@ -14,7 +14,7 @@ import zenoh
 from compensator.certificates import TlsFiles
 from compensator.config import Zenoh
 from compensator.errors import ConfigError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 log = logging.getLogger("compensator")
 
@@ -177,9 +177,9 @@ def tell_links(session: Any, endpoints: Sequence[str]) -> None:
         if came or kind == "client":  # who looks at the service comes and goes as they like
             log.info("%s is %s", who, "connected" if came else "gone")
         else:
-            log.warning("%s", Caution("link_lost", f"{who} is gone; it is tried again.").marked)
+            log.warning("%s", Remark("link_lost", f"{who} is gone; it is tried again.").marked)
 
     if endpoints and not session.info.transports():
         figures = f"zenoh: no connection to {', '.join(endpoints)} yet; it is tried again."
-        log.warning("%s", Caution("router_not_reached", figures).marked)
+        log.warning("%s", Remark("router_not_reached", figures).marked)
     session.info.declare_transport_events_listener(tell, history=True)

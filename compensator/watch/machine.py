@@ -9,7 +9,7 @@ import msgspec
 
 from compensator.clock import NS
 from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.watch.history import History, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import TONES, Tone, Words, age, in_words, to_do
@@ -173,38 +173,38 @@ class Machine:
             return "unknown"
         return "silent" if old_s > self._offset.valid_for_s else self._offset.state
 
-    def warnings(self, now_ns: int, monotonic_s: float) -> list[Caution]:
+    def warnings(self, now_ns: int, monotonic_s: float) -> list[Remark]:
         """Return what is odd about what is heard, in words."""
         said = []
         offset, shown = self._offset, self.shown(now_ns, monotonic_s)
         if self.alive is False and shown not in ("silent", "unknown"):
-            said.append(Caution("token_gone", "The service has ended or is cut off: its liveliness token is gone."))
+            said.append(Remark("token_gone", "The service has ended or is cut off: its liveliness token is gone."))
         if self.alive and shown == "silent":
             figures = "Its liveliness token is there: the service is connected but publishes nothing that is newer."
-            said.append(Caution("alive_but_silent", figures))
+            said.append(Remark("alive_but_silent", figures))
         other, heard_s = self._other
         if offset is not None and monotonic_s - heard_s < 4.0 * offset.valid_for_s:
-            said.append(Caution("two_services", f"Two services publish below this prefix: {other} and {self.name}."))
+            said.append(Remark("two_services", f"Two services publish below this prefix: {other} and {self.name}."))
         if offset is not None and offset.time_utc_ns - now_ns > AHEAD_S * NS:
             figures = f"Its clock is ahead of this computer's by {age((offset.time_utc_ns - now_ns) / NS)}."
-            said.append(Caution("clock_ahead", figures))
+            said.append(Remark("clock_ahead", figures))
         if offset is not None and shown == "silent" and monotonic_s - self._arrived_s < offset.valid_for_s / 2.0:
             figures = "Messages arrive but carry an old time: one of the two clocks is wrong, or somebody repeats them."
-            said.append(Caution("old_messages", figures))
+            said.append(Remark("old_messages", figures))
         misfit = self._misfit(now_ns, shown)
         if misfit is not None:
             said.append(misfit)
         if self.malformed:
             figures = f"{self.malformed} malformed message(s), the last: {self.last_malformed}."
-            said.append(Caution("malformed_messages", figures))
+            said.append(Remark("malformed_messages", figures))
         if self.numbers.missed:
-            said.append(Caution("missed_messages", f"{self.numbers.missed} message(s) never arrived here."))
+            said.append(Remark("missed_messages", f"{self.numbers.missed} message(s) never arrived here."))
         if self.numbers.repeated:
             figures = f"{self.numbers.repeated} message(s) came with a number that was there already."
-            said.append(Caution("repeated_numbers", figures))
+            said.append(Remark("repeated_numbers", figures))
         return said
 
-    def _misfit(self, now_ns: int, shown: str) -> Caution | None:
+    def _misfit(self, now_ns: int, shown: str) -> Remark | None:
         """Say that the probe sees more than the service states, where the service itself raises no alarm of it.
 
         A median: after the heat is switched a sound model is off for some minutes.
@@ -220,7 +220,7 @@ class Machine:
             f"Measured and predicted Y have been {residual_um:.1f} µm apart for half an hour (median); the "
             f"service states a standard deviation of {std_um:.2f} µm."
         )
-        return Caution("misfit", figures)
+        return Remark("misfit", figures)
 
     def snapshot(self, now_ns: int, monotonic_s: float) -> dict[str, Any]:
         """Return everything that is known now, for a view or as JSON.
@@ -321,7 +321,7 @@ class Machine:
         return {"time_utc_ns": event.time_utc_ns, "kind": event.kind, "text": event.text, "do": to_do(event)}
 
 
-def _tone(shown: str, warnings: list[Caution]) -> Tone:
+def _tone(shown: str, warnings: list[Remark]) -> Tone:
     """Return how much a machine needs somebody."""
     codes = {warning.code for warning in warnings}
     if "two_services" in codes:
@@ -330,7 +330,7 @@ def _tone(shown: str, warnings: list[Caution]) -> Tone:
     return "warn" if tone == "good" and codes & NEEDY else tone
 
 
-def _to_do(shown: str, reasons: list[Words], warnings: list[Caution]) -> str:
+def _to_do(shown: str, reasons: list[Words], warnings: list[Remark]) -> str:
     """Return in one line what is to be done; what the service said last is no news of one that is silent."""
     asked = [words.do for words in reasons if shown not in ("silent", "unknown")]
     if not asked and not (warnings and shown == "ok"):

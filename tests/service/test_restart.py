@@ -279,13 +279,13 @@ async def test_every_file_works_out_from_what_travels_in_it(tmp_path: Path, monk
 
     def break_off() -> None:
         compensation = machine.daemon._compensation  # type: ignore[union-attr]
-        original = compensation._decide
+        original = compensation._decision.decide
 
         def broken(*_: Any) -> Any:
-            compensation._decide = original  # type: ignore[method-assign]
+            compensation._decision.decide = original  # type: ignore[method-assign]
             raise ZeroDivisionError("a defect")
 
-        compensation._decide = broken  # type: ignore[method-assign]
+        compensation._decision.decide = broken  # type: ignore[method-assign]
 
     monkeypatch.setattr(Recorder, "write", failing)
     machine.at_sample[165] = lambda: (full.__setitem__(0, True), machine.command("zero", b'{"mode": "warm"}'))
