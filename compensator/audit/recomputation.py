@@ -14,13 +14,13 @@ from compensator.errors import CompensatorError, DataError
 from compensator.messages import Event, Offset, Sample, degraded, encode
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
+from compensator.reasons import Reason
 from compensator.recording.container import PAYLOAD, Attachment, Contents
 from compensator.service.compensation import Compensation
-from compensator.service.recording_thread import FAILED, LATE
 from compensator.service.retrace import obey
 
 #: Reasons that the disk gives: only the offset itself can say that it was published before it was on disk.
-_DISK_REASONS = (FAILED, LATE)
+_DISK_REASONS = (Reason.RECORDING_FAILED, Reason.RECORDING_LATE)
 
 _SAMPLE = msgspec.json.Decoder(Sample)
 _EVENT = msgspec.json.Decoder(Event)

@@ -17,7 +17,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Remark
 from compensator.recording.finishing import Retention
 from compensator.recording.reading import first_sequence
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.recording.signature import Signer
 from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Outcome
@@ -161,7 +161,7 @@ async def run_service(
     keep = Retention(keep_days=config.recording.keep_days, keep_mb=config.recording.keep_mb)
     with sole_user(folder, config.machine.name):
         attachments = {"config.toml": loaded.data, "model.toml": model_bytes}
-        recorder = Recorder(folder, config.machine.name, attachments, retention=keep, signer=_signer(loaded))
+        recorder = McapRecorder(folder, config.machine.name, attachments, retention=keep, signer=_signer(loaded))
 
         def command(name: str, payload: bytes, sender: Sender) -> Reply:
             return daemon.command(name, payload, sender)
@@ -194,7 +194,7 @@ async def run_service(
             first_sequence=max(first, early.seq + 1 if early is not None else 0),
             adoption=Adoption(config, folder, store),
             notes=(*resumed.notes, checks),
-            early=note,
+            checkpoint=note,
         )
         try:
             with publisher:

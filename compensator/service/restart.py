@@ -18,7 +18,7 @@ from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation
-from compensator.service.offset_checkpoint import Early
+from compensator.service.offset_checkpoint import EarlyOffset
 from compensator.service.retrace import opening_of, replayed, steps_of, warm_up
 from compensator.service.state import CompensationState, decode_state
 
@@ -67,7 +67,7 @@ class _Last:
                 self.operator_hold = name == "hold" or (self.operator_hold and name != "resume")
 
 
-def resume(loaded: LoadedConfig, model: ThermalModel, early: Early | None = None) -> Resumed:
+def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None = None) -> Resumed:
     """Bring a compensation to where the last recording ends.
 
     Parameters
@@ -76,7 +76,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: Early | None = None
         The present configuration.
     model : ThermalModel
         The present model.
-    early : Early, optional
+    early : EarlyOffset, optional
         The last offset that was published while the disk did not take it.
 
     Returns
