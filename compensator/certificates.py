@@ -63,7 +63,7 @@ class Certificate(NamedTuple):
 
 
 def check_files(source: str, files: TlsFiles) -> Certificate | None:
-    """Check that the files exist and belong together, and that nobody else can read the key.
+    """Check that the files exist and belong together, and that only the owner can read the key.
 
     Parameters
     ----------

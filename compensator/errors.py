@@ -6,7 +6,7 @@ CompensatorError            one line: file, row or key, value, what was expected
 ├── ConfigError             the configuration cannot be used                 exit code 2
 ├── ModelError              a model file or its dynamics cannot be used      exit code 2
 ├── DataError               a table or recording cannot be used              exit code 2
-├── ServiceError            the service cannot go on                         exit code 1
+├── ServiceError            the service cannot continue                         exit code 1
 └── AuditDifference         a recording and its recomputation differ         exit code 3
 ```
 
@@ -47,7 +47,7 @@ class DataError(CompensatorError):
 
 
 class ServiceError(CompensatorError):
-    """The service cannot go on."""
+    """The service cannot continue."""
 
 
 class AuditDifference(CompensatorError):

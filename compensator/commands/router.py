@@ -85,7 +85,7 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
     enabled = access.get("enabled")
     if not enabled:
         if access.get("rules") or access.get("policies"):
-            raise ConfigError(f"{path}: access_control/enabled: expected true beside rules; without it none applies")
+            raise ConfigError(f"{path}: access_control/enabled: expected true with rules; without it none applies")
         figures = "No access list: anybody who connects may publish and command everything."
         log.warning("%s: warning: %s", path, Remark(ServiceWarning.NO_ACCESS_LIST, figures).marked)
         return

@@ -29,8 +29,7 @@ from drivers.reading import Device
 
 log = logging.getLogger("compensator")
 
-#: So long the loop stands still for the disk: a fraction of the poll interval, so that no poll is late, and at most so
-#: many s.
+#: So long the loop blocks for the disk: a fraction of the poll interval, so that no poll is late, and at most so many s.
 DISK_PART, DISK_S = 0.4, 2.0
 #: So long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
 #: at most so many s. An offset of that age does no harm, its rate is published with it; one not on record might.
@@ -116,7 +115,7 @@ class Daemon:
         )
         self._sampler = Sampler(config, devices, clock, self._journal.note)
         self._takeover = Takeover(adoption, self._journal, clock, lambda: self._compensation)
-        self._commands = Commands(self._journal, self._takeover, unproven=config.zenoh.takes_unproven())
+        self._commands = Commands(self._journal, self._takeover, unproven=config.zenoh.accepts_unproven())
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""

@@ -133,7 +133,7 @@ class Journal:
     sequence : int
         Number of the first sample.
     limit_s : float
-        So long the loop stands still for the disk, s.
+        So long the loop blocks for the disk, s.
     patience_s : float
         So long an offset waits for the disk while polling continues, s; not if the previous one was late already.
     checkpoint : OffsetCheckpoint, optional
@@ -256,7 +256,7 @@ class Journal:
         return entry
 
     async def wait_briefly(self, entry: Entry) -> bool:
-        """Stand still for the disk; return whether longer waiting would be useless."""
+        """Block for the disk; return whether longer waiting would be useless."""
         await self._clock.settle([entry.attempt], self._limit_s)
         return entry.attempt.done() or bool(self._reason)
 

@@ -184,7 +184,7 @@ async def test_an_internal_error_holds_and_comes_out_again(tmp_path: Path, monke
 def test_a_restart_after_a_stop_or_a_kill(tmp_path: Path, minutes: int) -> None:
     folder = tmp_path / "rec"
     config = parse_config(CONFIG, source="test")
-    loaded = LoadedConfig(config=config, path=tmp_path / "machine.toml", data=CONFIG, sha256="")
+    loaded = LoadedConfig(config=config, path=tmp_path / "machine.toml", data=CONFIG)
     bench = replayable(tmp_path)
     live: list[bytes] = []
     bench.at_sample[80] = lambda: live.append(bench.recorder.path.read_bytes())  # type: ignore[union-attr]

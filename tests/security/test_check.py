@@ -133,7 +133,7 @@ def test_open_doors_and_numbered_ports_are_warned_of(tmp_path: Path, capsys: pyt
 
 def test_commands_of_nobody_are_taken_on_loopback_only(tmp_path: Path, keys: Path) -> None:
     def taken(zenoh: str) -> bool:
-        return load_config(written(tmp_path, zenoh)).config.zenoh.takes_unproven()
+        return load_config(written(tmp_path, zenoh)).config.zenoh.accepts_unproven()
 
     assert taken("") and taken('listen = ["tcp/127.0.0.1:1"]\n') and taken('listen = ["unixsock-stream/run/z"]\n')
     for other in ("tcp/0.0.0.0:1", "tcp/[::]:1", "tcp/10.0.0.7:1", "tcp/localhost.evil:1"):

@@ -84,9 +84,7 @@ class Machine:
     async def run(self, samples: int, until: Callable[[Outcome], bool] = lambda outcome: False) -> None:
         """Start the service, run it, end it cleanly."""
         data = self.store.in_use()
-        loaded = LoadedConfig(
-            config=self.config, path=self.folder / "machine.toml", data=self.config_bytes, sha256="unused"
-        )
+        loaded = LoadedConfig(config=self.config, path=self.folder / "machine.toml", data=self.config_bytes)
         note = OffsetCheckpoint(self.recordings, MACHINE, self.folder)
         early = note.read(self.config.limits.offset_max_um)
         resumed = resume(loaded, check_model(self.config, data, source="test"), early)

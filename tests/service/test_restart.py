@@ -231,7 +231,7 @@ async def test_cut_anywhere_every_whole_record_counts(tmp_path: Path) -> None:
     await machine.run_and_kill(40)
     path = recordings(machine.recordings, MACHINE)[-1]
     data = path.read_bytes()
-    loaded = LoadedConfig(config=machine.config, path=tmp_path / "machine.toml", data=machine.config_bytes, sha256="")
+    loaded = LoadedConfig(config=machine.config, path=tmp_path / "machine.toml", data=machine.config_bytes)
     model = load_model("quill")
     for cut in [*np.random.default_rng(5).integers(0, len(data), 60).tolist(), 0, 5, len(data) - 1]:
         path.write_bytes(data[:cut])

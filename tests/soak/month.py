@@ -130,7 +130,7 @@ class _Machine:
 
     async def _once(self) -> None:
         self._ending, self.away_min = "", 0
-        loaded = LoadedConfig(config=self.config, path=self.folder / "m.toml", data=self.config_bytes, sha256="")
+        loaded = LoadedConfig(config=self.config, path=self.folder / "m.toml", data=self.config_bytes)
         resumed = resume(loaded, parse_model(QUILL, source="test"))
         recorder = McapRecorder(self.folder / "rec", MACHINE, {"config.toml": self.config_bytes, "model.toml": QUILL})
         daemon = self.daemon = Daemon(
