@@ -29,7 +29,7 @@ from drivers.reading import Device
 
 log = logging.getLogger("compensator")
 
-#: So long the loop blocks for the disk: a fraction of the poll interval, so that no poll is late, and at most so many s.
+#: So long the loop blocks for the disk: a fraction of the poll interval, so that no poll is late, at most so many s.
 DISK_PART, DISK_S = 0.4, 2.0
 #: So long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
 #: at most so many s. An offset of that age does no harm, its rate is published with it; one not on record might.

@@ -93,7 +93,7 @@ def test_an_expired_certificate_is_said_with_its_date(
     [
         (TLS.format(stem="a") + 'listen = ["tcp/127.0.0.1:7447"]\n', "connect alone"),
         (TLS.format(stem="a").replace("tls/127", "tcp/127"), "expected tls/HOST:PORT"),
-        ('connect = ["tls/127.0.0.1:7447"]\n', "tls_ca, … beside it"),
+        ('connect = ["tls/127.0.0.1:7447"]\n', "with tls_ca, …"),
         ('connect = ["tls/127.0.0.1:7447"]\ntls_ca = "keys/ca.pem"\n', "zenoh.tls_certificate: missing"),
         ('listen = ["tls/127.0.0.1:7447"]\n', "compensator router"),
     ],
