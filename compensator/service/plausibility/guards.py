@@ -12,7 +12,7 @@ import msgspec
 
 from compensator.config import Channel, Guards
 from compensator.messages import ChannelSample, number
-from compensator.reasons import SampleQuality as Quality
+from compensator.reasons import SampleQuality
 
 #: Estimated heat, W, above which the machine counts as heated where heat is not measured.
 HEATED_W = 10.0
@@ -42,28 +42,28 @@ class ChannelGuard:
     def check(self, sample: ChannelSample) -> str:
         """Return the quality of a sample and remember what the next one needs."""
         self._since_good_min += self._period_min
-        if sample.device_quality != Quality.GOOD:
+        if sample.device_quality != SampleQuality.GOOD:
             return sample.device_quality
         quality = self._quality(number(sample.mean), sample)
-        if quality == Quality.GOOD:
+        if quality == SampleQuality.GOOD:
             self._last_good, self._since_good_min = number(sample.mean), 0.0
         return quality
 
-    def _quality(self, mean: float, sample: ChannelSample) -> Quality:
+    def _quality(self, mean: float, sample: ChannelSample) -> SampleQuality:
         channel = self._channel
         if not math.isfinite(mean):
-            return Quality.INVALID
+            return SampleQuality.INVALID
         if channel.range is not None and not channel.range[0] <= mean <= channel.range[1]:
-            return Quality.OUT_OF_RANGE
+            return SampleQuality.OUT_OF_RANGE
         if self._is_stuck(sample):
-            return Quality.STUCK
+            return SampleQuality.STUCK
         if channel.rate_max_per_min is not None and not math.isnan(self._last_good):
             # The permitted change grows with the time since the last good value: a sensor that returns after a long
             # loss is accepted again, a jump is not.
             allowed = channel.rate_max_per_min * self._since_good_min
             if abs(mean - self._last_good) > allowed:
-                return Quality.TOO_FAST
-        return Quality.GOOD
+                return SampleQuality.TOO_FAST
+        return SampleQuality.GOOD
 
     def _is_stuck(self, sample: ChannelSample) -> bool:
         low, high = number(sample.min), number(sample.max)
@@ -118,7 +118,7 @@ class SensorGuards:
         qualities = {name: self._guards[name].check(sample) for name, sample in channels.items()}
         if self._t_q_below_at(channels, qualities, heat_w):
             # Which of the two is wrong is unknown: neither is used.
-            qualities["t_q_degc"] = qualities["at_degc"] = Quality.T_Q_BELOW_AT
+            qualities["t_q_degc"] = qualities["at_degc"] = SampleQuality.T_Q_BELOW_AT
         return {
             name: sample
             if qualities[name] == sample.quality
@@ -127,11 +127,11 @@ class SensorGuards:
         }
 
     def _t_q_below_at(self, channels: Mapping[str, ChannelSample], qualities: Mapping[str, str], heat_w: float) -> bool:
-        if qualities.get("t_q_degc") != Quality.GOOD or qualities.get("at_degc") != Quality.GOOD:
+        if qualities.get("t_q_degc") != SampleQuality.GOOD or qualities.get("at_degc") != SampleQuality.GOOD:
             return False
         below_k = number(channels["at_degc"].mean) - number(channels["t_q_degc"].mean)
         known = channels.get("heat_w")
-        heat = number(known.mean) if known is not None and qualities["heat_w"] == Quality.GOOD else heat_w
+        heat = number(known.mean) if known is not None and qualities["heat_w"] == SampleQuality.GOOD else heat_w
         return below_k > self._limits.t_q_below_at_max_k and heat > HEATED_W
 
     def pass_time(self, minutes: float) -> None:
