@@ -6,8 +6,7 @@ CompensatorError            one line: file, row or key, value, what was expected
 ├── ConfigError             the configuration cannot be used                 exit code 2
 ├── ModelError              a model file or its dynamics cannot be used      exit code 2
 ├── DataError               a table or recording cannot be used              exit code 2
-├── ServiceError            the service cannot continue                         exit code 1
-└── AuditDifference         a recording and its recomputation differ         exit code 3
+└── ServiceError            the service cannot continue                      exit code 1
 ```
 
 Errors of devices are `drivers.DriverError`; the sampler turns them into qualities.
@@ -48,9 +47,3 @@ class DataError(CompensatorError):
 
 class ServiceError(CompensatorError):
     """The service cannot continue."""
-
-
-class AuditDifference(CompensatorError):
-    """A recording and its recomputation differ."""
-
-    exit_code = 3

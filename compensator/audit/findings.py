@@ -1,35 +1,126 @@
-"""What an audit can find, and how it is told."""
+"""What an audit can find: codes, their words, and findings as text and as JSON."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal
+from enum import Enum, StrEnum
+from typing import Any
 
-#: `altered`, `removed`, `inserted`, `reordered`: a record, attachment, metadata table or file. `truncated`: records at
-#: the end are missing, and not because the service was killed. `broken`: values of the chain do not belong together.
-#: `damaged`: no MCAP from some byte on. `missing_file`: a recording between two others. `unsigned`, `false_signature`:
-#: no seal, or none of the key given. `state`: the state that a file opens with is not the one that the file before
-#: ends with. `unreadable`: intact, and yet not what its schema says. `index`: the index of the file does not lead to
-#: all that is in it, or to something else.
-Kind = Literal[
-    "altered",
-    "removed",
-    "inserted",
-    "reordered",
-    "truncated",
-    "broken",
-    "damaged",
-    "missing_file",
-    "unsigned",
-    "false_signature",
-    "state",
-    "unreadable",
-    "index",
-]
+from compensator.reasons import explain
 
-#: So many findings of one file are kept; the rest is counted.
+#: So many findings of one file are kept; the others are counted.
 KEPT = 50
+
+
+class _Explained(StrEnum):
+    @property
+    def words(self) -> tuple[str, str]:
+        """What it means and what to do, from the table of words."""
+        return explain(self) or ("", "")
+
+
+class Kind(_Explained):
+    """Kinds of findings; `compensator explain` has their words."""
+
+    ALTERED = "altered"
+    REMOVED = "removed"
+    INSERTED = "inserted"
+    REORDERED = "reordered"
+    #: The end is missing, and not because the service was killed.
+    TRUNCATED = "truncated"
+    #: Values of the chain that do not belong together.
+    BROKEN = "broken"
+    #: Not MCAP from some byte on.
+    DAMAGED = "damaged"
+    MISSING_FILE = "missing_file"
+    UNSIGNED = "unsigned"
+    FALSE_SIGNATURE = "false_signature"
+    #: The state that a file opens with is not that in which the one before ended.
+    STATE = "state"
+    #: Intact, but not what its schema says.
+    UNREADABLE = "unreadable"
+    #: The index leads not to all that is in the file, or elsewhere.
+    INDEX = "index"
+
+
+class End(_Explained):
+    """How a file ends."""
+
+    FINISHED = "finished"
+    #: Torn, and finished at the next start.
+    RECOVERED = "recovered"
+    #: Without its end, all groups whole: still being written, the service was killed, or the end was cut off.
+    OPEN = "open"
+    #: The same within a group.
+    TORN = "torn"
+    #: A finished file without its end.
+    TRUNCATED = "truncated"
+    DAMAGED = "damaged"
+
+
+class Fault(Enum):
+    """Everything that can be wrong, with its kind and its sentence; names in braces are figures."""
+
+    # The chain of one file.
+    NO_CHAIN = (
+        Kind.REMOVED,
+        "the recorder writes it, but it is missing: nothing shows that the file is as it was written",
+    )
+    OPENING_UNREADABLE = Kind.ALTERED, "the first message of the chain cannot be read"
+    OPENING_MISSING = Kind.REMOVED, "the first message of the chain is missing"
+    PART_MISSING = Kind.REMOVED, "the recording began with it, but it is missing"
+    PART_ADDED = Kind.INSERTED, "the recording did not begin with it"
+    PART_CHANGED = Kind.ALTERED, "not what the recording began with"
+    PARTS_REORDERED = Kind.REORDERED, "attachments or metadata stand in another order"
+    NO_HASH = Kind.ALTERED, "a hash that is not one"
+    OPENING_CHANGED = Kind.ALTERED, "differs from what follows from the file"
+    OTHER_PREVIOUS = Kind.ALTERED, "names another last value of the previous file than the metadata"
+    PART_LATE = Kind.INSERTED, "{what}"
+    PART_CRC = Kind.ALTERED, "{what}"
+    UNREADABLE_MESSAGE = Kind.ALTERED, "cannot be read"
+    MESSAGE_CHANGED = Kind.ALTERED, "differs from what follows from the records"
+    MESSAGE_MISSING = Kind.REMOVED, "the message of the chain is missing"
+    VALUE_CHANGED = Kind.ALTERED, "its value of {name} is not that of the record"
+    VALUES_BROKEN = (
+        Kind.BROKEN,
+        "the values before and after this message do not belong together: one side was rewritten",
+    )
+    RECORDS_MISSING = Kind.REMOVED, "{numbers} missing before it"
+    RECORDS_MOVED = Kind.REORDERED, "{numbers} standing behind later ones"
+    RECORDS_AGAIN = Kind.INSERTED, "{numbers} standing there again"
+    NOT_LISTED = Kind.INSERTED, "the chain does not list it"
+    LISTED_MISSING = Kind.REMOVED, "the chain lists it, but it is missing"
+    EXCHANGED = Kind.REORDERED, "stands in the place of record {record}"
+    MOVED = Kind.REORDERED, "stands in another place than before"
+    RECORD_CHANGED = Kind.ALTERED, "does not match its value in the chain"
+    BEHIND_CHAIN = Kind.INSERTED, "{count} record(s) behind the last message of the chain"
+    NO_SEAL = Kind.REMOVED, "the file has its end, but not the seal before it"
+    SEAL_CHANGED = Kind.ALTERED, "does not seal the records before it"
+    FALSE_SIGNATURE = Kind.FALSE_SIGNATURE, "not signed by the key given"
+    # The file as such.
+    UNREADABLE = Kind.UNREADABLE, "{what}"
+    NOT_REPLAYED = Kind.UNREADABLE, "its samples cannot be replayed: {what}"
+    DAMAGED = Kind.DAMAGED, "byte {offset}: {what}"
+    LENGTH_CHANGED = (
+        Kind.DAMAGED,
+        "byte {offset}: a record whose length leads beyond the end, but what stands there is whole",
+    )
+    CUT_OFF = Kind.TRUNCATED, "a finished file that ends at byte {offset}; its end is missing"
+    INDEX = Kind.INDEX, "{what}"
+    # Several files.
+    RENAMED = Kind.REORDERED, "it has the name of another file: it was begun as {original}"
+    END_UNSIGNED = Kind.UNSIGNED, "its end is not signed"
+    NOTHING_SIGNED = Kind.UNSIGNED, "has no hash chain, so nothing is signed"
+    MORE_WAS_THERE = Kind.TRUNCATED, "{next} goes on from records that are missing here: its end was cut off"
+    FILE_MISSING = Kind.MISSING_FILE, "{previous}, from which it goes on, is {lost}; it stood behind {before}"
+    FILES_REORDERED = Kind.REORDERED, "goes on from {previous}, but {before} stands between"
+    FILES_BROKEN = Kind.BROKEN, "does not go on from the last value of {previous}: one of them was rewritten"
+    NUMBERS_AGAIN = Kind.BROKEN, "sample numbers from {seq} on are also in {previous}"
+    OTHER_STATE = Kind.STATE, "opens with another state than {previous} ends with"
+
+    def __init__(self, kind: Kind, sentence: str) -> None:
+        self.kind, self.sentence = kind, sentence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,16 +129,16 @@ class Finding:
 
     Parameters
     ----------
-    kind : str
-        See `Kind`.
+    kind : Kind
+        Its code.
     file : str
         Name of the file.
     text : str
-        What it is, for people.
+        What is wrong.
     topic : str
-        Channel without the slash, or `attachment …`, `metadata …`, `channel …`.
+        Channel without the slash, or the attachment or metadata; empty where it is the file.
     sequence : int, optional
-        Number of the record in the file.
+        Number of the record.
     time_utc_ns : int, optional
         Its time, ns since 1970 UTC.
     """
@@ -59,13 +150,17 @@ class Finding:
     sequence: int | None = None
     time_utc_ns: int | None = None
 
-    def line(self) -> str:
-        """Return one line for people."""
+    @property
+    def place(self) -> str:
+        """Where in the file it is."""
         where = [f"/{self.topic}" if self.topic and " " not in self.topic else self.topic]
         where.append("" if self.sequence is None else f"record {self.sequence}")
         where.append("" if self.time_utc_ns is None else utc(self.time_utc_ns))
-        place = " ".join(part for part in where if part)
-        return f"{self.file}: {self.kind}: {place + ': ' if place else ''}{self.text}"
+        return " ".join(filter(None, where))
+
+    def line(self) -> str:
+        """Return one line for people."""
+        return ": ".join(filter(None, (self.file, self.kind, self.place, self.text)))
 
     def as_json(self) -> dict[str, Any]:
         """Return it as it stands in the result of `--json`."""
@@ -90,7 +185,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """A message that the engine does not give again.
+    """A message that the replay does not reproduce.
 
     Parameters
     ----------
@@ -114,7 +209,7 @@ class Difference:
 
     def lines(self) -> list[str]:
         """Return it for people, field by field."""
-        head = f"{self.file}: /{self.topic} of sample {self.seq}, {utc(self.time_utc_ns)}, comes out differently:"
+        head = f"{self.file}: /{self.topic} of sample {self.seq}, {utc(self.time_utc_ns)}, differs:"
         rows = [f"  {f.name}: recorded {f.recorded!r}, recomputed {f.recomputed!r}" for f in self.fields]
         return [head, *rows]
 
@@ -128,25 +223,6 @@ class Difference:
             "time_utc_ns": self.time_utc_ns,
             "fields": fields,
         }
-
-
-class Findings:
-    """Findings of one file, the first of them kept."""
-
-    def __init__(self, file: str) -> None:
-        self.file = file
-        self.kept: list[Finding] = []
-        self.count = 0
-
-    def add(
-        self, kind: Kind, text: str, *, topic: str = "", sequence: int | None = None, time_utc_ns: int | None = None
-    ) -> None:
-        """Keep one, or count it where there are many."""
-        self.count += 1
-        if len(self.kept) < KEPT:
-            self.kept.append(
-                Finding(kind=kind, file=self.file, text=text, topic=topic, sequence=sequence, time_utc_ns=time_utc_ns)
-            )
 
 
 def utc(time_ns: int) -> str:

@@ -1,4 +1,4 @@
-"""The pages of `replay`: what an audit proved and what it did not, and what another model would have done."""
+"""The pages of `replay`: what an audit proved and what not, and what another model would have done."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from compensator import __version__
 from compensator.audit.comparison import Comparison, worst_utc
-from compensator.audit.findings import Difference, Finding, utc
-from compensator.audit.recording_audit import RecordingAudit
+from compensator.audit.findings import Difference, End, Kind, utc
+from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit
 from compensator.recording.chain import NOTHING
 from compensator.report.envelope import Envelope, line_of
@@ -38,9 +38,9 @@ _ROWS = 20
 _REMARKS = 40
 #: Values that are brought to a curve together.
 _TOGETHER = 5000
-_ENDS_WHOLE = ("finished", "recovered")
-#: Kinds of findings of whole files, not of what stands in one.
-_OF_FILES = ("missing_file", "broken", "state", "reordered")
+_ENDS_WHOLE = (End.FINISHED, End.RECOVERED)
+#: Kinds of findings that are about several files.
+_OF_FILES = (Kind.MISSING_FILE, Kind.BROKEN, Kind.STATE, Kind.REORDERED)
 
 
 # ---------------------------------------------------------------------------- audit
@@ -78,17 +78,19 @@ def verdict(found: Audit) -> str:
         if found.findings_count:
             said.append(f"{found.findings_count} finding(s)")
         if found.differing:
-            said.append(f"{found.differing} sample(s) that come out differently")
+            said.append(f"{found.differing} sample(s) that differ in the replay")
         return f"Not proven: {' and '.join(said)} in {files} with {found.samples} samples."
     if _partly(found):
-        return f"Proven in part: {found.samples} samples of {files} come out again; see what could not be looked at."
-    words = f"Proven: {found.samples} samples in {files} are as they were written, and every offset comes out again"
+        return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
+    words = (
+        f"Proven: {found.samples} samples in {files} are as they were written, and the replay reproduces every offset"
+    )
     return words + (", signed by the key given." if found.signed else "; no signature was checked.")
 
 
 def _partly(found: Audit) -> bool:
-    """Tell whether something was found right only because it could not be looked at."""
-    return not found.samples or any(not file.last or file.not_worked_out for file in found.files)
+    """Tell whether there was something that could not be checked."""
+    return not found.samples or any(not file.last or file.not_replayed for file in found.files)
 
 
 def _tone(found: Audit) -> Tone:
@@ -102,7 +104,7 @@ def _span(found: Audit) -> str:
 
 
 def _timeline(found: Audit) -> list[Block]:
-    """Show when was proven what; nothing where there is no sample."""
+    """Show which times are proven; nothing where there is no sample."""
     files = [file for file in found.files if file.first_ns]
     if not files:
         return []
@@ -133,22 +135,22 @@ def _timeline(found: Audit) -> list[Block]:
 
 
 def _proven(found: Audit) -> Table:
-    yes, no, open_ = "✓ proven", "✗ not proven", "– not looked at"
+    yes, no, open_ = "✓ proven", "✗ not proven", "– not checked"
     chained = [file for file in found.files if file.last]
     records = sum(file.records for file in chained)
     of_files = sum(finding.kind in _OF_FILES for finding in found.findings)
     ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]
     whole = bool(chained) and len(chained) == len(found.files)
-    worked_out = bool(found.samples) and not any(file.not_worked_out for file in found.files)
-    not_signed = sum(finding.kind in ("unsigned", "false_signature") for finding in found.findings)
-    cut = sum(finding.kind == "truncated" for finding in found.findings)
-    index = sum(finding.kind == "index" for finding in found.findings)
+    worked_out = bool(found.samples) and not any(file.not_replayed for file in found.files)
+    not_signed = sum(finding.kind in (Kind.UNSIGNED, Kind.FALSE_SIGNATURE) for finding in found.findings)
+    cut = sum(finding.kind == Kind.TRUNCATED for finding in found.findings)
+    index = sum(finding.kind == Kind.INDEX for finding in found.findings)
     inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
         [
             "Every estimate and every offset is what this program makes of the samples",
             no if found.differing else yes if worked_out else open_,
-            f"{found.samples} samples worked out again, bit for bit; {found.differing} differ",
+            f"{found.samples} samples replayed, bit for bit; {found.differing} differ",
         ],
         [
             "No record was changed, removed, inserted or moved",
@@ -163,10 +165,10 @@ def _proven(found: Audit) -> Table:
         [
             "Readers that seek find every record, and nothing else",
             no if index else yes if whole and not ends else open_,
-            "index and summary of each file held against what is in it",
+            "index and summary of each file compared with what is in it",
         ],
         [
-            "Nobody wrote all of it anew from some point on",
+            "It was not all rewritten from some point on",
             (no if not_signed else yes) if found.signed else open_,
             "signatures checked against the key given"
             if found.signed
@@ -178,15 +180,15 @@ def _proven(found: Audit) -> Table:
             f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end",
         ],
         ["What was before the first file", open_, "it was not given"],
-        ["The sensors told the truth", open_, "no recording can show that"],
+        ["The sensors measured what was there", open_, "no recording can show that"],
     ]
     return Table(title="What was proven, and what was not", head=["statement", "outcome", "how"], rows=rows)
 
 
 def _difference(difference: Difference) -> Table:
     return Table(
-        title="The first sample that comes out differently, field by field",
-        head=["field", "recorded", "worked out again"],
+        title="The first sample that differs, field by field",
+        head=["field", "recorded", "replayed"],
         rows=[[field.name, _shown(field.recorded), _shown(field.recomputed)] for field in difference.fields],
         note=f"{difference.file}: /{difference.topic} of sample {difference.seq}, {utc(difference.time_utc_ns)}.",
     )
@@ -197,16 +199,11 @@ def _shown(value: object) -> str:
 
 
 def _findings(found: Audit) -> Block:
-    def row(finding: Finding) -> list[Cell]:
-        where = f"/{finding.topic}" if finding.topic and " " not in finding.topic else finding.topic
-        number = "" if finding.sequence is None else f"record {finding.sequence}"
-        at = "" if finding.time_utc_ns is None else utc(finding.time_utc_ns)
-        return [finding.file, Code(finding.kind), finding.text, " ".join(filter(None, (where, number, at)))]
-
     more = found.findings_count - len(found.findings)
     note = f"And {more} more: of each file the first are named." if more else ""
     head = ["file", "kind", "what", "where"]
-    return _folded("Findings", head, [row(finding) for finding in found.findings], note)
+    rows: list[list[Cell]] = [[one.file, Code(one.kind), one.text, one.place] for one in found.findings]
+    return _folded("Findings", head, rows, note)
 
 
 def _files(files: Sequence[RecordingAudit]) -> Block:
@@ -256,7 +253,7 @@ def _folded(title: str, head: Sequence[str], rows: Sequence[Sequence[Cell]], not
 
 
 class Curves:
-    """Both models' offsets and what is left with each, over any time in little memory."""
+    """Both models' offsets and what is left with each, over any length of time in little memory."""
 
     def __init__(self) -> None:
         self.curves = {name: Envelope() for name in ("recorded", "other", "left recorded", "left other")}
@@ -264,7 +261,7 @@ class Curves:
         self.first_s, self.last_s = math.inf, -math.inf
 
     def add(self, time_ns: int, y: float, recorded: float, other_y: float, other: float) -> None:
-        """Take a sample in: measured deformation and offset of each, µm."""
+        """Add a sample: measured deformation and offset of each, µm."""
         t = time_ns * 1e-9
         self.first_s, self.last_s = min(self.first_s, t), max(self.last_s, t)
         self._rows.append((t, recorded, other, y + recorded, other_y + other))
@@ -351,15 +348,9 @@ def _before_and_after(found: Comparison) -> Table:
     return Table(
         title="Before and after",
         head=["", "rms µm", "largest µm", "samples", "largest at"],
-        rows=[
-            row(f"residual, {found.recorded} (recorded)", found.residual_before),
-            row(f"residual, {found.other}", found.residual_after),
-            row(f"left with the offset, {found.recorded} (recorded)", found.left_before),
-            row(f"left with the offset, {found.other}", found.left_after),
-            row(f"offset of {found.other} − recorded offset", found.offsets),
-        ],
-        note="Residual: measured − predicted. Every recorded sample went through the service's own compensation with "
-        "the other model, limits and losses included.",
+        rows=[row(name, spread) for name, spread in found.rows().items()],
+        note="Residual: measured − predicted. Every recorded sample was run through the service's own compensation "
+        "with the other model, limits and losses included.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Audits the recordings of a machine together: none missing, none exchanged, each going on where the last one ended."""
+"""Audits the recordings of a machine together: none is missing or exchanged, each goes on where the last one ended."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from compensator.audit.findings import Difference, Finding, Kind, utc
-from compensator.audit.recording_audit import RecordingAudit, audit_recording
+from compensator.audit.findings import Difference, End, Fault, Finding, utc
+from compensator.audit.recording_audit import audit_recording
+from compensator.audit.result import RecordingAudit
 from compensator.reasons import Remark
 from compensator.recording.chain import NOTHING
 from compensator.recording.signature import Verifier
@@ -20,7 +21,7 @@ _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Audit:
-    """Verdict over a number of recordings.
+    """Verdict on recordings.
 
     Parameters
     ----------
@@ -31,7 +32,7 @@ class Audit:
     findings_count : int
         How many there are.
     difference : Difference, optional
-        The first sample that comes out differently.
+        The first sample that the replay does not reproduce.
     remarks : tuple of Remark
         What is worth knowing and not wrong.
     signed : bool
@@ -47,12 +48,12 @@ class Audit:
 
     @property
     def samples(self) -> int:
-        """Number of samples worked out again."""
+        """Number of samples that were replayed."""
         return sum(file.samples for file in self.files)
 
     @property
     def differing(self) -> int:
-        """Number of samples that come out differently."""
+        """Number of samples that the replay does not reproduce."""
         return sum(file.differing for file in self.files)
 
     @property
@@ -112,7 +113,7 @@ def audit(
     progress : callable, optional
         Called with the number of bytes worked off, and of all.
     executor : Executor, optional
-        Who audits the files; this process, one after the other, where there is none.
+        Audits the files side by side; without one, this process audits one after the other.
 
     Raises
     ------
@@ -137,7 +138,7 @@ def audit(
         audits = _side_by_side(executor, paths, public_key, lambda path: add(sizes[path]))
     else:
         audits = [audit_recording(path, verifier, progress=add) for path in paths]
-    return judge(audits, signed=verifier is not None)
+    return combine(audits, signed=verifier is not None)
 
 
 def _side_by_side(
@@ -155,8 +156,8 @@ def _audit_one(path: Path, public_key: Path | None) -> RecordingAudit:
     return audit_recording(path, Verifier(public_key) if public_key else None)
 
 
-def judge(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
-    """Put the audits of single files together.
+def combine(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
+    """Combine the audits of single files.
 
     Parameters
     ----------
@@ -165,156 +166,130 @@ def judge(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
     signed : bool
         Whether seals were checked against a key.
     """
-    # By the names that they were begun with: these tell the order, also where the clock was set back.
+    # By the names that they were begun with: these show the order, also where the clock was set back.
     files = sorted(map(_named, audits), key=lambda f: (f.machine, f.original.removesuffix(".mcap")))
-    judged = _Judge(files, signed)
+    series = _Series(files, signed)
     for before, after in zip([None, *files[:-1]], files, strict=True):
-        judged.file(after)
-        judged.joint(before if before is not None and before.machine == after.machine else None, after)
-    findings = [finding for file in files for finding in (*judged.own.get(file.file, ()), *file.findings)]
-    count = sum(len(own) for own in judged.own.values()) + sum(file.findings_count for file in files)
-    first = next((file.difference for file in files if file.difference), None)
+        series.check_file(after)
+        series.check_link(before if before is not None and before.machine == after.machine else None, after)
+    findings = [finding for file in files for finding in (*series.own[file.file].findings, *file.findings)]
     return Audit(
         files=tuple(files),
         findings=tuple(findings),
-        findings_count=count,
-        difference=first,
-        remarks=tuple(judged.remarks),
+        findings_count=sum(file.findings_count for file in (*series.own.values(), *files)),
+        difference=next((file.difference for file in files if file.difference), None),
+        remarks=tuple(series.remarks),
         signed=signed,
     )
 
 
 def _named(file: RecordingAudit) -> RecordingAudit:
-    """Return the file with the machine of its name where nothing is left of it in it."""
+    """Return the file with the machine of its name where its metadata are lost."""
     name = _NAME.match(file.file)
     return file if name is None or file.machine else replace(file, machine=name["machine"])
 
 
-class _Judge:
-    """Looks at files one after the other, and at what joins them."""
+class _Series:
+    """Checks files one after the other, and what links them."""
 
     def __init__(self, files: Sequence[RecordingAudit], signed: bool) -> None:
         self._names = {file.original: file for file in files}
         self._removed = {name for file in files for name in file.removed}
         self._newest = {file.machine: file.file for file in files}
         self._signed = signed
-        self.own: dict[str, list[Finding]] = {}
+        #: Findings of whole files; they stand before those within a file.
+        self.own = {file.file: RecordingAudit(file=file.file) for file in files}
         self.remarks: list[Remark] = []
 
-    def _find(self, kind: Kind, file: RecordingAudit, text: str) -> None:
-        self.own.setdefault(file.file, []).append(Finding(kind=kind, file=file.file, text=text))
+    def _find(self, fault: Fault, file: RecordingAudit, **figures: Any) -> None:
+        self.own[file.file].find(fault, **figures)
 
-    def file(self, file: RecordingAudit) -> None:
-        """Look at one file by itself."""
-        if file.original != file.file and _NAME.match(file.file):
-            self._find("reordered", file, f"its name is that of another file: it was begun as {file.original}")
-        if file.not_worked_out:
-            self.remarks.append(
-                Remark("not_worked_out", f"{file.file}: not all samples were worked out again: {file.not_worked_out}.")
-            )
-        if not file.last and file.end in ("open", "torn"):
-            self.remarks.append(Remark("torn", f"{file.file}: torn before anything was recorded."))
+    def check_file(self, file: RecordingAudit) -> None:
+        """Check one file by itself."""
+        name, remark = file.file, self.remarks.append
+        if file.original != name and _NAME.match(name):
+            self._find(Fault.RENAMED, file, original=file.original)
+        if file.not_replayed:
+            remark(Remark("not_worked_out", f"{name}: not all samples were replayed: {file.not_replayed}."))
+        if not file.last and file.end in (End.OPEN, End.TORN):
+            remark(Remark("torn", f"{name}: torn before anything was recorded."))
             return
-        if file.end == "recovered":
-            self.remarks.append(
-                Remark("recovered", f"{file.file}: the service was ended hard; every whole record was kept.")
-            )
-        elif file.end in ("open", "torn"):
-            what = "within a group of records" if file.end == "torn" else "behind a whole group of records"
-            newest = self._newest[file.machine] == file.file
-            known = (
-                "; that no more was there cannot be known until the next file names its last value" if newest else ""
-            )
-            text = f"{file.file}: has no end, {what}: still being written, or ended hard{known}."
-            self.remarks.append(Remark("torn", text) if file.end == "torn" else Remark("open", text))
+        if file.end == End.RECOVERED:
+            remark(Remark("recovered", f"{name}: the service was killed; every whole record was kept."))
+        elif file.end in (End.OPEN, End.TORN):
+            figures = f"{name}: has no end, still being written, or the service was killed"
+            if self._newest[file.machine] == name:
+                figures += "; whether more was there shows the next file, which names the last value of this one"
+            if file.end == End.TORN:
+                remark(Remark("torn", f"{figures}. It ends within a group of records."))
+            else:
+                remark(Remark("open", f"{figures}. It ends behind a whole group of records."))
         if file.skipped:
-            self.remarks.append(
-                Remark("samples_missing", f"{file.file}: {file.skipped} sample(s) between others were not recorded.")
-            )
+            remark(Remark("samples_missing", f"{name}: {file.skipped} sample(s) between others were not recorded."))
         if file.early:
-            text = f"{file.early} offset(s) were published before they were on disk, which was slow or failed"
-            self.remarks.append(Remark("published_early", f"{file.file}: {text}."))
-        self._seals(file)
+            figures = f"{file.early} offset(s) were published before they were on disk, which was slow or failed"
+            remark(Remark("published_early", f"{name}: {figures}."))
+        self._check_signatures(file)
 
-    def _seals(self, file: RecordingAudit) -> None:
+    def _check_signatures(self, file: RecordingAudit) -> None:
+        name, remark = file.file, self.remarks.append
         if self._signed:
-            if file.end in ("finished", "recovered") and file.last and not file.sealed_signed:
-                self._find("unsigned", file, "its end is not signed")
+            if file.end in (End.FINISHED, End.RECOVERED) and file.last and not file.sealed_signed:
+                self._find(Fault.END_UNSIGNED, file)
             elif not file.last:
-                self._find("unsigned", file, "has no hash chain, so nothing is signed")
+                self._find(Fault.NOTHING_SIGNED, file)
             elif file.unsigned_behind:
-                self.remarks.append(
-                    Remark(
-                        "unsigned_behind", f"{file.file}: {file.unsigned_behind} record(s) behind the last signature."
-                    )
-                )
+                figures = f"{name}: {file.unsigned_behind} record(s) behind the last signature."
+                remark(Remark("unsigned_behind", figures))
         elif file.signed:
-            keys = ", ".join(key[:16] for key in file.keys)
-            self.remarks.append(
-                Remark("signature_not_checked", f"{file.file}: signed by {keys}…, not checked (no --public-key).")
-            )
+            keys = ", ".join(key[:16] for key in sorted(file.keys))
+            remark(Remark("signature_not_checked", f"{name}: signed by {keys}…, not checked (no --public-key)."))
 
-    def joint(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
-        """Look at what joins a file to the one before it."""
+    def check_link(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
+        """Check what links a file to the one before it."""
         if not after.last:
             return
         if before is None:
-            self._first(after)
-            return
-        if not before.last:
-            if (
-                before.end in ("open", "torn")
-                and after.previous_file == before.file
-                and after.previous != NOTHING.hex()
-            ):
-                self._find("truncated", before, f"{after.file} goes on from records that are not there")
-            return
-        if after.previous == before.last:
-            self._state(before, after)
-            return
-        if not after.previous_file:
-            self.remarks.append(
-                Remark(
-                    "begins_new_chain",
-                    f"{after.file}: begins a new chain; it says that no recording was there before it.",
-                )
-            )
-            return
+            self._check_first(after)
+        elif not before.last:
+            began = before.end in (End.OPEN, End.TORN) and after.previous_file == before.file
+            if began and after.previous != NOTHING.hex():
+                self._find(Fault.MORE_WAS_THERE, before, next=after.file)
+        elif after.previous == before.last:
+            self._check_state(before, after)
+        elif not after.previous_file:
+            figures = f"{after.file}: begins a new chain; it states that no recording was there before it."
+            self.remarks.append(Remark("begins_new_chain", figures))
+        else:
+            self._explain_break(before, after)
+
+    def _explain_break(self, before: RecordingAudit, after: RecordingAudit) -> None:
         named = self._names.get(after.previous_file)
         if named is None:
             lost = "removed by the limit of what is kept" if after.previous_file in self._removed else "missing"
-            self._find(
-                "missing_file",
-                after,
-                f"{after.previous_file}, which it goes on from, is {lost}; it stood behind {before.file}",
-            )
+            self._find(Fault.FILE_MISSING, after, previous=after.previous_file, lost=lost, before=before.file)
         elif named.original != before.original:
-            self._find("reordered", after, f"goes on from {named.file}, and {before.file} stands between")
-        elif before.end == "damaged":
-            return
-        elif before.end in ("open", "torn", "truncated"):
-            self._find("truncated", before, f"{after.file} goes on from more than is there: its end was cut off")
-        else:
-            self._find(
-                "broken", after, f"does not go on from the last value of {before.file}: one of them was rewritten"
-            )
+            self._find(Fault.FILES_REORDERED, after, previous=named.file, before=before.file)
+        elif before.end in (End.OPEN, End.TORN, End.TRUNCATED):
+            self._find(Fault.MORE_WAS_THERE, before, next=after.file)
+        elif before.end != End.DAMAGED:
+            self._find(Fault.FILES_BROKEN, after, previous=before.file)
 
-    def _first(self, file: RecordingAudit) -> None:
+    def _check_first(self, file: RecordingAudit) -> None:
         if file.previous != NOTHING.hex() or file.previous_file:
-            lost = (
-                "which the limit of what is kept removed" if file.previous_file in self._removed else "not given here"
-            )
+            removed = file.previous_file in self._removed
+            lost = "which the limit of what is kept removed" if removed else "not given here"
             self.remarks.append(Remark("before_not_given", f"{file.file}: begins after {file.previous_file}, {lost}."))
 
-    def _state(self, before: RecordingAudit, after: RecordingAudit) -> None:
-        """In one run, the state that a file opens with is that which the file before ended with."""
+    def _check_state(self, before: RecordingAudit, after: RecordingAudit) -> None:
+        """Check that in one run a file opens with the state in which the one before ended."""
         if after.first_seq >= 0 and 0 <= after.first_seq <= before.last_seq:
-            self._find("broken", after, f"sample numbers from {after.first_seq} on stand in {before.file}, too")
-        whole = not (before.not_worked_out or after.not_worked_out or before.findings_count or before.differing)
+            self._find(Fault.NUMBERS_AGAIN, after, seq=after.first_seq, previous=before.file)
+        whole = not (before.not_replayed or after.not_replayed or before.findings_count or before.differing)
         same_run = after.began == "day" and not after.restarted and after.identity == before.identity
         same_run = same_run and bool(after.state_before) and after.first_seq == before.last_seq + 1
         if whole and same_run and after.state_before != before.state_after:
-            self._find("state", after, f"opens with another state than {before.file} ends with")
+            self._find(Fault.OTHER_STATE, after, previous=before.file)
 
 
 def summary(found: Audit) -> str:
@@ -325,11 +300,11 @@ def summary(found: Audit) -> str:
     span = f", {utc(min(times))} to {utc(max(times))}" if times else ""
     lines = [f"{samples} samples of {machines} in {files} file(s){span}"]
     if not samples:
-        lines.append("No sample was worked out again.")
+        lines.append("No sample was replayed.")
     elif not found.differing:
-        lines.append("Every estimate and every offset comes out again, bit for bit.")
+        lines.append("The replay reproduces every estimate and every offset, bit for bit.")
     else:
-        lines.append(f"{found.differing} sample(s) come out differently. The first of them:")
+        lines.append(f"{found.differing} sample(s) differ in the replay. The first of them:")
         lines += found.difference.lines() if found.difference else []
     chained = [file for file in found.files if file.last]
     if chained and not found.findings_count:
@@ -337,7 +312,7 @@ def summary(found: Audit) -> str:
         lines.append(f"The hash chain holds over {records} records; nothing was changed, removed, inserted or moved.")
         if not found.signed:
             lines.append(
-                "Who could write all of these files could compute the chain anew: only a signature, checked "
+                "Whoever can write all of these files can compute a new chain; only a signature, checked "
                 "with --public-key, excludes that."
             )
     if found.findings_count:

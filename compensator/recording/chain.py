@@ -35,7 +35,7 @@ _sha256 = hashlib.sha256
 
 
 def body_of(sequence: int, time_ns: int, payload: bytes) -> bytes:
-    """Return what is hashed of a record beside its topic."""
+    """Return what is hashed of a record in addition to its topic."""
     return _BODY.pack(sequence, time_ns, time_ns) + payload
 
 
@@ -130,7 +130,7 @@ class ChainWriter:
         return encode(message)
 
     def add(self, topic: str, body: bytes) -> None:
-        """Take one record in."""
+        """Add one record."""
         self.head = link(self.head, topic, body)
         (sequence,) = struct.unpack_from("<I", body)
         self.links.append(ChainLink(topic=topic, sequence=sequence, sha256=self.head.hex()))

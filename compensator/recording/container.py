@@ -1,8 +1,8 @@
 """Reads an MCAP file from front to back: live or finished, chunked or not, whole, torn or damaged.
 
 The `mcap` library writes our files, and checks them when they are finished. An audit of a year reads millions of
-records, trusts none of them and must tell a torn end from damage, so it reads the framing itself: one record after
-the other, no index, lengths bounded before anything is allocated.
+records, trusts none of them and must distinguish a torn end from damage, so it reads the framing itself: one record
+after the other, no index, lengths bounded before anything is allocated.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
 
@@ -50,6 +51,7 @@ __all__ = [
     "Container",
     "Contents",
     "Damaged",
+    "Flaw",
     "Message",
     "Torn",
 ]
@@ -115,6 +117,14 @@ class Channel:
     schema: bytes
 
 
+class Flaw(StrEnum):
+    """What is wrong with an attachment or a metadata table, in words."""
+
+    WRONG_CRC = "its CRC is wrong"
+    TWICE = "stands twice"
+    LATE = "stands behind messages"
+
+
 @dataclass(slots=True)
 class Contents:
     """What was met so far beside messages.
@@ -129,8 +139,8 @@ class Contents:
         By name.
     channels : dict of int to Channel
         By number.
-    late : list of str
-        Names of attachments and metadata that stand behind the first message or twice.
+    flaws : list of (str, Flaw)
+        Attachments and metadata with a flaw.
     chunked, ended : bool
         Whether chunks were met, and whether the file has its end.
     messages : int
@@ -141,7 +151,7 @@ class Contents:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, Attachment] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    late: list[str] = field(default_factory=list)
+    flaws: list[tuple[str, Flaw]] = field(default_factory=list)
     chunked: bool = False
     ended: bool = False
     messages: int = 0
@@ -190,7 +200,7 @@ class Container:
         return self._base + self._at
 
     def survey(self, *, whole: bool) -> Contents:
-        """Read for what stands beside the messages, as far as the file goes, and return it.
+        """Read attachments, metadata and channels, as far as the file goes, and return them.
 
         Parameters
         ----------
@@ -358,7 +368,7 @@ class Container:
             fields.done()
             self.index.add_attachment(offset, 9 + len(body), log_time, create_time, len(data), name, media_type)
             if crc and zlib.crc32(body[:-4]) != crc:
-                contents.late.append(f"attachment {name}: its CRC is wrong")
+                contents.flaws.append((f"attachment {name}", Flaw.WRONG_CRC))
             self._keep(
                 contents.attachments, name, Attachment(name, media_type, log_time, create_time, data), "attachment"
             )
@@ -371,7 +381,7 @@ class Container:
 
     def _keep(self, kept: dict[str, _T], name: str, value: _T, kind: str) -> None:
         if self.contents.messages or name in kept:
-            self.contents.late.append(f"{kind} {name}: stands " + ("twice" if name in kept else "behind messages"))
+            self.contents.flaws.append((f"{kind} {name}", Flaw.TWICE if name in kept else Flaw.LATE))
         else:
             kept[name] = value
 

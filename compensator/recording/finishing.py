@@ -1,45 +1,33 @@
 """Makes finished recordings compact, and removes the oldest ones where a limit is set.
 
-A live file is written so that a kill loses nothing, which costs size and an index. Once nobody writes to it any more
-it is copied, message by message, into a file with chunks, compression, CRCs and an index; the copy is read back with
-the library's own reader, compared, and only then takes the live file's place. A kill at any time leaves one whole
-file under the name. All of this runs on a thread of its own that lets samples go first.
+All of this runs on a thread of its own that lets samples go first.
 """
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
 import logging
-import os
 import threading
-import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
-from compensator import __version__
 from compensator.clock import NS
 from compensator.errors import DataError
+from compensator.events import RecordingCode, RecordingData
 from compensator.messages import encode
 from compensator.recording import chain
-from compensator.recording.container import PAYLOAD, Container, Damaged, Message, Torn
-from compensator.recording.live_file import sync_folder
-from compensator.recording.reading import end_of_chain, recordings
+from compensator.recording.compaction import Copy, rewrite
+from compensator.recording.container import Contents, Message
+from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
 
 log = logging.getLogger("compensator")
-
-#: Number of messages after which the thread lets others go first.
-TURN = 64
-_PART = ".mcap.part"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +39,7 @@ class Retention:
     keep_days : float, optional
         Finished recordings that began longer ago are removed.
     keep_mb : float, optional
-        The oldest finished recordings are removed while all of them take more, MB (10⁶ bytes).
+        The oldest finished recordings are removed while all of them are larger together, MB (10⁶ bytes).
     """
 
     keep_days: float | None = None
@@ -59,7 +47,7 @@ class Retention:
 
 
 class Finisher:
-    """Takes files that nobody writes to any more.
+    """Makes finished files compact and removes the oldest ones.
 
     Parameters
     ----------
@@ -84,7 +72,7 @@ class Finisher:
         self._thread: threading.Thread | None = None
         self._remarks: list[tuple[str, dict[str, Any]]] = []
 
-    def put(self, path: Path, now_ns: int) -> None:
+    def enqueue(self, path: Path, now_ns: int) -> None:
         """Have a file made compact in the background.
 
         Parameters
@@ -100,7 +88,7 @@ class Finisher:
             self._begin([(job, now_ns) for job in jobs])
 
     def make_room(self, now_ns: int) -> None:
-        """Have what is beyond the retention removed in the background: the disk does not take the recording.
+        """Remove what exceeds the retention, in the background: the disk is full for the recording.
 
         Parameters
         ----------
@@ -142,7 +130,8 @@ class Finisher:
                 error = self._compacted(path)
                 self._remove_oldest(now_ns)
             if error is not None and path is not None and path.exists():
-                self._say(f"{path.name}: could not be made compact and stays as it is: {error}", {"file": path.name})
+                text = f"{path.name}: could not be made compact and stays as it is: {error}"
+                self._remark(text, RecordingData(code=RecordingCode.NOT_COMPACTED, file=path.name))
                 if isinstance(error, OSError):
                     with self._lock:
                         self._refused.append(path)
@@ -150,20 +139,20 @@ class Finisher:
     def _compacted(self, path: Path) -> Exception | None:
         """Make a file compact; return why it could not be."""
         try:
-            said = compact(path, self._signer, patient=True)
-        except (OSError, McapError, DataError) as error:
+            recovered = compact(path, self._signer, patient=True)
+        except (OSError, DataError) as error:
             return error
-        if said:
-            self._say(f"{path.name}: {said}", {"file": path.name})
+        if recovered:
+            self._remark(f"{path.name}: {recovered}", RecordingData(code=RecordingCode.RECOVERED, file=path.name))
         return None
 
-    def _say(self, text: str, data: dict[str, Any]) -> None:
+    def _remark(self, text: str, data: RecordingData) -> None:
         log.info("%s", text)
         with self._lock:
-            self._remarks = [*self._remarks[-99:], (text, data)]
+            self._remarks = [*self._remarks[-99:], (text, data.table())]
 
     def _remove_oldest(self, now_ns: int) -> bool:
-        """Remove what is beyond the retention, and tell whether something was.
+        """Remove what exceeds the retention; return whether something was removed.
 
         The newest two stay: the one that is being written, and the finished one that the next start needs.
         """
@@ -183,13 +172,14 @@ class Finisher:
                 removed.append((path.name, sizes.pop(path)))
         except OSError as error:
             if str(error) != self._unremoved:  # a disk that takes nothing is asked every minute
-                self._say(f"what is beyond the limit of what is kept could not be removed: {error}", {})
+                text = f"what is beyond the limit of what is kept could not be removed: {error}"
+                self._remark(text, RecordingData(code=RecordingCode.NOT_REMOVED))
             self._unremoved = str(error)
         if removed:
             size = sum(size for _, size in removed)
             names = [name for name, _ in removed]
             text = f"{len(names)} recording(s) removed by the limit of what is kept, up to {names[-1]}"
-            self._say(text, {"removed": names, "bytes": size})
+            self._remark(text, RecordingData(code=RecordingCode.REMOVED, removed=names, bytes=size))
         return bool(removed)
 
 
@@ -200,7 +190,7 @@ def _began_ns(path: Path, machine: str) -> int:
 
 
 def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) -> str:
-    """Rewrite a recording that nobody writes to with chunks, compression, CRCs and index.
+    """Replace a machine's live recording by a compact copy.
 
     A torn end is finished: its whole records get their place in a `/chain` message, and a seal says `recovered`.
 
@@ -220,159 +210,61 @@ def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) 
 
     Raises
     ------
-    OSError
-        If the disk does not take the copy; the file stays as it is.
-    DataError
-        If the copy does not read back as what was copied, or the file is damaged; it stays as it is.
+    OSError, DataError
+        As from `rewrite`; the file stays as it is.
     """
-    part = path.with_name(path.name.removesuffix(".mcap") + _PART)
-    part.unlink(missing_ok=True)
-    with path.open("rb") as live:
-        try:
-            fcntl.flock(live, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return ""
-        if _is_compact(path):
-            return ""
-        end = end_of_chain(path)
-        if end is None or end.chunked:
-            return ""
-        try:
-            with part.open("xb") as file:
-                said, expected = _copy(path, file, signer, patient)
-                file.flush()
-                os.fsync(file.fileno())
-            if _digest(part, patient) != expected:
-                raise DataError(f"{part}: does not read back as what was written")
-            part.replace(path)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
-    sync_folder(path.parent)
-    return said
+    copy = rewrite(path, partial(_ChainedCopy, signer=signer), patient=patient, chained=True)
+    if not isinstance(copy, _ChainedCopy) or copy.recovered is None:
+        return "its torn end was cut off" if copy is not None and copy.torn else ""
+    end = "its torn end was cut off" if copy.torn else "it had no end"
+    return f"{end}; {copy.recovered} whole record(s) behind the last complete group were kept"
 
 
-def _is_compact(path: Path) -> bool:
-    with Container(path) as container:
-        try:
-            for _ in container.messages():
-                return container.contents.chunked
-        except Damaged:
-            return container.contents.chunked
-    return False
+class _ChainedCopy(Copy):
+    """The copy of a machine's recording, with its chain; a torn end is finished."""
 
-
-def _copy(path: Path, file: BinaryIO, signer: Signer | None, patient: bool) -> tuple[str, str]:
-    """Copy a recording; return what was recovered and the hash of everything that was written."""
-    writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
-    said = ""
-    with Container(path) as container:
-        copied = _Copied(container, writer)
-        try:
-            for number, message in enumerate(container.messages()):
-                copied.add(message)
-                if patient and number % TURN == 0:
-                    time.sleep(0.0005)
-        except Damaged as error:
-            # Behind a torn end nothing can be read; what an audit finds damaged must stay as it was found.
-            if not isinstance(error, Torn):
-                raise
-            said = "its torn end was cut off" if error.offset < path.stat().st_size else ""
-        if not copied.sealed:
-            said = (said or "it had no end") + "; " + copied.recover(signer)
-    writer.finish()  # type: ignore[no-untyped-call]
-    return said, copied.digest.hexdigest()
-
-
-class _Copied:
-    """The copy as it grows, with its chain and a hash over all messages."""
-
-    def __init__(self, container: Container, writer: Writer) -> None:
-        self._contents, self._writer = container.contents, writer
-        self._began = False
-        self._chain = chain.ChainWriter("", chain.NOTHING)
-        self._topics: dict[int, str] = {}
+    def __init__(self, contents: Contents, writer: Writer, *, signer: Signer | None) -> None:
+        super().__init__(contents, writer)
+        self._signer = signer
+        self._chain: chain.ChainWriter | None = None
         self._last: Message | None = None
-        self.digest = hashlib.sha256()
-        self.sealed = False
+        self._sealed = False
+        #: Records that had no place in the chain yet; None where the file was whole.
+        self.recovered: int | None = None
 
     def add(self, message: Message) -> None:
-        """Take one message over."""
-        if not self._began:
-            self._begin(message)
-        topic = self._topics[message.channel]
+        """Copy one message and follow the chain."""
+        super().add(message)
+        if self._chain is None:
+            run = self.contents.metadata.get("run", {})
+            before = bytes.fromhex(run.get("previous_chain", "")) or chain.NOTHING
+            self._chain = chain.ChainWriter(run.get("machine", ""), before)
+            self._chain.begin(chain.parts_of(self.contents), message.log_time_ns)
+        topic = self.topics[message.channel]
         if topic == "chain":
             self._chain.listed()
         else:
             self._chain.add(topic, message.body)
-        self.sealed = topic == "seal" or (self.sealed and topic == "chain")
-        self._put(message.channel, message.sequence, message.log_time_ns, message.body)
+        self._sealed = topic == "seal" or (self._sealed and topic == "chain")
         self._last = message
 
-    def recover(self, signer: Signer | None) -> str:
-        """Finish a torn end; return how many records had no place in the chain yet."""
-        if self._last is None:
+    def finish(self) -> None:
+        """Finish a torn end, and write the end of the file."""
+        if self._chain is None or self._last is None:
             raise DataError("nothing whole in it, expected at least one record")
-        time_ns, unlisted = self._last.log_time_ns, len(self._chain.links)
-        numbers = {topic: number for number, topic in self._topics.items()}
-        sequence = self._last.sequence
-        if unlisted:
-            sequence += 1
-            self._made(numbers["chain"], sequence, time_ns, self._chain.message(time_ns))
-        seal = chain.seal(self._chain.machine, time_ns, "recovered", sequence, self._chain.head)
-        data = encode(signer.sign(seal) if signer else seal)
-        self._chain.add("seal", chain.body_of(sequence + 1, time_ns, data))
-        self._made(numbers["seal"], sequence + 1, time_ns, data)
-        self._made(numbers["chain"], sequence + 2, time_ns, self._chain.message(time_ns))
-        return f"{unlisted} whole record(s) behind the last complete group were kept"
+        if not self._sealed:
+            self.recovered = len(self._chain.links)
+            if self.recovered:
+                self._append("chain", self._chain.message(self._last.log_time_ns))
+            time_ns, sequence = self._last.log_time_ns, self._last.sequence
+            seal = chain.seal(self._chain.machine, time_ns, "recovered", sequence, self._chain.head)
+            self._append("seal", encode(self._signer.sign(seal) if self._signer else seal))
+            self._append("chain", self._chain.message(time_ns))
+        super().finish()
 
-    def _begin(self, first: Message) -> None:
-        contents, writer = self._contents, self._writer
-        self._began = True
-        writer.start(profile="", library=contents.library or f"compensator {__version__}")
-        for number, channel in contents.channels.items():
-            schema = writer.register_schema(channel.schema_name, channel.schema_encoding, channel.schema)
-            if number != writer.register_channel(channel.topic, channel.encoding, schema, channel.metadata):
-                raise DataError(f"channel {number} {channel.topic}: expected the numbers that the recorder gives")
-            self._topics[number] = channel.topic.lstrip("/")
-        for name, table in contents.metadata.items():
-            writer.add_metadata(name, table)
-        for part in contents.attachments.values():
-            writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
-        run = contents.metadata.get("run", {})
-        before = bytes.fromhex(run.get("previous_chain", "")) or chain.NOTHING
-        self._chain = chain.ChainWriter(run.get("machine", ""), before)
-        parts = chain.parts_of(contents)
-        self._chain.begin(parts, first.log_time_ns)
-        for known in parts:
-            self.digest.update(f"{known.name} {known.sha256}\n".encode())
-
-    def _made(self, channel: int, sequence: int, time_ns: int, data: bytes) -> None:
-        self._put(channel, sequence, time_ns, chain.body_of(sequence, time_ns, data))
-
-    def _put(self, channel: int, sequence: int, time_ns: int, body: bytes) -> None:
-        publish_ns = int.from_bytes(body[12:PAYLOAD], "little")
-        self._writer.add_message(channel, time_ns, body[PAYLOAD:], publish_ns, sequence=sequence)
-        self.digest.update(channel.to_bytes(2, "little") + body)
-
-
-def _digest(path: Path, patient: bool) -> str:
-    """Read a compact file with the library's seeking reader; return the hash of everything in it."""
-    digest = hashlib.sha256()
-    with Container(path) as container:
-        for _ in container.messages():
-            break
-        for part in chain.parts_of(container.contents):
-            digest.update(f"{part.name} {part.sha256}\n".encode())
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        for number, (_, _, message) in enumerate(reader.iter_messages(log_time_order=False)):
-            head = chain.body_of(message.sequence, message.log_time, b"")[:12]
-            body = head + message.publish_time.to_bytes(8, "little") + message.data
-            digest.update(message.channel_id.to_bytes(2, "little") + body)
-            if patient and number % TURN == 0:
-                time.sleep(0.0005)
-        summary = reader.get_summary()
-    if summary is None or not summary.chunk_indexes or summary.statistics is None:
-        raise DataError(f"{path}: has no index")
-    return digest.hexdigest()
+    def _append(self, topic: str, data: bytes) -> None:
+        """Add a message behind the last one."""
+        assert self._last is not None
+        channel = next(number for number, name in self.topics.items() if name == topic)
+        sequence, time_ns = self._last.sequence + 1, self._last.log_time_ns
+        self.add(Message(channel, sequence, time_ns, chain.body_of(sequence, time_ns, data)))

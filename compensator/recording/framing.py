@@ -1,4 +1,4 @@
-"""The framing of MCAP: kinds of records, their fields, and what is said where the bytes cannot be one."""
+"""The framing of MCAP: kinds of records, their fields, and the errors where bytes cannot be one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Fields:
     def __init__(self, path: Path, offset: int, body: bytes, at: int = 0) -> None:
         self._path, self._offset, self._body, self._at = path, offset, body, at
 
-    def _take(self, count: int) -> bytes:
+    def _read(self, count: int) -> bytes:
         end = self._at + count
         if end > len(self._body):
             raise Damaged(self._path, self._offset, f"a field of {count} bytes in a record of {len(self._body)}")
@@ -48,20 +48,20 @@ class Fields:
         return data
 
     def number(self, form: str) -> int:
-        """Take a number."""
-        (value,) = struct.unpack(form, self._take(struct.calcsize(form)))
+        """Read a number."""
+        (value,) = struct.unpack(form, self._read(struct.calcsize(form)))
         return int(value)
 
     def bytes4(self) -> bytes:
-        """Take bytes with a short length."""
-        return self._take(self.number("<I"))
+        """Read bytes with a short length."""
+        return self._read(self.number("<I"))
 
     def bytes8(self) -> bytes:
-        """Take bytes with a long length."""
-        return self._take(self.number("<Q"))
+        """Read bytes with a long length."""
+        return self._read(self.number("<Q"))
 
     def text(self) -> str:
-        """Take a text."""
+        """Read a text."""
         data = self.bytes4()
         try:
             return data.decode("utf-8")
@@ -69,7 +69,7 @@ class Fields:
             raise Damaged(self._path, self._offset, f"a text that is not UTF-8: {data[:20]!r}") from error
 
     def table(self) -> dict[str, str]:
-        """Take a table of texts."""
+        """Read a table of texts."""
         inner = Fields(self._path, self._offset, self.bytes4())
         found: dict[str, str] = {}
         while inner._at < len(inner._body):
@@ -80,7 +80,7 @@ class Fields:
         return found
 
     def counts(self) -> dict[int, int]:
-        """Take a table of numbers by channel."""
+        """Read a table of numbers by channel."""
         data = self.bytes4()
         if len(data) % 10:
             raise Damaged(self._path, self._offset, f"a table of {len(data)} bytes, expected a multiple of 10")
@@ -90,10 +90,10 @@ class Fields:
         return found
 
     def rest(self) -> bytes:
-        """Take everything that is left."""
-        return self._take(len(self._body) - self._at)
+        """Read everything that is left."""
+        return self._read(len(self._body) - self._at)
 
     def done(self) -> None:
-        """See that nothing is left."""
+        """Check that nothing is left."""
         if self._at != len(self._body):
             raise Damaged(self._path, self._offset, f"{len(self._body) - self._at} bytes more than the record has")

@@ -34,15 +34,15 @@ _NAMES = {
 }
 _THINGS = {CHUNK_INDEX: "chunk", ATTACHMENT_INDEX: "attachment", METADATA_INDEX: "metadata table"}
 
-#: What an entry says of what it leads to, in words.
+#: How an entry describes what it leads to, by name.
 _Entry = dict[str, Any]
 
 
 class Index:
-    """Notes what is in a file, and what its index says of it."""
+    """Compares what is in a file with its index."""
 
     def __init__(self) -> None:
-        #: Which part of the index is wrong, and what is wrong with it: the first `KEPT` of them, and their number.
+        #: Part of the index that is wrong, and what is wrong with it: the first `KEPT`, and the number of all.
         self.faults: list[tuple[str, str]] = []
         self.count = 0
         #: For each kind the entry that is due, by the offset of what it leads to, and the offsets that were found.
@@ -59,7 +59,7 @@ class Index:
         self._messages: dict[int, int] = {}
         self._loose = 0
         self._first_ns, self._last_ns = 2**64, 0
-        #: Groups of the summary as they stand there, and as the summary offsets say.
+        #: Groups of the summary as they stand there, and as the summary offsets state.
         self._groups: list[list[int]] = []
         self._stated: list[tuple[int, int, int]] = []
         self._offsets_at = 0
@@ -78,7 +78,7 @@ class Index:
         Parameters
         ----------
         head : Fields
-            What it says of itself.
+            Its own fields.
         offset, length : int
             Where it stands, bytes.
         places : dict of int to list of int
@@ -113,7 +113,7 @@ class Index:
             self._first_ns, self._last_ns = min(self._first_ns, first_ns), max(self._last_ns, last_ns)
 
     def add_message_index(self, offset: int, length: int, channel: int, entries: bytes) -> None:
-        """Hold a message index against the messages of the chunk before it.
+        """Compare a message index with the messages of the chunk before it.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class Index:
             )
 
     def _close_chunk(self) -> None:
-        """See that every message of the chunk had its index."""
+        """Check that every message of the chunk had its index."""
         for channel, place in self._places.items():
             what = f"no message index leads to its {len(place) // 2} message(s) of channel {channel}"
             self._fault(f"chunk at byte {self._chunk_at}", what)
@@ -196,7 +196,7 @@ class Index:
     # ------------------------------------------------------------------ the summary
 
     def summarise(self, kind: int, offset: int, fields: Fields, length: int) -> None:
-        """Take a record of the summary.
+        """Check a record of the summary.
 
         Parameters
         ----------
@@ -205,7 +205,7 @@ class Index:
         offset, length : int
             Where it stands, bytes.
         fields : Fields
-            What it says.
+            Its fields.
         """
         if kind == SUMMARY_OFFSET:
             self._offsets_at = self._offsets_at or offset
@@ -251,14 +251,14 @@ class Index:
         self._repeated[kind].add(number)
 
     def finish(self, summary_start: int, footer_at: int, footer: Fields) -> None:
-        """Say what can only be said at the end.
+        """Find what is known only at the end.
 
         Parameters
         ----------
         summary_start, footer_at : int
             Where the summary and the footer stand, bytes.
         footer : Fields
-            What the footer says.
+            Its fields.
         """
         self._close_chunk()
         chunks = len(self._due[CHUNK_INDEX])
@@ -298,7 +298,7 @@ class Index:
         }
 
     def _places_of_groups(self, start: int, footer_at: int, stated_start: int, stated_offsets: int) -> None:
-        """Hold footer and summary offsets against where the groups of the summary stand."""
+        """Compare footer and summary offsets with the places of the groups in the summary."""
         if stated_start != start:
             self._fault("footer", f"says that the summary begins at byte {stated_start}, it begins at byte {start}")
         if stated_offsets != self._offsets_at and (self._offsets_at or stated_offsets != footer_at):
@@ -319,7 +319,7 @@ class Index:
 
 
 def _entry_of(kind: int, fields: Fields) -> tuple[int, _Entry]:
-    """Return where an entry leads, and what it says of what stands there."""
+    """Return where an entry leads, and how it describes what is there."""
     entry: _Entry = {}
     if kind == CHUNK_INDEX:
         entry["first message (ns)"], entry["last message (ns)"] = fields.number("<Q"), fields.number("<Q")

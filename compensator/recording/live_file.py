@@ -12,6 +12,7 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from compensator import __version__
+from compensator.errors import DataError
 from compensator.messages import MESSAGES, encode, shipped_schema
 from compensator.recording import chain
 from compensator.recording.container import Attachment, Channel, Contents
@@ -94,6 +95,52 @@ class LiveFile:
         return cut
 
 
+class Opening:
+    """Writes what a file opens with: channels under their numbers, metadata, attachments.
+
+    Parameters
+    ----------
+    writer : Writer
+        Of the file.
+    """
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._begun = False
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        #: Topics that were written, without the slash, by number of the channel.
+        self.topics: dict[int, str] = {}
+
+    def write(self, contents: Contents) -> None:
+        """Write what was not written yet; behind the first call these are further channels.
+
+        Raises
+        ------
+        DataError
+            If a channel has not the number that it gets here.
+        """
+        writer = self._writer
+        if not self._begun:
+            writer.start(profile="", library=contents.library or f"compensator {__version__}")
+        for number, channel in contents.channels.items():
+            if number in self.topics:
+                continue
+            schema = (channel.schema_name, channel.schema_encoding, channel.schema)
+            if channel.schema_name and schema not in self._schemas:
+                self._schemas[schema] = writer.register_schema(*schema)
+            schema_number = self._schemas.get(schema, 0)
+            if number != writer.register_channel(channel.topic, channel.encoding, schema_number, channel.metadata):
+                raise DataError(f"channel {number} {channel.topic}: expected the numbers that the recorder gives")
+            self.topics[number] = channel.topic.lstrip("/")
+        if self._begun:
+            return
+        self._begun = True
+        for name, table in contents.metadata.items():
+            writer.add_metadata(name, table)
+        for part in contents.attachments.values():
+            writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
+
+
 class RecordingFile(LiveFile):
     """A live recording with its hash chain.
 
@@ -125,16 +172,12 @@ class RecordingFile(LiveFile):
     def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
         """Write what the file opens with."""
         contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
-        self.writer.start(profile="", library=f"compensator {__version__}")
-        for topic in TOPICS:
-            name, data, about = MESSAGES[topic].__name__, shipped_schema(topic), {"machine": self._machine}
-            schema = self.writer.register_schema(name, "jsonschema", data)
-            number = self.writer.register_channel(f"/{topic}", "json", schema, about)
-            self._channels[topic] = number
-            contents.channels[number] = Channel(f"/{topic}", "json", about, name, "jsonschema", data)
-        self.writer.add_metadata("run", metadata)
-        for part in attachments:
-            self.writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
+        for number, topic in enumerate(TOPICS, 1):
+            about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
+            contents.channels[number] = Channel(f"/{topic}", "json", about, kind, "jsonschema", schema)
+        opening = Opening(self.writer)
+        opening.write(contents)
+        self._channels = {topic: number for number, topic in opening.topics.items()}
         self._write("chain", self._chain.begin(chain.parts_of(contents), self.time_ns))
 
     def append(self, records: Iterable[tuple[str, bytes]], time_ns: int) -> None:

@@ -2,49 +2,128 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import msgspec
 
 from compensator.errors import DataError
-from compensator.messages import MESSAGES, Chain, Offset, Sample, Seal
+from compensator.messages import MESSAGES, Chain, Offset, Sample
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
 
+_T = TypeVar("_T")
 _EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
+_DECODERS = {topic: msgspec.json.Decoder(kind) for topic, kind in MESSAGES.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class Recorded:
+class Record(NamedTuple):
     """One message of a recording.
 
     Parameters
     ----------
     topic : str
-        `sample`, `estimate`, `offset`, `event`, `seal` or `chain`.
-    data : bytes
-        JSON as it was written.
+        Of a machine's recording `sample`, `estimate`, `offset`, `event`, `seal` or `chain`.
     sequence : int
-        Sequence number of the record in the file.
+        Number of the record in the file.
     log_time_ns : int
         When it was written.
+    body : bytes
+        What the hash chain runs over, see `Message`.
     """
 
     topic: str
-    data: bytes
     sequence: int
     log_time_ns: int
+    body: bytes
+
+    @property
+    def data(self) -> bytes:
+        """JSON as it was written."""
+        return self.body[PAYLOAD:]
 
 
-def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: str = "") -> Iterator[Recorded]:
+class Group(NamedTuple):
+    """Records that were brought to disk together.
+
+    Parameters
+    ----------
+    records : list of Record
+        Events, sample, estimate and offset of one sample, or a seal.
+    chain : Record or None
+        The `/chain` message that lists them; None in a file without a hash chain.
+    whole : bool
+        Whether the group has its end; only the last one of a file may lack it.
+    """
+
+    records: list[Record]
+    chain: Record | None
+    whole: bool
+
+
+def records_of(container: Container) -> Iterator[Record]:
+    """Yield the messages of a file with their topics.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file.
+    Damaged
+        Where it cannot be read any further.
+    """
+    topics: dict[int, str] = {}
+    channels = container.contents.channels
+    for channel, sequence, time_ns, body in container.messages():
+        topic = topics.get(channel)
+        if topic is None:
+            topic = topics[channel] = channels[channel].topic.lstrip("/")
+        yield Record(topic, sequence, time_ns, body)
+
+
+def groups_of(container: Container) -> Iterator[Group]:
+    """Yield the records of a machine's recording group by group.
+
+    A `/chain` message ends a group; in a file without such messages an offset does. Records of a group without its
+    end come last.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file.
+    Damaged
+        Where it cannot be read any further; everything before that was yielded.
+    """
+    records: list[Record] = []
+    end = ""
+    try:
+        for record in records_of(container):
+            topic = record.topic
+            if not end:
+                topics = {channel.topic for channel in container.contents.channels.values()}
+                end = "chain" if "/chain" in topics else "offset"
+            if topic == end == "chain":
+                yield Group(records, record, True)
+                records = []
+                continue
+            records.append(record)
+            if topic == end:
+                yield Group(records, None, True)
+                records = []
+    except Damaged:
+        yield Group(records, None, False)
+        raise
+    yield Group(records, None, False)
+
+
+def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: str = "") -> Iterator[Record]:
     """Yield the messages of a file in the order in which they were written.
 
     Parameters
     ----------
     path : pathlib.Path
-        An MCAP file of ours, finished or not.
+        A recording, finished or not.
     topics : tuple of str, optional
         Only these.
     prefix : str
@@ -55,18 +134,14 @@ def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: 
     DataError
         If it is not an MCAP file. A torn end ends the iteration without an error.
     """
-    with Container(path) as container:
-        channels = container.contents.channels
-        try:
-            for number, sequence, log_time_ns, body in container.messages():
-                topic = channels[number].topic.lstrip("/")
-                if prefix:
-                    machine, _, rest = topic.rpartition("/thermal/")
-                    topic = rest.removeprefix("y/") if machine == prefix else ""
-                if topics is None or topic in topics:
-                    yield Recorded(topic, body[PAYLOAD:], sequence, log_time_ns)
-        except Damaged:
-            return
+    with Container(path) as container, suppress(Damaged):
+        for record in records_of(container):
+            topic = record.topic
+            if prefix:
+                machine, _, rest = topic.rpartition("/thermal/")
+                topic = rest.removeprefix("y/") if machine == prefix else ""
+            if topics is None or topic in topics:
+                yield record._replace(topic=topic) if prefix else record
 
 
 def machines_in(path: Path) -> list[str]:
@@ -83,7 +158,7 @@ def machines_in(path: Path) -> list[str]:
     return sorted(known - {""})
 
 
-def decode(record: Recorded, path: Path) -> msgspec.Struct:
+def decode(record: Record, path: Path) -> msgspec.Struct:
     """Decode a recorded message.
 
     Raises
@@ -91,13 +166,33 @@ def decode(record: Recorded, path: Path) -> msgspec.Struct:
     DataError
         If it does not follow its schema.
     """
-    kind = MESSAGES.get(record.topic)
-    if kind is None:
+    decoder = _DECODERS.get(record.topic)
+    if decoder is None:
         raise DataError(f"{path}: unknown channel /{record.topic}, expected one of: {', '.join(MESSAGES)}")
+    return decode_with(decoder, record, str(path))
+
+
+def decode_with(decoder: msgspec.json.Decoder[_T], record: Record, file: str) -> _T:
+    """Decode a recorded message, or a part of one.
+
+    Parameters
+    ----------
+    decoder : msgspec.json.Decoder
+        What is expected.
+    record : Record
+        The message.
+    file : str
+        Where it stands, for the error.
+
+    Raises
+    ------
+    DataError
+        If it is something else; the line names file, topic and record.
+    """
     try:
-        return msgspec.json.decode(record.data, type=kind)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: /{record.topic} record {record.sequence}: {error}") from error
+        return decoder.decode(record.data)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise DataError(f"{file}: /{record.topic} record {record.sequence}: {error}") from error
 
 
 def recordings(folder: Path, machine: str) -> list[Path]:
@@ -106,63 +201,49 @@ def recordings(folder: Path, machine: str) -> list[Path]:
     return sorted(folder.glob(f"{machine}_????????T??????Z*.mcap"), key=lambda path: path.stem)
 
 
-@dataclass(frozen=True, slots=True)
-class ChainEnd:
-    """Where the hash chain of a file ends.
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Return recordings of one machine in the order in which they were begun, each once.
 
-    Parameters
-    ----------
-    value : bytes
-        Value at its last whole record; the chain of the next file begins with it. A seal that was set afterwards,
-        when a torn end was finished, does not count: the next file was begun without it.
-    unlisted : int
-        Number of whole records behind the last `/chain` message.
-    sealed : str
-        Reason of the seal that it ends with, empty where it ends without one.
-    whole : bool
-        Whether the file has its end.
-    chunked : bool
-        Whether it is compact.
+    Raises
+    ------
+    DataError
+        If one is not an MCAP file, or they are of several machines.
     """
+    began: dict[Path, str] = {}
+    machines: set[str] = set()
+    for path in dict.fromkeys(paths):
+        with Container(path) as container:
+            run = container.survey(whole=False).metadata.get("run", {})
+        machines |= {run["machine"]} if "machine" in run else set()
+        began[path] = run.get("file", path.name).removesuffix(".mcap")
+    if len(machines) > 1:
+        raise DataError(f"recordings of {', '.join(sorted(machines))}; expected those of one machine")
+    return sorted(began, key=began.__getitem__)
 
-    value: bytes
-    unlisted: int
-    sealed: str
-    whole: bool
-    chunked: bool
 
+def last_value(path: Path) -> bytes:
+    """Return the value with which the chain of the next file begins, empty where a file has no chain.
 
-def end_of_chain(path: Path) -> ChainEnd | None:
-    """Follow the hash chain of a file to its end; None where it has none.
+    It is that of the last whole record, but not of a seal that was added afterwards, when a torn end was finished: the
+    next file was begun without it.
 
     Raises
     ------
     DataError
         If it is not an MCAP file.
     """
-    value, before_seal, unlisted, sealed = b"", b"", 0, ""
-    with Container(path) as container:
-        channels = container.contents.channels
-        try:
-            for number, _, _, body in container.messages():
-                topic = channels[number].topic.lstrip("/")
-                if topic == "chain":
-                    if not value:
-                        first = msgspec.json.decode(body[PAYLOAD:], type=Chain)
-                        value = chain.opening(bytes.fromhex(first.before), chain.parts_of(container.contents))
-                    unlisted = 0
-                    continue
-                if not value:
-                    return None
-                before_seal, value = value, chain.link(value, topic, body)
-                unlisted += 1
-                sealed = msgspec.json.decode(body[PAYLOAD:], type=Seal).reason if topic == "seal" else ""
-        except (Damaged, msgspec.MsgspecError, ValueError):
-            pass
-    if not value:
-        return None
-    contents = container.contents
-    return ChainEnd(before_seal if sealed == "recovered" else value, unlisted, sealed, contents.ended, contents.chunked)
+    value, before_seal, recovered = b"", b"", False
+    with Container(path) as container, suppress(Damaged, msgspec.MsgspecError, ValueError):
+        for record in records_of(container):
+            if record.topic == "chain" and not value:
+                first = msgspec.json.decode(record.data, type=Chain)
+                value = chain.opening(bytes.fromhex(first.before), chain.parts_of(container.contents))
+            elif record.topic != "chain" and not value:
+                break
+            elif record.topic != "chain":
+                before_seal, value = value, chain.link(value, record.topic, record.body)
+                recovered = record.topic == "seal" and b'"reason":"recovered"' in record.body
+    return before_seal if recovered else value
 
 
 def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:

@@ -23,7 +23,7 @@ from compensator.recording import chain
 from compensator.recording.container import Attachment
 from compensator.recording.finishing import Finisher, Retention
 from compensator.recording.live_file import RecordingFile, sync_folder
-from compensator.recording.reading import end_of_chain, recordings
+from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 
 #: How often the chain is signed within a file.
@@ -146,7 +146,7 @@ class McapRecorder:
             self._give_up()
             raise
         self._live, self._reason, self._last = None, reason, live.head
-        self._finisher.put(live.path, live.time_ns)
+        self._finisher.enqueue(live.path, live.time_ns)
 
     def _give_up(self) -> None:
         """Leave the file as it was after the last sync."""
@@ -170,8 +170,7 @@ class McapRecorder:
         previous = recordings(self._folder, self._machine)
         before = self._last
         if previous and not before:
-            end = end_of_chain(previous[-1])
-            before = end.value if end else b""
+            before = last_value(previous[-1])
         names = self._names(time_utc_ns, previous[-1] if previous else None)
         live = self._live = RecordingFile(names, self._machine, before or chain.NOTHING, time_utc_ns)
         self.path = live.path
@@ -198,7 +197,7 @@ class McapRecorder:
         if self._reason in ("start", "failure"):
             # A kill leaves unfinished files: at a start it may be any of them, after a failure the last.
             for path in previous if self._reason == "start" else previous[-1:]:
-                self._finisher.put(path, time_utc_ns)
+                self._finisher.enqueue(path, time_utc_ns)
 
     def _names(self, time_utc_ns: int, newest: Path | None) -> Iterator[Path]:
         """Yield names for a new file by machine and UTC time."""

@@ -15,9 +15,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from compensator.errors import DataError, UsageError
+from compensator.errors import DataError
 from compensator.messages import number
 from compensator.recording.container import PAYLOAD, Container, Contents, Damaged, Torn
+from compensator.recording.reading import in_order
 from compensator.report.envelope import Envelope, Stretches
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, File, History, Missed, Period
 
@@ -91,11 +92,9 @@ def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] 
     Raises
     ------
     DataError
-        If one of them is no recording, or there are no samples.
-    UsageError
-        If they are of several machines.
+        If one of them is no recording, there are no samples, or they are of several machines.
     """
-    ordered = _in_order(paths)
+    ordered = in_order(paths)
     whole = sum(path.stat().st_size for path in ordered)
     reader, done = _Reader(), 0
     for path in ordered:
@@ -105,19 +104,6 @@ def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] 
                     progress(done + container.position, whole)
         done += path.stat().st_size
     return reader.result()
-
-
-def _in_order(paths: Sequence[Path]) -> list[Path]:
-    """Return the files as they were begun; refuse those of several machines."""
-    began: dict[Path, tuple[str, str]] = {}
-    for path in dict.fromkeys(paths):
-        with Container(path) as container:
-            run = container.survey(whole=False).metadata.get("run", {})
-        began[path] = (run.get("machine", ""), run.get("file", path.name).removesuffix(".mcap"))
-    machines = sorted({machine for machine, _ in began.values() if machine})
-    if len(machines) > 1:
-        raise UsageError(f"recordings of {', '.join(machines)}; expected those of one machine")
-    return sorted(began, key=lambda path: began[path][1])
 
 
 class _Reader:

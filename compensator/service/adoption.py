@@ -1,4 +1,4 @@
-"""Takes another model over while the service runs: checks it, warms it up on the recordings, keeps it.
+"""Prepares another model while the service runs: checks it, warms it up on the recordings, stores it.
 
 All of this runs on a thread of its own and lets samples go first; the swap itself lies between two samples and is the
 daemon's.
@@ -19,18 +19,18 @@ from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation
 from compensator.service.model_store import ModelStore, sha256_of
-from compensator.service.retrace import WARM_UP, samples_between, warm_up
 from compensator.service.state import ZeroMode
+from compensator.service.warm_up import WARM_UP, WarmUp, warm_up
 
 #: Longest payload of a command that brings a model, bytes.
 LONGEST_MODEL = 1_000_000
 #: After so many samples of a warm-up the thread sleeps for a moment, so that it never holds a sample up.
-TURN = 10
+LET_OTHERS = 10
 MOMENT_S = 0.001
 
 
 def check_model(config: Config, data: bytes, *, source: str) -> ThermalModel:
-    """Make a model of its file and check that the service of a configuration can run it.
+    """Read a model file and check that the service of a configuration can run it.
 
     Raises
     ------
@@ -66,7 +66,7 @@ class Wanted:
     text : str
         The model file, empty where it is in the store already.
     force : bool
-        Take it even where the recordings do not determine its state.
+        Adopt it even where the recordings do not determine its state.
     """
 
     action: str
@@ -103,40 +103,31 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prepared:
-    """A model that is ready to be taken over.
+    """A model that is ready to be adopted.
 
     Parameters
     ----------
     data : bytes
         The model file.
-    compensation : Compensation
-        Warmed up to the last recorded sample.
-    samples : int
-        Number of samples of the warm-up.
-    minutes : float
-        Time that they span, min.
-    known : bool
-        Whether they determine the state.
+    warm : WarmUp
+        Its compensation at the last recorded sample.
     """
 
     data: bytes
-    compensation: Compensation
-    samples: int
-    minutes: float
-    known: bool
+    warm: WarmUp
 
     def catch_up(self, sample: Sample, zero: ZeroMode | None) -> None:
-        """Take a sample that came while the model was warmed up; one that is in the recording is left out."""
-        seq, time_ns = self.compensation.last
+        """Run a sample that came during the warm-up; one that is in the recording is left out."""
+        compensation = self.warm.compensation
+        seq, _ = compensation.last
         if sample.seq <= seq:
             return
-        if seq >= 0 and sample.seq > seq + 1:
-            # The disk did not take what is between.
-            period_s = self.compensation.model.period_s
-            self.compensation.pause(samples_between(time_ns, sample.time_utc_ns, period_s))
+        if seq >= 0:
+            # Numbers between were not on disk in time for the warm-up.
+            compensation.pause(sample.seq - seq - 1)
         if zero is not None:
-            self.compensation.zero(zero)
-        self.compensation.process(sample)
+            compensation.zero(zero)
+        compensation.process(sample)
 
 
 class Adoption:
@@ -158,7 +149,7 @@ class Adoption:
         self._store = store
 
     def prepare(self, wanted: Wanted, running: ThermalModel, zero: dict[str, float] | None, now_ns: int) -> Prepared:
-        """Make the model ready and keep it for the next start; takes its time.
+        """Make the model ready and store it for the next start; this takes a while.
 
         Parameters
         ----------
@@ -184,7 +175,7 @@ class Adoption:
             raise ServiceError(
                 f"model {model.name}: sample_period_s = {model.period_s:g}, the service runs at {running.period_s:g} s"
             )
-        prepared = self._warmed(data, model, zero, wanted.force)
+        prepared = Prepared(data=data, warm=self._warmed(model, zero, wanted.force))
         if wanted.action == "back":
             self._store.back(name=model.name, time_utc_ns=now_ns)
         else:
@@ -199,18 +190,18 @@ class Adoption:
             raise ServiceError("back: the configured model is in use, there is none before it")
         return before
 
-    def _warmed(self, data: bytes, model: ThermalModel, zero: dict[str, float] | None, force: bool) -> Prepared:
+    def _warmed(self, model: ThermalModel, zero: dict[str, float] | None, force: bool) -> WarmUp:
         if zero is None:
             compensation = Compensation(self._config, model)
-            return Prepared(data=data, compensation=compensation, samples=0, minutes=0.0, known=True)
+            return WarmUp(compensation=compensation, samples=0, minutes=0.0, known=True)
         try:
-            warm = warm_up(self._folder, self._config, model, let_others=_turns())
+            warm = warm_up(self._folder, self._config, model, let_others=_let_others())
         except DataError as error:
             if not force:
                 raise ServiceError(f"model {model.name}: no warm-up: {error}; {_ADVICE}") from error
             compensation = Compensation(self._config, model)
             compensation.begin(**zero)
-            return Prepared(data=data, compensation=compensation, samples=0, minutes=0.0, known=False)
+            return WarmUp(compensation=compensation, samples=0, minutes=0.0, known=False)
         if not warm.known and not force:
             slowest = warm.compensation.slowest_min
             raise ServiceError(
@@ -218,22 +209,20 @@ class Adoption:
                 f"time constant is {slowest / 60.0:.1f} h and {WARM_UP:g} of them are wanted; its offset would be "
                 f"known to ±{warm.compensation.std_um:.1f} µm only (standard deviation); {_ADVICE}"
             )
-        return Prepared(
-            data=data, compensation=warm.compensation, samples=warm.samples, minutes=warm.minutes, known=warm.known
-        )
+        return warm
 
 
-_ADVICE = "wait, zero the machine at rest, or take it all the same with --force"
+_ADVICE = "wait, zero the machine at rest, or adopt it nevertheless with --force"
 
 
-def _turns() -> Callable[[], None]:
-    """Return what lets the service's own thread go first, every few samples."""
+def _let_others() -> Callable[[], None]:
+    """Return a function that lets the thread of the service run first, every few samples."""
     count = 0
 
-    def turn() -> None:
+    def pause() -> None:
         nonlocal count
         count += 1
-        if count % TURN == 0:
+        if count % LET_OTHERS == 0:
             time.sleep(MOMENT_S)
 
-    return turn
+    return pause

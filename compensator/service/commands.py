@@ -13,7 +13,7 @@ from compensator.service.adoption import LONGEST_MODEL, Wanted
 from compensator.service.compensation import Compensation
 from compensator.service.journal import Journal
 from compensator.service.publisher import COMMANDS, Reply, Sender
-from compensator.service.retrace import obey
+from compensator.service.replay import execute
 from compensator.service.takeover import Takeover, refusal, sent_by
 
 #: Longest payload of a command without a model, bytes.
@@ -77,8 +77,8 @@ class Commands:
         self._refused = 0
         while not self._waiting.empty():
             name, arguments, sender = self._waiting.get_nowait()
-            self._journal.note("command", name, arguments | sent_by(sender))
-            obey(compensation, name, arguments)
+            self._journal.note("command", name, arguments | {"command": name} | sent_by(sender))
+            execute(compensation, name, arguments)
 
     def _checked(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
         """Return the arguments of an acceptable command."""

@@ -13,6 +13,7 @@ import msgspec
 
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
+from compensator.events import EventKind, Note, ZeroData
 from compensator.messages import Offset, Sample, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
@@ -321,7 +322,7 @@ class Compensation:
         heat = self._memory.estimate.heat_w if self._memory.estimate else NAN
         sample = msgspec.structs.replace(raw, channels=self._guards.check(raw.channels, heat))
         values = Values.of(sample.channels)
-        notes: list[tuple[str, str]] = []
+        notes: list[Note] = []
         self._set_zero(values, notes)
         self._memory.seq, self._memory.time_utc_ns = raw.seq, raw.time_utc_ns
         estimate = None
@@ -365,7 +366,7 @@ class Compensation:
             predicted_um=y_pred,
         )
 
-    def _set_zero(self, values: Values, notes: list[tuple[str, str]]) -> None:
+    def _set_zero(self, values: Values, notes: list[Note]) -> None:
         zero = self._zero
         if not zero.wanted or math.isnan(values.t_q) or math.isnan(values.at):
             return
@@ -379,14 +380,13 @@ class Compensation:
             zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
         self.plausibility.reset(at_rest=not warm)
-        notes.append(
-            (
-                "zero",
-                f"zero on a {'warm machine' if warm else 'machine at rest'}: "
-                f"T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C, "
-                + ("Y not measured" if math.isnan(values.y) else f"Y {values.y:.3f} µm"),
-            )
+        # Version 0.1.0 recorded this text without data: an audit of its recordings compares it.
+        text = (
+            f"zero on a {'warm machine' if warm else 'machine at rest'}: T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C"
         )
+        text += ", Y not measured" if math.isnan(values.y) else f", Y {values.y:.3f} µm"
+        data = ZeroData(mode="warm" if warm else "rest", t_q_degc=values.t_q, at_degc=values.at, y_um=values.y)
+        notes.append(Note(EventKind.ZERO, text, data.table()))
 
     def _is_warm(self, mode: ZeroMode) -> bool:
         if mode != "auto" or not self._memory.rates:

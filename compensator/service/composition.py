@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any
 
 import drivers
 from compensator.clock import Clock, SystemClock
 from compensator.errors import ConfigError
+from compensator.events import EventKind, Note
 from compensator.recording.finishing import Retention
 from compensator.recording.reading import first_sequence
 from compensator.recording.recorder import McapRecorder
@@ -100,7 +100,7 @@ async def run_service(
         early = checkpoint.read(config.limits.offset_max_um)
         resumed = resume(loaded, setup.model, early)
         first = first_sequence(folder, machine, clock.utc_ns(), setup.model.period_s)
-        checks: tuple[str, str, dict[str, Any]] = ("plausibility", resumed.compensation.plausibility.describe(), {})
+        checks = Note(EventKind.PLAUSIBILITY, resumed.compensation.plausibility.describe(), {})
         daemon = Daemon(
             config=config,
             compensation=resumed.compensation,

@@ -10,11 +10,11 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from compensator import __version__
-from compensator.clock import Clock
+from compensator.clock import NS, Clock
 from compensator.config import Config
+from compensator.events import Note, PauseData
 from compensator.messages import SCHEMA, Offset, Sample, Status, encode
 from compensator.service.adoption import Adoption
 from compensator.service.commands import Commands
@@ -22,7 +22,6 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.journal import Entry, Journal, Recorder
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.publisher import UNNAMED, Reply, Sender
-from compensator.service.retrace import samples_between
 from compensator.service.sampling import Grid, Sampler
 from compensator.service.takeover import Takeover
 from drivers.reading import Device
@@ -79,8 +78,8 @@ class Daemon:
         Sequence number of the first sample.
     adoption : Adoption, optional
         Prepares other models; without it the commands `adopt` and `back` are refused.
-    notes : sequence of (str, str, dict)
-        Events from before the start: kind, text and data.
+    notes : sequence of Note
+        Events from before the start.
     checkpoint : OffsetCheckpoint, optional
         Keeps an offset that is published before it is on disk.
     """
@@ -96,7 +95,7 @@ class Daemon:
         clock: Clock,
         first_sequence: int,
         adoption: Adoption | None = None,
-        notes: Sequence[tuple[str, str, dict[str, Any]]] = (),
+        notes: Sequence[Note] = (),
         checkpoint: OffsetCheckpoint | None = None,
     ) -> None:
         self._config = config
@@ -238,8 +237,8 @@ class Daemon:
         self._broken_off = False
         if broke_off:  # once for all consecutive samples that failed
             self._journal.start_new_file()
-        for kind, text in outcome.notes:
-            self._journal.note(kind, text)
+        for note in outcome.notes:
+            self._journal.note(*note)
         self._note_state(self._journal.expected(outcome.offset))
         sample, estimate = encode(outcome.sample), encode(outcome.estimate)
         entry = self._journal.enqueue(label_ns, state, sample=sample, estimate=estimate, offset=outcome.offset)
@@ -282,15 +281,14 @@ class Daemon:
         if not first or last_ns == 0:
             return
         period_s = self._compensation.model.period_s
-        missing, bridged = samples_between(last_ns, label_ns, period_s), self._compensation.bridge_max_min
+        missing = max(round((label_ns - last_ns) / (period_s * NS)) - 1, 0)
+        bridged = self._compensation.bridge_max_min
         minutes = missing * period_s / 60.0
-        data: dict[str, Any] = {"missing": missing, "minutes": minutes, "bridged": minutes <= bridged}
         text = f"{missing} sample(s) are missing between the last recording and now; "
         if label_ns <= last_ns:
             text = (
                 "the wall clock stands before the end of the last recording: how long the service was away is unknown"
             )
-            data = {"missing": None, "minutes": None, "bridged": False}
             self._compensation.pause_of_unknown_length()
         else:
             self._compensation.pause(missing)
@@ -299,7 +297,14 @@ class Daemon:
                 if minutes <= bridged
                 else f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
             )
-        self._journal.note("restart", text, data | {"y_std_um": self._compensation.std_um})
+        known, std = label_ns > last_ns, self._compensation.std_um
+        data = PauseData(
+            missing=missing if known else None,
+            minutes=minutes if known else None,
+            bridged=known and minutes <= bridged,
+            y_std_um=std,
+        )
+        self._journal.note("restart", text, data.table())
 
     def _status(self, outcome: Outcome) -> Status:
         model = self._compensation.model

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from compensator.clock import NS, Clock
+from compensator.events import RecordingCode, RecordingData
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
 from compensator.reasons import Reason, Remark
 from compensator.remarks import ServiceWarning
@@ -187,7 +188,7 @@ class Journal:
 
     # ------------------------------------------------------------------ on the loop
 
-    def note(self, kind: str, text: str, data: dict[str, Any] | None = None) -> None:
+    def note(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
         """Publish an event and keep it for the recording."""
         event = Event(
             schema=SCHEMA,
@@ -196,7 +197,7 @@ class Journal:
             time_utc_ns=self._clock.utc_ns(),
             kind=kind,
             text=text,
-            data=data or {},
+            data=dict(data or {}),
         )
         # Bounded, so that a loop that cannot record costs no memory.
         self._events = [*self._events[1 - WAITING_EVENTS :], event]
@@ -296,7 +297,9 @@ class Journal:
 
     def _note_disk(self, reason: str, in_flight: bool, error: BaseException | None) -> None:
         """Note once when the disk stops accepting the recording, and once when it accepts it again."""
-        data = {"published_early": self.sequence, "reason": reason} if in_flight else {}
+        early = {"published_early": self.sequence, "reason": reason} if in_flight else {}
+        code = RecordingCode.DISK_LATE if reason == Reason.RECORDING_LATE else RecordingCode.DISK_FAILED
+        data = {"code": code, **early}
         if reason and (reason != self._reason or in_flight):
             if error is not None and not isinstance(error, OSError):
                 log.error("internal error", exc_info=error)
@@ -308,7 +311,7 @@ class Journal:
         elif self._reason and not reason:
             lost, self._dropped = self._dropped, 0
             text = f"{DISK_BACK}; " + (f"{lost} sample(s) were not recorded" if lost else "nothing was lost")
-            self.note("recording", text, {"lost": lost})
+            self.note("recording", text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
         self._reason, self._error = reason, error or self._error
 
     async def close(self, state: bytes) -> None:
@@ -324,7 +327,8 @@ class Journal:
             log.error("%d sample(s) are not on disk, which refused them", self.waiting)
         error = closing.exception()
         if isinstance(error, OSError):
-            self.note("recording", f"the recording could not be finished: {error}")
+            data = RecordingData(code=RecordingCode.NOT_FINISHED)
+            self.note("recording", f"the recording could not be finished: {error}", data.table())
         elif error is not None:
             raise error
 

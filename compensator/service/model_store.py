@@ -1,7 +1,6 @@
-"""The models that were adopted, kept beside the recordings: which one is in use, and which came before.
+"""The adopted models, stored with the recordings: which one is in use, and which came before.
 
-The configuration stays as it is. An adopted model stands until the configured model itself is changed: whoever edits
-the configuration has the last word.
+An adopted model is used until the configured model itself is changed: the configuration has the last word.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class Adopted(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Contents(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """`adopted.json`: the models in use, the last one on top, and every change there ever was."""
+    """`adopted.json`: the models in use, the present one last, and every change."""
 
     schema: Literal[1] = 1
     configured_sha256: str
@@ -101,16 +100,16 @@ class ModelStore:
         return data
 
     def adopt(self, data: bytes, *, name: str, time_utc_ns: int) -> None:
-        """Put a model on top."""
+        """Store a model and use it from now on."""
         contents = self._read()
         entry = Adopted(sha256=sha256_of(data), name=name, time_utc_ns=time_utc_ns)
         contents.in_use.append(entry)
         contents.history.append(entry)
-        self._put(f"{entry.sha256}.toml", data)
+        self._replace_file(f"{entry.sha256}.toml", data)
         self._write(contents)
 
     def back(self, *, name: str, time_utc_ns: int) -> None:
-        """Take the model on top away; its file stays."""
+        """Return to the model before; the file of the present one stays."""
         contents = self._read()
         if contents.in_use:
             contents.in_use.pop()
@@ -135,9 +134,9 @@ class ModelStore:
         return contents
 
     def _write(self, contents: _Contents) -> None:
-        self._put(_FILE, msgspec.json.format(msgspec.json.encode(contents)))
+        self._replace_file(_FILE, msgspec.json.format(msgspec.json.encode(contents)))
 
-    def _put(self, name: str, data: bytes) -> None:
+    def _replace_file(self, name: str, data: bytes) -> None:
         """Write a file so that a power cut leaves the old one or the new one."""
         path, part = self.folder / name, self.folder / f"{name}.part"
         try:
@@ -149,7 +148,7 @@ class ModelStore:
             part.replace(path)
             sync_folder(self.folder)
         except OSError as error:
-            raise ServiceError(f"{path}: {error.strerror or error}; the model is not kept") from error
+            raise ServiceError(f"{path}: {error.strerror or error}; the model is not stored") from error
 
 
 def sha256_of(data: bytes) -> str:

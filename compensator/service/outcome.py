@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from compensator.events import Note
 from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, number
 from compensator.model.engine import Estimate, Reference
 from compensator.reasons import SampleQuality
@@ -24,14 +25,14 @@ class Outcome:
         The model's estimate.
     offset : Offset
         What is published.
-    notes : tuple of (str, str)
-        Events: kind and text.
+    notes : tuple of Note
+        Events of this sample.
     """
 
     sample: Sample
     estimate: EstimateMessage
     offset: Offset
-    notes: tuple[tuple[str, str], ...]
+    notes: tuple[Note, ...]
 
 
 @dataclass(slots=True)

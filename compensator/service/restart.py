@@ -1,4 +1,4 @@
-"""After any end of the service: finds its last recording and brings the state to where it ended.
+"""The start of the service: finds its last recording and brings the state to where that ended.
 
 A clean stop, a kill and a power cut are the same here: whatever is whole on disk is used. The samples of the last file
 run from the state that it opens with, and give the state after the last of them, bit for bit. Where the configuration
@@ -14,13 +14,15 @@ from typing import Any
 
 from compensator.config import Config, LoadedConfig
 from compensator.errors import CompensatorError, DataError
+from compensator.events import EventKind, Note, command_of
 from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import recordings
-from compensator.service.compensation import Compensation
+from compensator.service.compensation import Compensation, Outcome
 from compensator.service.offset_checkpoint import EarlyOffset
-from compensator.service.retrace import opening_of, replayed, steps_of, warm_up
+from compensator.service.replay import Step, apply, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
+from compensator.service.warm_up import warm_up
 
 
 @dataclass(slots=True)
@@ -31,40 +33,42 @@ class Resumed:
     ----------
     compensation : Compensation
         As it was, or at its first start.
-    notes : list of (str, str, dict)
-        Events: kind, text and data.
+    notes : list of Note
+        Events that describe it.
     """
 
     compensation: Compensation
-    notes: list[tuple[str, str, dict[str, Any]]] = field(default_factory=list)
+    notes: list[Note] = field(default_factory=list)
 
     def note(self, text: str, **data: Any) -> None:
         """Add an event."""
-        self.notes.append(("restart", text, data))
+        self.notes.append(Note(EventKind.RESTART, text, data))
 
 
 @dataclass(slots=True)
-class _Last:
-    """The last file with a sample or a state, and what stands at its end."""
+class _LastFile:
+    """The last file with a sample or a state, and what is known at its end."""
 
     path: Path
     opening: dict[str, bytes]
     state: CompensationState | None
     samples: int = 0
-    #: What was published last, µm; a control that never got an offset applies none.
+    #: Last published offset, µm; a control that never got one applies none.
     offset_um: float = 0.0
     operator_hold: bool = False
 
-    def read(self) -> None:
-        """Read the file through; what it holds of a day at one sample a second is too much to be kept."""
-        if self.state is not None:
-            self.offset_um, self.operator_hold = self.state.offset_um, self.state.memory.operator_hold
-        for step in steps_of(self.path):
-            self.samples += 1
-            if step.offset is not None and not math.isnan(number(step.offset.y_offset_um)):
-                self.offset_um = number(step.offset.y_offset_um)
-            for name, _ in step.commands:
+    def add(self, step: Step) -> float:
+        """Follow one group; return the offset that was published with it, µm, NaN where none was."""
+        self.samples += step.sample is not None
+        offset = step.offset
+        published = number(offset.y_offset_um) if offset is not None else math.nan
+        if not math.isnan(published):
+            self.offset_um = published
+        for event in step.events:
+            if event.kind == EventKind.COMMAND:
+                name = command_of(event)
                 self.operator_hold = name == "hold" or (self.operator_hold and name != "resume")
+        return published
 
 
 def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None = None) -> Resumed:
@@ -77,12 +81,12 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None 
     model : ThermalModel
         The present model.
     early : EarlyOffset, optional
-        The last offset that was published while the disk did not take it.
+        The last offset that was published while the disk failed.
 
     Returns
     -------
     Resumed
-        Before the pause since then, which the first sample tells.
+        The state before the pause since then; the first sample shows how long that is.
     """
     resumed = _from_disk(loaded, model)
     compensation = resumed.compensation
@@ -90,7 +94,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None 
         compensation.go_on_from(early.y_offset_um, model_changed=compensation.is_under_way)
         resumed.note(
             f"goes on from the offset {early.y_offset_um:.3f} µm of sample {early.seq}, "
-            "which was published while the disk did not take it",
+            "which was published while the disk failed",
             early_seq=early.seq,
             offset_um=early.y_offset_um,
         )
@@ -101,46 +105,39 @@ def _from_disk(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
     config = loaded.config
     resumed = Resumed(Compensation(config, model))
     folder = loaded.resolve(config.recording.folder)
-    last = _last(folder, config.machine.name, resumed)
-    if last is None:
-        return resumed
-    changes = _changes(last, loaded, model)
-    if not changes:
+    for path in reversed(recordings(folder, config.machine.name)):
         try:
-            _restore(resumed, last, config)
-        except DataError as error:
-            changes = [str(error)]
-        else:
-            return resumed
-    _warm(resumed, last, folder, config, model, changes)
-    return resumed
-
-
-def _last(folder: Path, machine: str, resumed: Resumed) -> _Last | None:
-    for path in reversed(recordings(folder, machine)):
-        try:
-            last = _Last(path, opening_of(path), None)
+            last = _LastFile(path, opening_of(path), None)
             if "state.json" in last.opening:
                 last.state = _state(last, resumed)
-            last.read()
+            changes = _changes(last, loaded, model)
+            compensation = Compensation(config, model)
+            differing, why = _run_again(last, compensation, restore=not changes)
         except CompensatorError as error:
             resumed.note(f"a recording cannot be used: {error}")
             continue
-        if last.state is not None or last.samples:
-            return last
-    return None
+        if last.state is None and not last.samples:
+            continue
+        if changes or why:
+            _warm(resumed, last, folder, config, model, changes or [why])
+        else:
+            _go_on(resumed, last, compensation, differing)
+        break
+    return resumed
 
 
-def _state(last: _Last, resumed: Resumed) -> CompensationState | None:
+def _state(last: _LastFile, resumed: Resumed) -> CompensationState | None:
     try:
-        return decode_state(last.opening["state.json"])
+        state = decode_state(last.opening["state.json"])
     except DataError as error:
         resumed.note(f"{last.path.name}: {error}")
         return None
+    last.offset_um, last.operator_hold = state.offset_um, state.memory.operator_hold
+    return state
 
 
-def _changes(last: _Last, loaded: LoadedConfig, model: ThermalModel) -> list[str]:
-    """Say in words why the state of the recording is not that of this configuration and model."""
+def _changes(last: _LastFile, loaded: LoadedConfig, model: ThermalModel) -> list[str]:
+    """Return in words why the state of the recording is not that of this configuration and model."""
     if last.state is None:
         return ["the recording carries no state that can be used"]
     changes = []
@@ -151,24 +148,48 @@ def _changes(last: _Last, loaded: LoadedConfig, model: ThermalModel) -> list[str
     return changes
 
 
-def _restore(resumed: Resumed, last: _Last, config: Config) -> None:
-    compensation = Compensation(config, resumed.compensation.model)
-    compensation.restore(last.opening["state.json"])
-    outcome, differing = None, 0
+def _run_again(last: _LastFile, compensation: Compensation, *, restore: bool) -> tuple[int, str]:
+    """Read the last file through, with `restore` running it from its state.
+
+    Returns
+    -------
+    int
+        Number of offsets that do not come out as they were published.
+    str
+        Why it could not be run; empty where it could.
+    """
+    differing, why = 0, ""
+    try:
+        if restore:
+            compensation.restore(last.opening["state.json"])
+    except DataError as error:
+        why = str(error)
     for step in steps_of(last.path):
-        outcome = replayed(compensation, step)
-        if step.offset is not None:
+        published = last.add(step)
+        if not restore or why:
+            continue
+        try:
+            result = apply(compensation, step)
+        except DataError as error:
+            why = str(error)
+            continue
+        if isinstance(result, Outcome) and "offset" in step.records:
             # The daemon adds to the reasons when the disk fails; the numbers are the compensation's alone.
-            made, was = number(outcome.offset.y_offset_um), number(step.offset.y_offset_um)
-            differing += made != was and not (math.isnan(made) and math.isnan(was))
+            made = number(result.offset.y_offset_um)
+            differing += made != published and not (math.isnan(made) and math.isnan(published))
+    return differing, why
+
+
+def _go_on(resumed: Resumed, last: _LastFile, compensation: Compensation, differing: int) -> None:
+    """Go on with a compensation that has run the last file."""
     if differing:
         resumed.note(
-            f"{differing} offset(s) of {last.path.name} come out otherwise than they were published: audit it",
+            f"{differing} offset(s) of {last.path.name} do not come out as they were published: audit it",
             file=last.path.name,
             differing=differing,
         )
-    if outcome is not None:
-        # Not what is worked out for a torn last sample, whose offset nobody got.
+    if last.samples:
+        # Not from the offset of a torn last sample, which was not published.
         compensation.go_on_from(last.offset_um, model_changed=compensation.is_under_way)
     seq, _ = compensation.last
     resumed.compensation = compensation
@@ -181,7 +202,9 @@ def _restore(resumed: Resumed, last: _Last, config: Config) -> None:
     )
 
 
-def _warm(resumed: Resumed, last: _Last, folder: Path, config: Config, model: ThermalModel, changes: list[str]) -> None:
+def _warm(
+    resumed: Resumed, last: _LastFile, folder: Path, config: Config, model: ThermalModel, changes: list[str]
+) -> None:
     why = " and ".join(changes)
     model_changed = last.state is None or last.state.model_sha256 != model.sha256
     try:
@@ -190,7 +213,9 @@ def _warm(resumed: Resumed, last: _Last, folder: Path, config: Config, model: Th
         resumed.compensation.go_on_from(last.offset_um, model_changed=model_changed)
         if last.operator_hold:
             resumed.compensation.hold()
-        resumed.note(f"{why}; the state cannot be brought over ({error}): it begins anew", begun_anew=True)
+        resumed.note(
+            f"{why}; the state cannot be carried over ({error}): it begins as at a first start", begun_anew=True
+        )
         return
     resumed.compensation = warm.compensation
     resumed.compensation.go_on_from(last.offset_um, model_changed=model_changed)

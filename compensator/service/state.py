@@ -1,7 +1,7 @@
-"""The state of a compensation as JSON: everything that decides the next outcome, to the bit.
+"""The state of a compensation as JSON: everything that decides the next outcome, bit for bit.
 
-A number that is not finite stands as a text (`"nan"`, `"inf"`, `"-inf"`), since JSON has no word for it; every other
-one is written with as many digits as give the same bits back.
+A number that is not finite is a text (`"nan"`, `"inf"`, `"-inf"`), since JSON has none; every other one has as many
+digits as give the same bits back.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def encode_state(state: CompensationState) -> bytes:
 
 
 def _worded(value: Any) -> Any:
-    """Put words in the place of numbers that are not finite."""
+    """Replace numbers that are not finite by words."""
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Another model in the place of the running one: prepared on a thread, swapped in between two samples."""
+"""Replaces the running model by another one: prepared on a thread, swapped in between two samples."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 from compensator.clock import Clock
 from compensator.errors import CompensatorError
+from compensator.events import EventKind
 from compensator.service.adoption import Adoption, Prepared, Wanted
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.journal import Journal
@@ -21,7 +22,7 @@ log = logging.getLogger("compensator")
 
 @dataclass(slots=True)
 class _Adopting:
-    """A model that is being taken over, with the samples that came meanwhile."""
+    """A model that is being adopted, with the samples that came meanwhile."""
 
     wanted: Wanted
     reply: Future[dict[str, Any]]
@@ -31,7 +32,7 @@ class _Adopting:
 
 
 class Takeover:
-    """Takes one model over at a time.
+    """Adopts one model at a time.
 
     Parameters
     ----------
@@ -56,9 +57,9 @@ class Takeover:
         self._ended = False
 
     def begin(self, wanted: Wanted, reply: Future[dict[str, Any]], sender: Sender) -> None:
-        """Begin to make a model ready; the reply comes once it is, or is refused. In the loop only."""
+        """Begin to prepare a model; the reply comes once it is ready or refused. In the loop only."""
         if self._adoption is None or self._ended or self._adopting is not None:
-            why = f"{wanted.action}: this service takes no model now"
+            why = f"{wanted.action}: this service adopts no model now"
             if self._adopting is not None:
                 why = f"{wanted.action}: another model is under way until the next sample; ask again then"
             self._journal.note("command_refused", why, {"name": wanted.action, "ok": False} | sent_by(sender))
@@ -66,44 +67,41 @@ class Takeover:
             return
         # The text of the model is not repeated here: it travels in the recording that begins with it.
         data = {"sha256": wanted.sha256, "force": wanted.force}
-        self._journal.note("command", wanted.action, data | sent_by(sender))
+        self._journal.note("command", wanted.action, data | {"command": wanted.action} | sent_by(sender))
         self._adopting = _Adopting(wanted, reply)
         self._adopting.task = asyncio.create_task(self._prepare(self._adoption, self._adopting))
-        self._adopting.task.add_done_callback(self._tell_refusal)
+        self._adopting.task.add_done_callback(self._answer_refusal)
 
     def follow(self, outcome: Outcome) -> None:
-        """Take note of a sample that comes while a model is made ready."""
+        """Keep a sample that comes while a model is prepared."""
         if self._adopting is not None:
             self._adopting.since.append(outcome)
 
     def swap(self) -> Compensation:
-        """Return the compensation to go on with: the running one, or one with a model that is ready."""
+        """Return the compensation for the next sample: the running one, or one with a model that is ready."""
         adopting, old = self._adopting, self._running()
         if adopting is None or adopting.prepared is None:
             return old
         self._adopting = None
         prepared = adopting.prepared
-        new = prepared.compensation
+        new = prepared.warm.compensation
         for outcome in adopting.since:
-            zeroed = any(kind == "zero" for kind, _ in outcome.notes)
-            how = "rest" if outcome.estimate.y_base_um == 0.0 else "warm"
-            prepared.catch_up(outcome.sample, how if zeroed else None)  # type: ignore[arg-type]
+            zero = next((note.data["mode"] for note in outcome.notes if note.kind == EventKind.ZERO), None)
+            prepared.catch_up(outcome.sample, zero)
         difference = new.target_um - old.target_um
         new.succeed(old)
         self._journal.start_new_file(prepared.data)
         named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
         self._journal.note(
             "adopt",
-            f"model {named[0]} in the place of {named[1]}, "
-            f"warm-up {prepared.minutes / 60.0:.1f} h, the offset is to move by {difference:+.2f} µm",
+            f"model {named[0]} replaces {named[1]}, "
+            f"warm-up {prepared.warm.minutes / 60.0:.1f} h, the offset moves by {difference:+.2f} µm",
             {
                 "ok": True,
                 "action": adopting.wanted.action,
                 "old_sha256": old.model.sha256,
                 "new_sha256": new.model.sha256,
-                "warm_up_min": prepared.minutes,
-                "warm_up_samples": prepared.samples,
-                "state_known": prepared.known,
+                **prepared.warm.figures(),
                 "difference_um": difference,
                 "y_std_um": new.std_um,
             },
@@ -111,7 +109,7 @@ class Takeover:
         return new
 
     async def end(self) -> None:
-        """Let what is under way be answered: a model that was kept is used at the next start."""
+        """Wait until a model under way is answered: one that was stored is used at the next start."""
         self._ended = True
         await asyncio.sleep(0)  # one that was asked for just now is refused
         adopting = self._adopting
@@ -119,29 +117,27 @@ class Takeover:
             await asyncio.gather(adopting.task, return_exceptions=True)
 
     async def _prepare(self, adoption: Adoption, adopting: _Adopting) -> None:
-        """Have the model made ready on another thread; then answer. The swap is the next sample's."""
+        """Have the model prepared on another thread, then answer; the swap comes with the next sample."""
         running = self._running()
         zero = running.zero_that_stands if running.has_reference else None
         prepared = await asyncio.to_thread(adoption.prepare, adopting.wanted, running.model, zero, self._clock.utc_ns())
         adopting.prepared = prepared
-        model = prepared.compensation.model
-        how = f"warmed up on {prepared.samples} sample(s) of {prepared.minutes / 60.0:.1f} h"
-        if not prepared.known:
-            how += f", too little to know its state: standard deviation {prepared.compensation.std_um:.1f} µm for now"
+        warm, model = prepared.warm, prepared.warm.compensation.model
+        how = f"warmed up on {warm.samples} sample(s) of {warm.minutes / 60.0:.1f} h"
+        if not warm.known:
+            how += f", too little to know its state: standard deviation {warm.compensation.std_um:.1f} µm for now"
         adopting.reply.set_result(
             {
                 "ok": True,
-                "text": f"model {model.name} ({model.sha256[:12]}) is taken over at the next sample, {how}",
+                "text": f"model {model.name} ({model.sha256[:12]}) is adopted with the next sample, {how}",
                 "model": model.name,
                 "model_sha256": model.sha256,
-                "warm_up_min": prepared.minutes,
-                "warm_up_samples": prepared.samples,
-                "state_known": prepared.known,
+                **prepared.warm.figures(),
             }
         )
 
-    def _tell_refusal(self, task: asyncio.Task[None]) -> None:
-        """Answer that nothing comes of it, whatever the reason: the running model goes on."""
+    def _answer_refusal(self, task: asyncio.Task[None]) -> None:
+        """Answer with the reason where a model could not be prepared; the running one goes on."""
         adopting, error = self._adopting, None if task.cancelled() else task.exception()
         if adopting is None or error is None:
             return
@@ -155,10 +151,10 @@ class Takeover:
 
 
 def refusal(text: str) -> dict[str, Any]:
-    """Return the answer to a command that is not taken."""
+    """Return the answer to a command that is refused."""
     return {"ok": False, "text": text}
 
 
 def sent_by(sender: Sender) -> dict[str, Any]:
-    """Return what an event says of who sent a command; it stands above what the payload says of itself."""
+    """Return the sender of a command for its event; it replaces what the payload claims."""
     return {"by": sender.name, "by_proof": sender.proof}

@@ -19,11 +19,12 @@ from typing import Any, NamedTuple
 
 from compensator import __version__
 from compensator.clock import NS, Clock
+from compensator.errors import DataError
 from compensator.messages import MESSAGES, shipped_schema
+from compensator.recording.compaction import rewrite
 from compensator.recording.live_file import LiveFile
 from compensator.watch.machine import KINDS, Malformed, decoded
 from compensator.watch.sequence import Sequence
-from compensator.watch.shop_file import compact
 
 log = logging.getLogger("compensator")
 
@@ -222,11 +223,13 @@ def _day(arrival: _Arrival) -> str:
 def _compact_all(paths: list[Path]) -> None:
     for path in paths:
         try:
-            said = compact(path)
-        except (OSError, ValueError) as error:
-            said = f"could not be made compact and stays as it is: {error}"
-        if said:
-            log.info("%s: %s", path.name, said)
+            copy = rewrite(path)
+        except (OSError, DataError) as error:
+            log.info("%s: could not be made compact and stays as it is: %s", path.name, error)
+            continue
+        if copy is not None:
+            end = "" if copy.contents.ended else "; it had no end, every whole message was kept"
+            log.info("%s: %d messages, compact%s", path.name, copy.messages, end)
 
 
 class _File(LiveFile):

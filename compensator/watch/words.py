@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from typing import Any, Literal, NamedTuple
 
 from compensator.clock import NS
+from compensator.events import EventKind, RecordingData, data_of
 from compensator.messages import Event
 from compensator.reasons import explain
 
@@ -69,7 +70,8 @@ def to_do(event: Event) -> str:
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
         return " ".join(dict.fromkeys(in_words(code).do for code in codes)) if state not in ("", "ok") else ""
-    if event.kind == "recording" and ("again" in event.text or "removed" in event.data):
+    recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
+    if recording is not None and recording.is_resolved:
         return ""
     return _DO.get(event.kind, "")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +117,7 @@ class Service:
     def now_ns(self) -> int:
         return self.start_ns + self.seq * MINUTE_NS
 
-    def note(self, kind: str, text: str, data: dict[str, Any] | None = None) -> None:
+    def note(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
         self.events.append(
             Event(
                 schema=SCHEMA,
@@ -126,7 +126,7 @@ class Service:
                 time_utc_ns=self.now_ns,
                 kind=kind,
                 text=text,
-                data=data or {},
+                data=dict(data or {}),
             )
         )
 
@@ -159,12 +159,12 @@ class Service:
             return raw
         state = self.compensation.state()
         for name, data in self.commands:
-            self.note("command", name, data)
+            self.note("command", name, data | {"command": name})
             getattr(self.compensation, name)(**data)
         self.commands = []
         outcome = self.compensation.process(raw)
-        for kind, text in outcome.notes:
-            self.note(kind, text)
+        for note in outcome.notes:
+            self.note(*note)
         offset = outcome.offset
         if self._failing:
             offset = msgspec.structs.replace(

@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, Writer
 from compensator.messages import Chain
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Attachment, Container, Contents, Torn
+from compensator.recording.reading import last_value
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,27 @@ def lines_of(path: Path) -> tuple[list[Line], Contents]:
             for number, sequence, time_ns, body in container.messages():
                 lines.append(Line(channels[number].topic[1:], sequence, time_ns, body[PAYLOAD:]))
         return lines, container.contents
+
+
+@dataclass(frozen=True)
+class End:
+    """How a file ends: the value it hands on, messages the chain does not list, its seal, whether whole and compact."""
+
+    value: bytes
+    unlisted: int
+    sealed: str
+    whole: bool
+    chunked: bool
+
+
+def end_of_chain(path: Path) -> End | None:
+    lines, contents = lines_of(path)
+    listed = [i for i, line in enumerate(lines) if line.topic == "chain"]
+    if not listed:
+        return None
+    last = [line for line in lines if line.topic != "chain"][-1]
+    sealed = msgspec.json.decode(last.data)["reason"] if last.topic == "seal" else ""
+    return End(last_value(path), len(lines) - 1 - listed[-1], sealed, contents.ended, contents.chunked)
 
 
 def rewrite(

@@ -31,7 +31,7 @@ def test_a_clean_recording_is_stated_shortly(rec: Path, capsys: pytest.CaptureFi
     assert main(["replay", str(rec)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("30 samples of vmc-07 in 1 file(s), 2026-01-05T06:00:00Z to 2026-01-05T06:29:00Z")
-    assert lines[1] == "Every estimate and every offset comes out again, bit for bit."
+    assert lines[1] == "The replay reproduces every estimate and every offset, bit for bit."
     assert lines[2].startswith("The hash chain holds over 94 records") and len(lines) == 4
 
 
@@ -39,9 +39,9 @@ def test_a_difference_is_exit_code_3_and_named_field_by_field(rec: Path, capsys:
     tampered(rec)
     assert main(["replay", str(rec)]) == 3
     out = capsys.readouterr().out
-    assert "/offset of sample 20, 2026-01-05T06:20:00Z, comes out differently:" in out
+    assert "/offset of sample 20, 2026-01-05T06:20:00Z, differs:" in out
     assert "  valid_for_s: recorded 950.0, recomputed 150.0" in out
-    assert f"{rec.name}: altered: /offset record" in out and "comes out again, bit for bit" not in out
+    assert f"{rec.name}: altered: /offset record" in out and "bit for bit" not in out
 
 
 def test_the_result_as_json(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -124,7 +124,7 @@ def test_samples_that_cannot_be_worked_out_again_prove_nothing(rec: Path, capsys
 
     rewrite(rec, lambda lines: [line for line in lines if line.topic not in ("chain", "seal")], contents=bare)
     assert main(["replay", str(rec)]) == 3
-    assert "unreadable: its samples cannot be worked out again: attachment config.toml" in capsys.readouterr().out
+    assert "unreadable: its samples cannot be replayed: attachment config.toml" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from compensator.audit.series import Audit, audit
 from compensator.errors import CompensatorError, DataError
 from compensator.recording.container import MAGIC, Container
 from compensator.recording.finishing import compact
-from compensator.recording.reading import end_of_chain, read_messages
+from compensator.recording.reading import last_value, read_messages
 from tests.audit.made import Service
 from tests.audit.tampering import rewrite
 
@@ -127,7 +127,7 @@ def test_wild_changes_give_a_verdict_and_recovery_never_fails_badly(
     original = bytes(data)
     verdict(place, original)
     try:
-        end_of_chain(place)
+        last_value(place)
         list(read_messages(place))
         compact(place)
     except DataError:

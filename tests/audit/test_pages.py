@@ -46,14 +46,14 @@ def test_what_was_proven_and_what_no_recording_can_prove(rec: Path, capsys: pyte
     assert list(outcomes(text).values()) == ["✓", "✓", "✓", "✓", "–", "✓", "–", "–"]
     for path in recordings(rec, MACHINE):
         assert text.count(path.name) >= 2
-    assert 'href="#word-finished"' in text and "first sample that comes out differently" not in text
+    assert 'href="#word-finished"' in text and "first sample that differs" not in text
 
 
 def test_a_change_is_shown_field_by_field(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tampered(recordings(rec, MACHINE)[0])
     text = page(capsys, 3, rec)
     assert '<p class="verdict bad">' in text
-    assert "Not proven: 1 finding(s) and 1 sample(s) that come out differently in 2 recording(s)" in text
+    assert "Not proven: 1 finding(s) and 1 sample(s) that differ in the replay in 2 recording(s)" in text
     assert '<tr><th scope="row">valid_for_s</th><td>950.0</td><td>150.0</td></tr>' in text
     assert [*outcomes(text).values()][:3] == ["✗", "✗", "✓"]
     assert 'href="#word-altered"' in text

@@ -1,4 +1,4 @@
-"""What the service recorded comes out again, bit for bit, whatever happened; a changed bit is found by its field."""
+"""A replay gives what the service recorded, bit for bit, whatever happened; a changed bit is found by its field."""
 
 from __future__ import annotations
 

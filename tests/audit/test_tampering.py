@@ -326,7 +326,7 @@ def test_swapped_files_are_named(folder: Path) -> None:
     first.write_bytes(b)
     other.write_bytes(a)
     findings = look(folder).findings
-    assert {(f.kind, f.file) for f in findings if "its name" in f.text} == {
+    assert {(f.kind, f.file) for f in findings if "the name of another file" in f.text} == {
         ("reordered", first.name),
         ("reordered", other.name),
     }
@@ -427,7 +427,7 @@ def test_a_kill_is_no_tampering_and_the_next_file_goes_on(tmp_path: Path) -> Non
     Service(tmp_path, start_ns=EVENING_NS + 10 * MINUTE_NS, seq=8).run(5).stop()
     found = look(tmp_path)
     assert found.clean and [f.end for f in found.files] == ["recovered", "finished"]
-    assert found.files[0].samples == 8 and "ended hard" in found.remarks[0]
+    assert found.files[0].samples == 8 and "killed" in found.remarks[0]
     # Less than was there at that restart: somebody was at it afterwards.
     path = recordings(tmp_path, MACHINE)[0]
     rewrite(path, lambda lines: lines[: find(lines, "chain", -5) + 1])

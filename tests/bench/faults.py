@@ -59,7 +59,7 @@ def healthy(name, plant, model, days, seeds, **more):
     raised, total = [], 0
     for seed in seeds:
         for i, outcome in run(Compensation(settings(**more), model), recorded(plant(), seed, days)):
-            raised += [(seed, i, text) for kind, text in outcome.notes if kind == "plausibility"]
+            raised += [(seed, i, text) for kind, text, _ in outcome.notes if kind == "plausibility"]
             total += 1
     found = f"raised {len(raised)} times in {total / 1440:.0f} days" + (f": {raised[:3]}" if raised else "")
     yield told(Figure(what=f"plausibility, healthy machine ({name})", found=found, wanted="never"))

@@ -5,13 +5,11 @@ from __future__ import annotations
 import ast
 import json
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
 import compensator
-from compensator.audit.findings import Kind
-from compensator.audit.recording_audit import End
+from compensator.audit.findings import End, Kind
 from compensator.cli import main
 from compensator.codes import Code
 from compensator.reasons import DOMAINS, WORDS, Remark
@@ -71,7 +69,7 @@ def test_no_code_is_left_over() -> None:
 
 def test_every_code_that_is_shown_has_its_sentences() -> None:
     assert len(remarks()) >= 18
-    assert remarks() | set(get_args(Kind)) | set(get_args(End)) <= set(WORDS)
+    assert remarks() | set(Kind) | set(End) <= set(WORDS)
     for code, (means, do) in WORDS.items():
         assert means.endswith(".") and do.endswith(".") and means != do, code
 

@@ -25,8 +25,8 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.model_store import ModelStore
 from compensator.service.offset_checkpoint import OffsetCheckpoint
+from compensator.service.replay import apply, opening_of, steps_of
 from compensator.service.restart import resume
-from compensator.service.retrace import opening_of, replayed, steps_of
 from sim_hardware.physics import Duty, PublishedQuill, World
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
 
@@ -156,13 +156,16 @@ def check_files(machine: Machine) -> int:
         compensation = Compensation(machine.config, parse_model(opening["model.toml"], source="attached"))
         compensation.restore(opening["state.json"])
         for step in steps_of(path):
-            outcome = replayed(compensation, step)
-            assert encode(outcome.sample) == encode(step.sample), (path.name, step.sample.seq)
+            outcome = apply(compensation, step)
+            if not isinstance(outcome, Outcome):
+                continue
+            seq = outcome.sample.seq
+            assert encode(outcome.sample) == step.records["sample"].data, (path.name, seq)
             if step.estimate is not None:
-                assert encode(outcome.estimate) == encode(step.estimate), (path.name, step.sample.seq)
+                assert encode(outcome.estimate) == step.records["estimate"].data, (path.name, seq)
             if step.offset is not None and not {"recording_failed", "recording_late"} & set(step.offset.reasons):
-                assert encode(outcome.offset) == encode(step.offset), (path.name, step.sample.seq)
-            seqs.append(step.sample.seq)
+                assert encode(outcome.offset) == step.records["offset"].data, (path.name, seq)
+            seqs.append(seq)
             samples += 1
     assert seqs == sorted(set(seqs))
     return samples

@@ -18,7 +18,7 @@ from compensator.recording.reading import recordings
 from compensator.service.adoption import Adoption
 from compensator.service.compensation import Outcome
 from compensator.service.model_store import ModelStore, sha256_of
-from compensator.service.retrace import opening_of
+from compensator.service.replay import opening_of
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.test_restart import QUILL, STRONGER
 
@@ -109,7 +109,7 @@ async def test_the_running_service_takes_a_model_over_as_if_it_had_run_all_the_t
     assert [opening_of(path)["model.toml"] for path in files] == [QUILL, model]
     assert check_files(machine) == len(machine.outcomes)
     told = [event for event in machine.events("command") if event.text == "adopt"]
-    asked = {"sha256": sha256_of(model), "force": False, "by": "unnamed", "by_proof": "none"}
+    asked = {"command": "adopt", "sha256": sha256_of(model), "force": False, "by": "unnamed", "by_proof": "none"}
     assert len(told) == 1 and told[0].data == asked
     # The next start uses it.
     assert machine.store.in_use() == model

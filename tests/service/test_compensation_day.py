@@ -12,9 +12,10 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import MESSAGES, Offset, number, schemas, shipped_schema
-from compensator.recording.reading import decode, end_of_chain, first_sequence, last_sequence, read_messages, recordings
+from compensator.recording.reading import decode, first_sequence, last_sequence, read_messages, recordings
 from drivers.errors import DeviceTimeout
 from drivers.reading import Quality, Reading
+from tests.audit.tampering import end_of_chain
 from tests.service.simulated import START_NS, Bench, config
 
 MISSING = Reading.bad(Quality.OPEN, "wire broken")
@@ -206,7 +207,7 @@ async def test_commands_hold_resume_zero(bench: Bench) -> None:
     # The machine is warm there: its stored heat goes on, only the deformation counts from here.
     zero = bench.outcomes[161 - 1]
     assert number(zero.estimate.y_um) == pytest.approx(0.0, abs=1e-9)
-    assert any("warm" in text for kind, text in zero.notes if kind == "zero")
+    assert any(note.data["mode"] == "warm" for note in zero.notes if note.kind == "zero")
     assert abs(number(zero.estimate.y_pred_um)) < 1.0
     settled = bench.outcomes[200:]
     assert np.std([number(o.estimate.residual_um) for o in settled]) < 0.7

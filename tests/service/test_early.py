@@ -40,7 +40,7 @@ async def test_killed_on_a_full_disk_the_offset_does_not_leap_back(
     assert abs(before[99] - before[59]) > 20 * RATE_UM_PER_MIN  # so far it would leap
     (note,) = tmp_path.glob("compensator-*.json")
     await machine.run(20)
-    assert "published while the disk did not take it" in " ".join(event.text for event in machine.events("restart"))
+    assert "published while the disk failed" in " ".join(event.text for event in machine.events("restart"))
     assert largest_step(machine.outcomes) <= RATE_UM_PER_MIN + 1e-9
     assert [o.offset.seq for o in machine.outcomes] == sorted({o.offset.seq for o in machine.outcomes})
     assert not note.exists()  # the disk has everything again

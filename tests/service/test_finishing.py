@@ -14,11 +14,11 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from compensator.audit.series import audit
 from compensator.errors import DataError
-from compensator.recording import finishing
+from compensator.recording import compaction, finishing
 from compensator.recording.finishing import Finisher, Retention, compact
-from compensator.recording.reading import end_of_chain, read_messages, recordings
+from compensator.recording.reading import read_messages, recordings
 from tests.audit.made import MACHINE, MINUTE_NS, Service
-from tests.audit.tampering import lines_of, rewrite
+from tests.audit.tampering import end_of_chain, lines_of, rewrite
 from tests.service.simulated import START_NS
 
 DAY_NS = 1440 * MINUTE_NS
@@ -103,11 +103,11 @@ def test_whatever_happens_meanwhile_the_live_file_stays(
         raise SystemExit
 
     if what == "write":
-        monkeypatch.setattr(finishing.os, "fsync", full)
+        monkeypatch.setattr(compaction.os, "fsync", full)
     elif what == "read back":
-        monkeypatch.setattr(finishing, "_digest", lambda *_: "another")
+        monkeypatch.setattr(compaction, "_digest", lambda *_: "another")
     else:
-        monkeypatch.setattr(finishing, "_digest", killed)
+        monkeypatch.setattr(compaction, "_digest", killed)
     with pytest.raises((OSError, DataError, SystemExit)):
         compact(path)
     assert path.read_bytes() == data and list(tmp_path.iterdir()) == [path]
@@ -123,7 +123,7 @@ def test_what_a_kill_leaves_of_a_copy_is_written_anew(tmp_path: Path) -> None:
 
 
 def test_a_failure_is_said_and_the_recording_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finishing, "_digest", lambda *_: "another")
+    monkeypatch.setattr(compaction, "_digest", lambda *_: "another")
     service = Service(tmp_path).run(5)
     service.recorder.start_new()
     service.run(5).stop()
@@ -242,7 +242,7 @@ def test_a_disk_that_refuses_the_copy_is_made_room_on(tmp_path: Path, monkeypatc
     monkeypatch.undo()
     # Once the disk takes it the next finished file brings those along that it refused.
     finisher = service.recorder._finisher
-    finisher.put(left[-1], service.now_ns - DAY_NS)
+    finisher.enqueue(left[-1], service.now_ns - DAY_NS)
     finisher.wait()
     assert all(lines_of(path)[1].chunked for path in left)
     assert audit(left).clean
@@ -315,7 +315,7 @@ def test_files_of_others_are_not_touched(tmp_path: Path) -> None:
         path.write_bytes(b"not ours")
     finisher = Finisher(tmp_path, MACHINE, Retention(keep_days=1.0), None)
     service = days(tmp_path, 4, keep_days=1.0)
-    finisher.put(others[1], service.now_ns)
+    finisher.enqueue(others[1], service.now_ns)
     finisher.wait()
     service.stop()
     assert all(path.read_bytes() == b"not ours" for path in others)

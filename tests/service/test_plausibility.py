@@ -58,7 +58,7 @@ def outcomes_of(
 
 
 def told(outcomes: list[Outcome]) -> list[tuple[int, str]]:
-    return [(i, text) for i, o in enumerate(outcomes) for kind, text in o.notes if kind == "plausibility"]
+    return [(i, text) for i, o in enumerate(outcomes) for kind, text, _ in o.notes if kind == "plausibility"]
 
 
 def first_at(outcomes: list[Outcome], reason: str) -> int:

@@ -191,7 +191,7 @@ async def test_what_waits_is_bounded_and_what_is_given_up_is_said(
     # The one that is being written and eight that wait; the zero that was set with one of the lost ones stands.
     assert [o.seq for o in logged(tmp_path / "rec")] == [*range(11), *range(22, 40)]
     assert events(bench)[-1].text == "the disk takes the recording again; 11 sample(s) were not recorded"
-    assert events(bench)[-1].data == {"lost": 11}
+    assert events(bench)[-1].data == {"code": "disk_back", "lost": 11}
     found = look(tmp_path / "rec")
     assert found.clean and found.samples == 29, summary(found)
     kept = [

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from compensator import durable
 from compensator.cli import main
 from compensator.clock import NS
 from compensator.errors import DataError
+from compensator.recording import live_file
+from compensator.recording.compaction import rewrite
 from compensator.watch import shop_recorder
-from compensator.watch.shop_file import compact
 from compensator.watch.shop_recorder import ShopRecorder
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
 
@@ -140,7 +140,7 @@ def test_a_kill_loses_nothing_that_was_synced_and_the_next_start_finishes_the_fi
         pass
     assert [one[2] for one in read(path)] == list(range(100))
     assert [one.name for one in folder.iterdir()] == [path.name]
-    assert compact(path) == ""
+    assert rewrite(path) is None
 
 
 def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +152,7 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path: Path, monkeypatch
             raise OSError(28, "No space left on device")
         sync(descriptor)
 
-    monkeypatch.setattr(durable.os, "fsync", fsync)
+    monkeypatch.setattr(live_file.os, "fsync", fsync)
     monkeypatch.setattr(shop_recorder, "SYNC_S", 0.02)
     with ShopRecorder(tmp_path, "shop", Clock()) as recorder:
         recorder.take(KEY + "y/offset", offset(1))
@@ -185,7 +185,7 @@ def test_damage_leaves_the_file_as_it_was(tmp_path: Path) -> None:
         broken[place] ^= 1
         path.write_bytes(broken)
         try:
-            compact(path)
+            rewrite(path)
         except DataError as error:
             counted[type(error).__name__] += 1
         assert path.read_bytes() == broken

@@ -22,8 +22,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 from compensator.config import Config, Plausibility
+from compensator.events import EventKind, Implausibility, Note
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Reason
 from compensator.service.plausibility.isolation import LOG_ODDS, Block, FaultIsolation, Fit
@@ -155,7 +157,7 @@ class PlausibilityCheck:
         )
         self._isolation = FaultIsolation(model, BLOCK_SAMPLES, WINDOW, self._keep)
         self.state = PlausibilityState()
-        self._notes: list[tuple[str, str]] = []
+        self._notes: list[Note] = []
 
     @property
     def is_on(self) -> bool:
@@ -190,8 +192,8 @@ class PlausibilityCheck:
         )
         return "; ".join(parts)
 
-    def update(self, evidence: Evidence) -> list[tuple[str, str]]:
-        """Check one sample; return its events: kind and text."""
+    def update(self, evidence: Evidence) -> list[Note]:
+        """Check one sample; return its events."""
         self._notes = []
         self._check_exchanged(evidence.below_k)
         self._check_rest(evidence)
@@ -250,8 +252,11 @@ class PlausibilityCheck:
         if state.below_min >= limit and not state.exchanged:
             state.exchanged = True
             self._note(
+                Implausibility.EXCHANGED,
                 f"T_Q has been more than {self._below_max_k:g} K below AT for {state.below_min:g} min, {below_k:.1f} K "
-                f"now: exchanged wires or addresses, or a couple that has come off; suspects: T_Q, AT"
+                f"now: exchanged wires or addresses, or a couple that has come off; suspects: T_Q, AT",
+                below_k=below_k,
+                minutes=state.below_min,
             )
 
     def _check_rest(self, evidence: Evidence) -> None:
@@ -264,11 +269,14 @@ class PlausibilityCheck:
         apart = abs(evidence.apart_k) > rest.t_q_at_max_k
         if apart and not state.apart:
             self._note(
+                Implausibility.APART,
                 f"after {state.rest_min:g} min of rest T_Q and AT differ by {evidence.apart_k:+.2f} K more than at the "
-                f"zero, expected within {rest.t_q_at_max_k:g} K; suspects: T_Q, AT, or a zero on a warm machine"
+                f"zero, expected within {rest.t_q_at_max_k:g} K; suspects: T_Q, AT, or a zero on a warm machine",
+                apart_k=evidence.apart_k,
+                minutes=state.rest_min,
             )
         elif state.apart and not apart:
-            self._note("T_Q and AT have come together at rest")
+            self._note(Implausibility.TOGETHER, "T_Q and AT have come together at rest")
         state.apart = apart
 
     def _check_residual(self, evidence: Evidence) -> None:
@@ -314,7 +322,7 @@ class PlausibilityCheck:
             state.calm = state.calm + 1 if abs(z) < _CALM else 0
             if state.calm >= CALM_BLOCKS:
                 state.suspects, state.high, state.low, state.calm, state.accused = [], 0.0, 0.0, 0, 0
-                self._note("measured and predicted Y agree again")
+                self._note(Implausibility.RESIDUAL_OVER, "measured and predicted Y agree again")
                 return
         if state.suspects or max(state.high, state.low) > self.threshold:
             self._isolate(block)
@@ -330,7 +338,13 @@ class PlausibilityCheck:
         if suspects == self.state.suspects:
             return
         self.state.suspects = suspects
-        self._note(self._describe_alarm(block, named, misfit))
+        self._note(
+            Implausibility.RESIDUAL,
+            self._describe_alarm(block, named, misfit),
+            suspects=suspects,
+            residual_um=block.residual_um,
+            std_um=block.std_um,
+        )
 
     def _describe_alarm(self, block: Block, named: list[Fit], misfit: bool) -> str:
         words = [f"{fit.words} since {self._ago(fit)}" if fit.suspect != "model" else fit.words for fit in named]
@@ -344,8 +358,9 @@ class PlausibilityCheck:
     def _ago(self, fit: Fit) -> str:
         return f"{fit.blocks_ago * BLOCK_SAMPLES * self._period_min:g} min"
 
-    def _note(self, text: str) -> None:
-        self._notes.append(("plausibility", text))
+    def _note(self, code: Implausibility, text: str, **data: Any) -> None:
+        # Version 0.1.0 recorded these texts without data: an audit of its recordings compares them.
+        self._notes.append(Note(EventKind.PLAUSIBILITY, text, {"code": code, **data}))
 
 
 def cusum_threshold(allowance: float, std: float, blocks: float) -> float:

@@ -1,0 +1,320 @@
+"""Follows the hash chain of one file and names what breaks it.
+
+The rule is short (`recording/chain.py`): compute the values, make the `/chain` message that must follow, compare its
+bytes. Only where they differ the cause is looked for: a record that no longer matches the value before it was altered,
+one that the chain lists and the file lacks was removed, one that the file has and the chain does not list was inserted,
+one in another place was moved.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import msgspec
+
+from compensator.audit.findings import Fault
+from compensator.audit.result import RecordingAudit
+from compensator.messages import SCHEMA, Chain, ChainLink, Seal, encode
+from compensator.recording import chain
+from compensator.recording.container import PAYLOAD, Contents, Flaw
+from compensator.recording.reading import Record
+from compensator.recording.signature import Verifier
+
+_sha256 = hashlib.sha256
+_DECODER = msgspec.json.Decoder(Chain)
+_UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, ValueError)
+
+
+class _Prefixes(dict[str, bytes]):
+    """What stands before the body of a record of each topic; an unknown one comes from a channel that was altered."""
+
+    def __missing__(self, topic: str) -> bytes:
+        self[topic] = topic.encode() + b"\0"
+        return self[topic]
+
+
+_PREFIX = _Prefixes()
+
+
+class ChainCheck:
+    """Checks the hash chain of one file.
+
+    Parameters
+    ----------
+    contents : Contents
+        What the file opens with.
+    result : RecordingAudit
+        Where records, seals and findings are entered.
+    verifier : Verifier, optional
+        Public key of the machine.
+    """
+
+    def __init__(self, contents: Contents, result: RecordingAudit, verifier: Verifier | None) -> None:
+        self._contents, self._result, self._verifier = contents, result, verifier
+        #: Value at the last record, and before a seal of a torn end that was finished afterwards.
+        self.head = b""
+        self._before_last = b""
+        #: Value that the chain of this file claims to go on from.
+        self.previous = chain.NOTHING
+        self._next = 0
+        self._run = contents.metadata.get("run", {})
+        self._machine = msgspec.json.encode(self._run.get("machine", "")).decode()
+        self._gaps: dict[int, tuple[int, int]] = {}
+        self._suspect: tuple[int, bytes] | None = None
+
+    def check(self, records: list[Record], message: Record) -> None:
+        """Check the records since the last `/chain` message, and that message.
+
+        Parameters
+        ----------
+        records : list of Record
+            The records, in the order of the file.
+        message : Record
+            The message behind them.
+        """
+        _, sequence, time_ns, body = message
+        if not self.head:
+            self._open(message)
+            if not records:
+                self._next = sequence + 1
+                return
+        result, value, number, entries = self._result, self.head, self._next, []
+        whole = True
+        for topic, its_number, its_time, its_body in records:
+            before = value
+            value = _sha256(b"%b%b%b" % (value, _PREFIX[topic], its_body)).digest()
+            entries.append(f'{{"topic":"{topic}","sequence":{its_number},"sha256":"{value.hex()}"}}')
+            whole = whole and its_number == number and its_time == time_ns
+            number += 1
+            if topic == "seal":
+                self._before_last = before
+                self._seal(before, Record(topic, its_number, its_time, its_body))
+            else:
+                result.seal, result.sealed_signed = "", False
+                result.unsigned_behind += 1
+        result.records += len(records)
+        expected = (
+            f'{{"schema":{SCHEMA},"machine":{self._machine},"time_utc_ns":{time_ns},"before":"{self.head.hex()}",'
+            f'"parts":[],"records":[{",".join(entries)}]}}'
+        )
+        whole = whole and number == sequence and body[4:12] == body[12:PAYLOAD]
+        if whole and body[PAYLOAD:] == expected.encode():
+            self.head, self._next = value, number + 1
+            return
+        self._explain(records, value, message)
+
+    def add_rest(self, records: list[Record]) -> None:
+        """Count the records behind the last `/chain` message: the file ends within a group."""
+        result = self._result
+        for record in records:
+            self.head = chain.link(self.head, record.topic, record.body)
+            result.seal, result.sealed_signed = "", False
+        result.records += len(records)
+        result.unsigned_behind += len(records)
+
+    def finish(self) -> None:
+        """Enter what is known only at the end."""
+        result = self._result
+        for first, (last, time_ns) in sorted(self._gaps.items()):
+            numbers = _numbers(first, last)
+            result.find(Fault.RECORDS_MISSING, sequence=last + 1, time_utc_ns=time_ns, numbers=numbers)
+        result.pair_moved()
+        for name, flaw in self._contents.flaws:
+            result.find(Fault.PART_CRC if flaw is Flaw.WRONG_CRC else Fault.PART_LATE, topic=name, what=flaw.value)
+        result.previous = self.previous.hex()
+        result.last = (self._before_last if result.seal == "recovered" else self.head).hex()
+
+    # ------------------------------------------------------------------ opening
+
+    def _open(self, message: Record) -> None:
+        """Check what the file opens with; name the part that is not what it was."""
+        result, sequence = self._result, message.sequence
+        parts = chain.parts_of(self._contents)
+        try:
+            stated = _DECODER.decode(message.data)
+            self.previous = bytes.fromhex(stated.before)
+        except _UNREADABLE:
+            result.find(Fault.OPENING_UNREADABLE, topic="chain", sequence=sequence)
+            self.head = chain.opening(self.previous, parts)
+            return
+        if sequence != 0 or stated.records or not stated.parts:
+            result.find(Fault.OPENING_MISSING, topic="chain", sequence=0)
+            self.head, self._next = self.previous, stated.records[0].sequence if stated.records else sequence
+            return
+        self._compare_parts({p.name: p.sha256 for p in stated.parts}, {p.name: p.sha256 for p in parts})
+        try:
+            self.head = chain.opening(self.previous, stated.parts)
+        except ValueError:
+            result.find(Fault.NO_HASH, topic="chain", sequence=sequence)
+            self.head = chain.opening(self.previous, parts)
+        expected = Chain(
+            schema=SCHEMA,
+            machine=self._run.get("machine", ""),
+            time_utc_ns=message.log_time_ns,
+            before=stated.before,
+            parts=stated.parts,
+            records=[],
+        )
+        if message.data != encode(expected) or message.body[4:12] != message.body[12:PAYLOAD]:
+            result.find(Fault.OPENING_CHANGED, message)
+        if (self._run.get("previous_chain", "") or chain.NOTHING.hex()) != stated.before:
+            result.find(Fault.OTHER_PREVIOUS, topic="chain", sequence=sequence)
+
+    def _compare_parts(self, stated: dict[str, str], found: dict[str, str]) -> None:
+        for name in sorted(stated.keys() | found.keys()):
+            if name not in found:
+                self._result.find(Fault.PART_MISSING, topic=name)
+            elif name not in stated:
+                self._result.find(Fault.PART_ADDED, topic=name)
+            elif stated[name] != found[name]:
+                self._result.find(Fault.PART_CHANGED, topic=name)
+        if list(stated) != list(found) and stated == found:
+            self._result.find(Fault.PARTS_REORDERED, topic="chain", sequence=0)
+
+    # ------------------------------------------------------------------ what happened
+
+    def _explain(self, records: list[Record], computed: bytes, message: Record) -> None:
+        """Name what makes a group differ from its `/chain` message, and go on behind it."""
+        result, sequence = self._result, message.sequence
+        try:
+            stated = _DECODER.decode(message.data)
+            before = bytes.fromhex(stated.before)
+            values = [bytes.fromhex(entry.sha256) for entry in stated.records]
+        except _UNREADABLE:
+            result.find(Fault.UNREADABLE_MESSAGE, message)
+            self.head, self._next = computed, sequence + 1
+            return
+        count = result.findings_count - self._clear_suspect(before)
+        moved = self._place(records, stated.records[0].sequence if stated.records else sequence, message)
+        self._find_unlisted(records, stated.records, before)
+        self._find_missing(records, stated.records, message)
+        self._find_changed(records, stated.records, [before, *values], message)
+        if result.findings_count == count and not moved:
+            result.find(Fault.VALUES_BROKEN if before != self.head else Fault.MESSAGE_CHANGED, message)
+        if sequence >= self._next:
+            self.head, self._next = (values[-1] if values else before), sequence + 1
+
+    def _clear_suspect(self, before: bytes) -> bool:
+        """Tell whether the last record of the group before is intact and its value in the chain was altered."""
+        suspect, self._suspect = self._suspect, None
+        findings = self._result.findings
+        if suspect is None or suspect[1] != before or suspect[0] >= len(findings):
+            return False
+        index, self.head = suspect
+        old = findings[index]
+        text = Fault.VALUE_CHANGED.sentence.format(name=f"/{old.topic} record {old.sequence}")
+        findings[index] = replace(old, topic="chain", text=text)
+        return True
+
+    def _place(self, records: list[Record], first: int, message: Record) -> bool:
+        """Tell whether whole groups are missing before this one, or whether it stands in the wrong place."""
+        sequence, time_ns = message.sequence, message.log_time_ns
+        present = {record.sequence for record in records}
+        if first > self._next and not present & set(range(self._next, first)):
+            self._gaps[self._next] = (first - 1, time_ns)
+            return True
+        if first >= self._next:
+            return False
+        fault = Fault.RECORDS_AGAIN
+        for start, (last, gap_time) in list(self._gaps.items()):
+            if start <= first and sequence <= last:
+                del self._gaps[start]
+                if start < first:
+                    self._gaps[start] = (first - 1, gap_time)
+                if sequence < last:
+                    self._gaps[sequence + 1] = (last, gap_time)
+                fault = Fault.RECORDS_MOVED
+                break
+        self._result.find(fault, sequence=first, time_utc_ns=time_ns, numbers=_numbers(first, sequence))
+        return True
+
+    def _find_unlisted(self, records: list[Record], listed: list[ChainLink], before: bytes) -> None:
+        """Name records that the chain does not list."""
+        numbers = {entry.sequence for entry in listed}
+        unlisted = [record for record in records if record.sequence not in numbers]
+        value = self.head
+        prefix = 0
+        for record in records:
+            if record.sequence in numbers:
+                break
+            value, prefix = chain.link(value, record.topic, record.body), prefix + 1
+        if prefix and value == before:
+            last = records[prefix - 1]
+            self._result.find(
+                Fault.MESSAGE_MISSING, topic="chain", sequence=last.sequence + 1, time_utc_ns=last.log_time_ns
+            )
+            self.head = value
+            unlisted = unlisted[prefix:]
+        seen: set[int] = set()
+        for record in records:
+            if record in unlisted or record.sequence in seen:
+                self._result.find(Fault.NOT_LISTED, record)
+            seen.add(record.sequence)
+
+    def _find_missing(self, records: list[Record], listed: list[ChainLink], message: Record) -> None:
+        """Name records that are listed and missing, or stand in another order."""
+        present = [record.sequence for record in records]
+        for entry in listed:
+            if entry.sequence not in present:
+                self._result.find(
+                    Fault.LISTED_MISSING,
+                    topic=entry.topic,
+                    sequence=entry.sequence,
+                    time_utc_ns=message.log_time_ns,
+                )
+        numbers = [entry.sequence for entry in listed if entry.sequence in present]
+        order = [number for number in dict.fromkeys(present) if number in numbers]
+        for wanted, found in zip(numbers, order, strict=False):
+            if wanted != found:
+                record = next(record for record in records if record.sequence == found)
+                self._result.find(Fault.EXCHANGED, record, record=wanted)
+                return
+
+    def _find_changed(
+        self, records: list[Record], listed: list[ChainLink], values: list[bytes], message: Record
+    ) -> None:
+        """Name records whose value is not the one stated; `values` begins with the one before the first of them."""
+        there = {record.sequence: record for record in reversed(records)}
+        last = len(listed) - 1
+        for i, entry in enumerate(listed):
+            record = there.get(entry.sequence)
+            if record is None:
+                continue
+            value = chain.link(values[i], record.topic, record.body)
+            if value == values[i + 1] and record.topic == entry.topic:
+                continue
+            after = there.get(listed[i + 1].sequence) if i < last else None
+            if after is not None and chain.link(value, after.topic, after.body) == values[i + 2]:
+                self._result.find(Fault.VALUE_CHANGED, message, name=f"/{record.topic} record {record.sequence}")
+                continue
+            self._result.find(Fault.RECORD_CHANGED, record)
+            if i == last:
+                self._suspect = (len(self._result.findings) - 1, value)
+
+    # ------------------------------------------------------------------ seals
+
+    def _seal(self, before: bytes, record: Record) -> None:
+        result = self._result
+        try:
+            seal = msgspec.json.decode(record.data, type=Seal)
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            result.find(Fault.UNREADABLE_MESSAGE, record)
+            return
+        result.seal = "" if seal.reason == "hour" else seal.reason
+        if (seal.sha256, seal.sequence) != (before.hex(), record.sequence - 1):
+            result.find(Fault.SEAL_CHANGED, record)
+        result.sealed_signed = bool(seal.signature)
+        if not seal.signature:
+            result.unsigned_behind += 1
+            return
+        result.signed += 1
+        result.keys.add(seal.public_key)
+        if self._verifier is not None and not self._verifier.holds(seal):
+            result.find(Fault.FALSE_SIGNATURE, record)
+        else:
+            result.unsigned_behind = 0
+
+
+def _numbers(first: int, last: int) -> str:
+    return f"record {first} is" if first == last else f"records {first} to {last} are"

@@ -1,0 +1,174 @@
+"""Replays one file from the state that it opens with, and compares byte by byte."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+
+from compensator.audit.findings import Difference, Field
+from compensator.audit.result import RecordingAudit
+from compensator.errors import CompensatorError, DataError
+from compensator.events import EventKind, Note, RecordingData, data_of, is_recorded
+from compensator.messages import Event, Offset, degraded, encode
+from compensator.reasons import Reason
+from compensator.recording.container import Contents
+from compensator.recording.reading import Record
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.replay import Step, apply, setup_of, step_of
+
+#: Reasons that the disk gives: only the offset itself shows that it was published before it was on disk.
+_DISK_REASONS = tuple((reason, f'"{reason}"'.encode()) for reason in (Reason.RECORDING_FAILED, Reason.RECORDING_LATE))
+#: So many removed recordings are believed of one event.
+_REMOVED = 1000
+
+
+class ReplayCheck:
+    """Replays the samples of one file.
+
+    Parameters
+    ----------
+    contents : Contents
+        Configuration, model and state that travel in the file.
+    result : RecordingAudit
+        Where samples and differences are entered.
+
+    Raises
+    ------
+    CompensatorError
+        If they cannot be used.
+    """
+
+    def __init__(self, contents: Contents, result: RecordingAudit) -> None:
+        self._contents, self._result = contents, result
+        self.compensation = Compensation(*setup_of(contents, result.file))
+        state = contents.attachments.get("state.json")
+        if state is not None:
+            try:
+                self.compensation.restore(state.data)
+            except CompensatorError as error:
+                raise DataError(f"{result.file}: state.json: {error}") from error
+        result.model = self.compensation.model.sha256
+        #: A sample of which the estimate or the offset is missing: a torn end, or a difference.
+        self._incomplete: Difference | None = None
+
+    def check(self, records: list[Record]) -> None:
+        """Replay one group.
+
+        Parameters
+        ----------
+        records : list of Record
+            Events, sample, estimate and offset, as they were written together.
+
+        Raises
+        ------
+        DataError
+            If a message is not what its schema says.
+        """
+        if self._incomplete is not None:
+            if not (records[0].topic == "seal" and b'"reason":"recovered"' in records[0].body):
+                self._count(self._incomplete)
+            self._incomplete = None
+        step = step_of(records, self._contents, self._result.file)
+        for event in step.events:
+            self._follow(event)
+        outcome = apply(self.compensation, step)
+        if isinstance(outcome, Outcome):
+            self._compare(step, outcome)
+        elif outcome is not None:
+            expected = self._as_published(outcome, step.records["offset"].data)
+            self._matches("offset", expected, step.records["offset"])
+
+    def finish(self) -> None:
+        """Enter what is known only at the end."""
+        if self._incomplete is not None:
+            self._count(self._incomplete)
+
+    def _follow(self, event: Event) -> None:
+        result = self._result
+        if event.kind == EventKind.START:
+            result.restarted = result.restarted or not result.samples
+        elif event.kind == EventKind.RECORDING and (data := data_of(event, RecordingData)) is not None:
+            if data.published_early is not None:
+                result.early_seqs.add(data.published_early)
+            result.removed += data.removed[:_REMOVED]
+
+    def _compare(self, step: Step, outcome: Outcome) -> None:
+        """Compare the messages of a sample; what differs first is enough."""
+        result, sample, records = self._result, outcome.sample, step.records
+        if result.samples:
+            result.skipped += max(0, sample.seq - result.last_seq - 1)
+        else:
+            result.first_seq, result.first_ns = sample.seq, sample.time_utc_ns
+        result.last_seq, result.last_ns = sample.seq, sample.time_utc_ns
+        result.samples += 1
+        offset = outcome.offset
+        if "offset" in records:
+            offset = self._as_published(offset, records["offset"].data)
+        for topic, message in (("sample", sample), ("estimate", outcome.estimate), ("offset", offset)):
+            record = records.get(topic)
+            if record is None:
+                nothing = Field(name="message", recorded=None, recomputed=msgspec.to_builtins(message))
+                self._incomplete = self._difference(topic, message, (nothing,))
+                return
+            if not self._matches(topic, message, record):
+                return
+        for note in outcome.notes:
+            if not any(is_recorded(note, event) for event in step.events):
+                self._count(self._difference("event", sample, (_missing_note(note, step.events),)))
+
+    def _as_published(self, expected: Offset, recorded: bytes) -> Offset:
+        """Return an offset with the reason of the disk where it was published with one."""
+        for reason, quoted in _DISK_REASONS:
+            if quoted in recorded:
+                self._result.early_seqs.add(expected.seq)
+                return degraded(expected, reason)
+        return expected
+
+    def _matches(self, topic: str, message: Any, record: Record) -> bool:
+        recorded, recomputed = record.data, encode(message)
+        if recorded == recomputed:
+            return True
+        first = self._result.difference is None
+        fields = tuple(differing_fields(recorded, recomputed)) if first else ()
+        self._count(self._difference(topic, message, fields))
+        return False
+
+    def _difference(self, topic: str, message: Any, fields: tuple[Field, ...]) -> Difference:
+        seq, time_ns = message.seq, message.time_utc_ns
+        return Difference(file=self._result.file, topic=topic, seq=seq, time_utc_ns=time_ns, fields=fields)
+
+    def _count(self, difference: Difference) -> None:
+        self._result.differing += 1
+        if self._result.difference is None:
+            self._result.difference = difference
+
+
+def _missing_note(note: Note, events: list[Event]) -> Field:
+    """Return how a note differs from the event of its kind: by its data, or by its text where that has none."""
+    event = next((event for event in events if event.kind == note.kind), None)
+    if event is None or not event.data:
+        return Field(name=note.kind, recorded=event.text if event else None, recomputed=note.text)
+    return Field(name=note.kind, recorded=event.data, recomputed=msgspec.json.decode(msgspec.json.encode(note.data)))
+
+
+def differing_fields(recorded: bytes, recomputed: bytes) -> Iterator[Field]:
+    """Yield the fields in which two JSON messages differ, by their path."""
+    try:
+        there = msgspec.json.decode(recorded)
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        there = repr(recorded[:80])
+    found = list(_differing("", there, msgspec.json.decode(recomputed)))
+    if found:
+        yield from found
+    else:
+        yield Field(name="bytes", recorded=recorded.decode("utf-8", "replace"), recomputed=recomputed.decode())
+
+
+def _differing(name: str, recorded: Any, recomputed: Any) -> Iterator[Field]:
+    if isinstance(recorded, dict) and isinstance(recomputed, dict):
+        for key in [*recorded, *(key for key in recomputed if key not in recorded)]:
+            yield from _differing(f"{name}.{key}" if name else key, recorded.get(key), recomputed.get(key))
+    elif recorded != recomputed or type(recorded) is not type(recomputed):
+        yield Field(name=name or "message", recorded=recorded, recomputed=recomputed)

@@ -1,0 +1,146 @@
+"""What the audit of one file gives; its checks fill it in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from compensator.audit.findings import KEPT, Difference, End, Fault, Finding, Kind
+from compensator.recording.reading import Record
+
+
+@dataclass(slots=True, kw_only=True)
+class RecordingAudit:
+    """What the audit of one file gave.
+
+    Parameters
+    ----------
+    file : str
+        Name.
+    size : int
+        Bytes.
+    original, machine, began, previous_file : str
+        From its metadata: the name that it was begun with, the machine, why it began, the previous file.
+    previous, last : str
+        Value of the hash chain that it goes on from, and the one it hands on; empty where it has no chain.
+    end : End
+        How it ends.
+    findings, findings_count : list of Finding, int
+        What is wrong with the file, the first of it, and how much there is.
+    records : int
+        Records in the chain.
+    signed, unsigned_behind : int
+        Signed seals, and records behind the last of them.
+    keys : set of str
+        Public keys in the seals.
+    seal, sealed_signed : str, bool
+        Reason of the seal that is the last record, empty where there is none, and whether it is signed.
+    samples, skipped : int
+        Samples that were replayed, and samples between them that were not recorded.
+    first_seq, last_seq, first_ns, last_ns : int
+        Numbers and times of the first and last sample.
+    restarted : bool
+        Whether the service started with this file.
+    differing, difference : int, Difference or None
+        Samples that the replay does not reproduce, and the first of them.
+    early_seqs : set of int
+        Samples whose offset was published before it was on disk.
+    removed : list of str
+        Recordings that its events name as removed by the limit of what is kept.
+    not_replayed : str
+        Why its samples could not be replayed; empty where they were.
+    identity, model : str
+        Hash over configuration and model, and that of the model.
+    state_before, state_after : str
+        Hash of the state that it opens with, empty where there is none, and of the state after its last sample.
+    """
+
+    file: str
+    size: int = 0
+    original: str = ""
+    machine: str = ""
+    began: str = ""
+    previous_file: str = ""
+    previous: str = ""
+    last: str = ""
+    end: End = End.FINISHED
+    findings: list[Finding] = field(default_factory=list)
+    findings_count: int = 0
+    records: int = 0
+    signed: int = 0
+    unsigned_behind: int = 0
+    keys: set[str] = field(default_factory=set)
+    seal: str = ""
+    sealed_signed: bool = False
+    samples: int = 0
+    skipped: int = 0
+    first_seq: int = -1
+    last_seq: int = -1
+    first_ns: int = 0
+    last_ns: int = 0
+    restarted: bool = False
+    differing: int = 0
+    difference: Difference | None = None
+    early_seqs: set[int] = field(default_factory=set)
+    removed: list[str] = field(default_factory=list)
+    not_replayed: str = ""
+    identity: str = ""
+    model: str = ""
+    state_before: str = ""
+    state_after: str = ""
+
+    @property
+    def early(self) -> int:
+        """Number of offsets that were published before they were on disk."""
+        return len(self.early_seqs)
+
+    def find(
+        self,
+        fault: Fault,
+        at: Record | None = None,
+        *,
+        topic: str = "",
+        sequence: int | None = None,
+        time_utc_ns: int | None = None,
+        **figures: Any,
+    ) -> None:
+        """Keep a finding, or count it where there are many.
+
+        Parameters
+        ----------
+        fault : Fault
+            What is wrong.
+        at : Record, optional
+            Where.
+        topic, sequence, time_utc_ns
+            Where it is in no single record.
+        **figures
+            What the sentence of the fault names.
+        """
+        if at is not None:
+            topic, sequence, time_utc_ns = at.topic, at.sequence, at.log_time_ns
+        self.findings_count += 1
+        if len(self.findings) < KEPT:
+            self.findings.append(
+                Finding(
+                    kind=fault.kind,
+                    file=self.file,
+                    text=fault.sentence.format(**figures),
+                    topic=topic,
+                    sequence=sequence,
+                    time_utc_ns=time_utc_ns,
+                )
+            )
+
+    def pair_moved(self) -> None:
+        """Turn a record that is missing in one place and too many in another into one that was moved."""
+        missing = {(f.topic, f.sequence) for f in self.findings if f.kind == Kind.REMOVED and f.topic}
+        moved = set()
+        for i, finding in enumerate(self.findings):
+            place = (finding.topic, finding.sequence)
+            if finding.kind == Kind.INSERTED and place in missing:
+                self.findings[i] = replace(finding, kind=Fault.MOVED.kind, text=Fault.MOVED.sentence)
+                moved.add(place)
+        kept = [f for f in self.findings if f.kind != Kind.REMOVED or (f.topic, f.sequence) not in moved]
+        self.findings_count -= len(self.findings) - len(kept)
+        self.findings = kept

@@ -1,0 +1,200 @@
+"""Events: their kinds, the data of each, and how programs read them.
+
+`Event.text` is one line for people, whose words may change. Programs read `kind` and `data` alone. Version
+0.1.0 recorded some events with a text only; what is needed to read those stands at the end of this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import msgspec
+
+from compensator.messages import Event
+
+
+class EventKind(StrEnum):
+    """Kinds of events, as they stand in `Event.kind`."""
+
+    START = "start"
+    STOP = "stop"
+    #: What the service found on disk at its start, and the pause since then (`PauseData`).
+    RESTART = "restart"
+    #: A new state, or new reasons.
+    STATE = "state"
+    #: A zero was set (`ZeroData`).
+    ZERO = "zero"
+    #: A command that acts with the sample of the same number, see `command_of`.
+    COMMAND = "command"
+    COMMAND_REFUSED = "command_refused"
+    #: Another model was taken over or refused.
+    ADOPT = "adopt"
+    #: A device stopped answering, or answers again.
+    DEVICE = "device"
+    #: The wall clock was set.
+    CLOCK = "clock"
+    #: What happened to the recording (`RecordingData`).
+    RECORDING = "recording"
+    #: Sensors that contradict each other or the model, see `Implausibility`.
+    PLAUSIBILITY = "plausibility"
+    #: An internal error; the offset is held.
+    ERROR = "error"
+
+
+class Note(NamedTuple):
+    """An event before it gets its number and time.
+
+    Parameters
+    ----------
+    kind : EventKind
+        Its kind.
+    text : str
+        One line for people.
+    data : mapping of str to Any
+        What programs read.
+    """
+
+    kind: EventKind
+    text: str
+    data: Mapping[str, Any]
+
+
+class _Data(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Data of one kind of event."""
+
+    def table(self) -> dict[str, Any]:
+        """Return it as it stands in `Event.data`."""
+        table: dict[str, Any] = msgspec.to_builtins(self)
+        return table
+
+
+class ZeroData(_Data, frozen=True, kw_only=True):
+    """A zero that was set: on a machine at rest or a warm one, T_Q, AT (°C) and Y (µm) at that time."""
+
+    mode: Literal["rest", "warm"]
+    t_q_degc: float
+    at_degc: float
+    y_um: float | None
+
+
+class PauseData(_Data, frozen=True, kw_only=True):
+    """The pause before the first sample of a service.
+
+    Parameters
+    ----------
+    missing : int or None
+        Number of samples that were not taken; None where it is unknown.
+    minutes : float or None
+        The same, min.
+    bridged : bool
+        Whether the pause is short enough to be interpolated.
+    y_std_um : float or None
+        Standard deviation of the prediction after it, µm.
+    """
+
+    missing: int | None
+    minutes: float | None
+    bridged: bool
+    y_std_um: float | None
+
+
+class RecordingCode(StrEnum):
+    """What happened to the recording."""
+
+    DISK_FAILED = "disk_failed"
+    DISK_LATE = "disk_late"
+    DISK_BACK = "disk_back"
+    RECOVERED = "recovered"
+    REMOVED = "removed"
+    NOT_COMPACTED = "not_compacted"
+    NOT_REMOVED = "not_removed"
+    NOT_FINISHED = "not_finished"
+
+
+class RecordingData(_Data, frozen=True, kw_only=True):
+    """What happened to the recording.
+
+    Parameters
+    ----------
+    code : RecordingCode, optional
+        What it is; version 0.1.0 did not record it.
+    published_early : int, optional
+        Number of a sample whose offset was published while it was being written.
+    reason : str, optional
+        Reason with which that offset was published.
+    lost : int, optional
+        Samples that were given up before the disk took the recording again.
+    file : str, optional
+        The recording.
+    removed : list of str
+        Recordings that were removed by the limit of what is kept.
+    bytes : int, optional
+        Their size.
+    """
+
+    code: RecordingCode | None = None
+    published_early: int | None = None
+    reason: str = ""
+    lost: int | None = None
+    file: str = ""
+    removed: list[str] = []
+    bytes: int | None = None
+
+    @property
+    def is_resolved(self) -> bool:
+        """Whether nothing has to be done about it."""
+        if self.code is None:
+            return self.lost is not None or bool(self.removed)
+        return self.code in (RecordingCode.DISK_BACK, RecordingCode.RECOVERED, RecordingCode.REMOVED)
+
+
+class Implausibility(StrEnum):
+    """What the plausibility checks found, `code` in the data of such an event."""
+
+    EXCHANGED = "exchanged"
+    APART = "apart"
+    TOGETHER = "together"
+    RESIDUAL = "residual"
+    RESIDUAL_OVER = "residual_over"
+
+
+_AnyData = TypeVar("_AnyData", bound=_Data)
+
+
+def data_of(event: Event, kind: type[_AnyData]) -> _AnyData | None:
+    """Return the data of an event, None where they are not of this kind.
+
+    Examples
+    --------
+    >>> event = Event(schema=1, machine="a", seq=1, time_utc_ns=0, kind="recording", text="", data={"lost": 3})
+    >>> data_of(event, RecordingData).lost, data_of(event, ZeroData)
+    (3, None)
+    """
+    try:
+        return msgspec.convert(event.data, kind)
+    except msgspec.ValidationError:
+        return None
+
+
+def command_of(event: Event) -> str:
+    """Return the name of the command that an event records.
+
+    Version 0.1.0 recorded the name as the text alone.
+    """
+    name = event.data.get("command")
+    return name if isinstance(name, str) else event.text
+
+
+def is_recorded(note: Note, event: Event) -> bool:
+    """Tell whether a recorded event carries what a note carries.
+
+    Version 0.1.0 recorded zeros and implausibilities without data: there the texts are compared, so these two kinds
+    of note keep the wording of that version.
+    """
+    if event.kind != note.kind:
+        return False
+    if not event.data:
+        return event.text == note.text
+    return msgspec.json.encode(event.data) == msgspec.json.encode(note.data)

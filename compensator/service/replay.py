@@ -1,0 +1,298 @@
+"""Replay: recorded samples through a compensation again.
+
+The audit, the comparison with another model, the restart and the warm-up of another model read and run recordings here.
+`apply` does what the service did with one group of records. This is enough where the state comes from the file: each
+file opens with the state before its first sample, after any pause. `FreeRun` is for a compensation of another model,
+whose state is in no file: it passes the pauses as well.
+
+A pause is a number of samples that the compensation did not get. Time does not measure it: the wall clock may be set
+and the computer may sleep, and the service passes no pause for either. A pause is therefore
+
+- at the start of a service, what that start recorded (`PauseData`), which may be a pause of unknown length;
+- else the numbers missing between two samples; a number that a held offset carries is not missing;
+- where files between two others were not given, the time between them: numbers do not follow it across restarts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from compensator.clock import NS
+from compensator.config import Config, parse_config
+from compensator.errors import DataError
+from compensator.events import EventKind, PauseData, command_of, data_of
+from compensator.messages import EstimateMessage, Event, Offset, Sample
+from compensator.model.model_file import parse_model
+from compensator.model.thermal_model import ThermalModel
+from compensator.recording.container import Container, Contents, Damaged
+from compensator.recording.reading import Record, decode_with, groups_of
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.state import ZeroMode
+
+_SAMPLE, _EVENT = msgspec.json.Decoder(Sample), msgspec.json.Decoder(Event)
+_ESTIMATE, _OFFSET = msgspec.json.Decoder(EstimateMessage), msgspec.json.Decoder(Offset)
+
+
+@dataclass(slots=True)
+class Step:
+    """One recorded group: a sample and what followed from it, or an offset that was held without a sample.
+
+    Parameters
+    ----------
+    file : str
+        Name of the file.
+    run : dict of str to str
+        Metadata of the file.
+    records : dict of str to Record
+        `sample`, `estimate` and `offset`, as far as they are there; a torn end lacks some.
+    events : list of Event
+        Events. Those of smaller numbers were held back by a full disk and are in the state of the file already.
+    sample : Sample or None
+        The sample; None in a held offset, and in events alone.
+    """
+
+    file: str
+    run: dict[str, str]
+    records: dict[str, Record]
+    events: list[Event]
+    sample: Sample | None
+
+    @property
+    def estimate(self) -> EstimateMessage | None:
+        """What the model made of the sample."""
+        record = self.records.get("estimate")
+        return None if record is None else decode_with(_ESTIMATE, record, self.file)
+
+    @property
+    def offset(self) -> Offset | None:
+        """What was published."""
+        record = self.records.get("offset")
+        return None if record is None else decode_with(_OFFSET, record, self.file)
+
+    @property
+    def zero(self) -> ZeroMode | None:
+        """How a zero was set with this sample, None where none was."""
+        sample = self.sample
+        if sample is None or not any(e.kind == EventKind.ZERO and e.seq == sample.seq for e in self.events):
+            return None
+        estimate = self.estimate
+        return None if estimate is None else "rest" if estimate.y_base_um == 0.0 else "warm"
+
+
+def step_of(records: Sequence[Record], contents: Contents, file: str) -> Step:
+    """Read one group of records.
+
+    Raises
+    ------
+    DataError
+        If its sample or an event is not what the schema says.
+    """
+    found, events = {}, []
+    for record in records:
+        if record.topic == "event":
+            events.append(decode_with(_EVENT, record, file))
+        else:
+            found[record.topic] = record
+    sample = decode_with(_SAMPLE, found["sample"], file) if "sample" in found else None
+    return Step(file, contents.metadata.get("run", {}), found, events, sample)
+
+
+def steps_in(container: Container) -> Iterator[Step]:
+    """Yield the groups of a recording as far as it can be read; what is whole in a torn group comes last.
+
+    Raises
+    ------
+    DataError
+        If it is no recording of ours.
+    """
+    with suppress(Damaged):
+        for records, _, _ in groups_of(container):
+            if records:
+                yield step_of(records, container.contents, container.path.name)
+
+
+def steps_of(path: Path) -> Iterator[Step]:
+    """Yield the groups of a recording, see `steps_in`."""
+    with Container(path) as container:
+        yield from steps_in(container)
+
+
+def opening_of(path: Path) -> dict[str, bytes]:
+    """Return the attachments of a recording by name; none where it is torn before them.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file.
+    """
+    with Container(path) as container:
+        return {name: attachment.data for name, attachment in container.survey(whole=False).attachments.items()}
+
+
+def setup_of(contents: Contents, file: str) -> tuple[Config, ThermalModel]:
+    """Return configuration and model that travel in a recording.
+
+    Raises
+    ------
+    CompensatorError
+        If one of them is not there or cannot be used; the line names file and attachment.
+    """
+    config = parse_config(_attachment(contents, "config.toml", file), source=f"{file}: config.toml")
+    model = parse_model(_attachment(contents, "model.toml", file), source=f"{file}: model.toml")
+    if config.model.alternative:
+        model = model.with_alternative(config.model.alternative)
+    return config, model
+
+
+def _attachment(contents: Contents, name: str, file: str) -> bytes:
+    found = contents.attachments.get(name)
+    if found is None:
+        there = ", ".join(contents.attachments) or "none"
+        raise DataError(f"{file}: attachment {name} is missing, there is: {there}; a replay needs it")
+    return found.data
+
+
+# ---------------------------------------------------------------------- what the service did
+
+
+def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
+    """Execute a command, live or recorded; `adopt` and `back` are not the compensation's own and change nothing."""
+    if name == "zero":
+        mode = arguments.get("mode", "auto")
+        compensation.zero(mode if mode in ("auto", "rest", "warm") else "auto")
+    elif name == "hold":
+        compensation.hold()
+    elif name == "resume":
+        compensation.resume()
+
+
+def apply(
+    compensation: Compensation, step: Step, *, commands: bool = True, since: int | None = None
+) -> Outcome | Offset | None:
+    """Do what the service did with one recorded group: commands and errors of its number, then the sample.
+
+    Parameters
+    ----------
+    compensation : Compensation
+        In the state before the group.
+    step : Step
+        The group.
+    commands : bool
+        Whether commands and errors count.
+    since : int, optional
+        Lowest number of the events that count; by default that of the group itself.
+
+    Returns
+    -------
+    Outcome or Offset or None
+        What follows from the sample; the offset that is held where the group has no sample; None for events alone.
+
+    Raises
+    ------
+    DataError
+        If a message is not what the schema says, or the sample lacks a configured channel.
+    """
+    sample = step.sample
+    held = step.offset if sample is None else None
+    if sample is None and held is None:
+        return None
+    if commands and step.events:
+        seq = (sample or held).seq  # type: ignore[union-attr]
+        for event in step.events:
+            if not (seq if since is None else since) <= event.seq <= seq:
+                continue
+            if event.kind == EventKind.COMMAND:
+                execute(compensation, command_of(event), event.data)
+            elif event.kind == EventKind.ERROR:
+                compensation.fail()
+    if sample is None:
+        assert held is not None
+        return compensation.held(held.machine, held.seq, held.time_utc_ns)
+    try:
+        return compensation.process(_as_measured(sample))
+    except (KeyError, AttributeError, TypeError) as error:
+        raise DataError(
+            f"{step.file}: /sample {sample.seq}: {type(error).__name__} {error}; expected the configured channels"
+        ) from error
+
+
+def _as_measured(sample: Sample) -> Sample:
+    """Return a recorded sample as the devices gave it, without the verdicts of the guards."""
+    channels = sample.channels
+    for channel in channels.values():
+        if channel.quality != channel.device_quality:
+            break
+    else:
+        return sample
+    replace = msgspec.structs.replace
+    return replace(sample, channels={k: replace(c, quality=c.device_quality) for k, c in channels.items()})
+
+
+# ---------------------------------------------------------------------- another model
+
+
+class FreeRun:
+    """Runs one file after the other through a compensation whose state they do not carry.
+
+    Parameters
+    ----------
+    compensation : Compensation
+        Before the first of the samples.
+    """
+
+    def __init__(self, compensation: Compensation) -> None:
+        self.compensation = compensation
+        #: Number and time of the last sample or held offset, −1 and 0 before the first.
+        self.seq, self.time_ns = -1, 0
+        self._file = ""
+        #: Offset before a sample of a torn end, whose own offset was not published.
+        self._before_torn_um: float | None = None
+
+    def run(self, step: Step, *, commands: bool = True) -> Outcome | Offset | None:
+        """Run the next group, after the pause before it; see `apply`.
+
+        Raises
+        ------
+        DataError
+            Also if the sample is not as long as those of the model.
+        """
+        sample, compensation = step.sample, self.compensation
+        if sample is not None:
+            period_s = compensation.model.period_s
+            if sample.period_s != period_s:
+                raise DataError(
+                    f"{step.file}: samples of {sample.period_s:g} s, expected those of the model, {period_s:g} s"
+                )
+            if self._before_torn_um is not None:
+                compensation.go_on_from(self._before_torn_um, model_changed=compensation.is_under_way)
+            if self.seq >= 0:
+                self._pass_pause(step, sample)
+            self._before_torn_um = compensation.offset_um if "offset" not in step.records else None
+        result = apply(compensation, step, commands=commands, since=self.seq + 1 if self.seq >= 0 else None)
+        self._file = step.run.get("file", step.file)
+        if isinstance(result, Outcome):
+            self.seq, self.time_ns = result.sample.seq, result.sample.time_utc_ns
+        elif result is not None and self.seq >= 0:
+            self.seq, self.time_ns = result.seq, result.time_utc_ns
+        return result
+
+    def _pass_pause(self, step: Step, sample: Sample) -> None:
+        if self._file not in (step.run.get("file", step.file), step.run.get("previous_file")):
+            self.compensation.pause(round((sample.time_utc_ns - self.time_ns) / (sample.period_s * NS)) - 1)
+            return
+        for event in step.events:
+            pause = data_of(event, PauseData) if event.kind == EventKind.RESTART else None
+            if pause is not None and pause.missing is None:
+                self.compensation.pause_of_unknown_length()
+                return
+            if pause is not None:
+                # Noted with the first sample of that start; what a full disk never took comes on top.
+                self.compensation.pause((pause.missing or 0) + sample.seq - event.seq)
+                return
+        self.compensation.pause(sample.seq - self.seq - 1)
