@@ -1,7 +1,7 @@
-"""TLS files looked into before they are used: Zenoh says no more of a bad one than that it cannot connect.
+"""TLS files are checked before they are used: with a bad one Zenoh reports only that it cannot connect.
 
-What is inside a certificate is read with the package `cryptography` (extra `tls`); without it only that the
-files are there, and who can read them, is checked.
+Certificates are read with the package `cryptography` (extra `tls`); without it only the presence and the permissions
+of the files are checked.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from compensator.errors import ConfigError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
+from compensator.remarks import ServiceWarning
 
-#: A certificate that ends within so many days is said.
+#: Days before its end from which on a certificate is warned of.
 SOON_DAYS = 30.0
-MISSING = "certificates are not looked into without the package cryptography: pip install quill-compensator[tls]"
+MISSING = "certificates are not checked without the package cryptography: pip install quill-compensator[tls]"
 
 
 class TlsFiles(NamedTuple):
@@ -28,7 +29,7 @@ class TlsFiles(NamedTuple):
     ca, certificate, key : pathlib.Path
         Authority of the other side, own certificate, own private key; PEM.
     names : tuple of str
-        How the configuration calls the three.
+        Their keys in the configuration.
     """
 
     ca: Path
@@ -38,12 +39,12 @@ class TlsFiles(NamedTuple):
 
 
 class Certificate(NamedTuple):
-    """What stands in a certificate.
+    """Content of a certificate.
 
     Parameters
     ----------
     common_name : str
-        Who it is of.
+        Its owner.
     begins, ends : datetime.datetime
         When it is valid, UTC.
     """
@@ -53,7 +54,7 @@ class Certificate(NamedTuple):
     ends: datetime.datetime
 
     def wrong_at(self, now: datetime.datetime) -> str | None:
-        """Return in words why it cannot be used at a time, None where it can."""
+        """Return why it cannot be used at a time, None if it can."""
         if now > self.ends:
             return f"certificate of {self.common_name!r} has expired on {self.ends:%Y-%m-%d %H:%M} UTC"
         if now < self.begins:
@@ -62,7 +63,7 @@ class Certificate(NamedTuple):
 
 
 def check_files(source: str, files: TlsFiles) -> Certificate | None:
-    """Check that the files are there, belong together and that nobody else can read the key.
+    """Check that the files exist and belong together, and that only the owner can read the key.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ def check_files(source: str, files: TlsFiles) -> Certificate | None:
     Returns
     -------
     Certificate or None
-        The own certificate, whether valid now or not; None without the package `cryptography`.
+        The own certificate, valid now or not; None without the package `cryptography`.
 
     Raises
     ------
@@ -120,17 +121,19 @@ def common_name_of(path: Path) -> str:
     return _common_name(_read(str(path), "certificate", path, x509.load_pem_x509_certificates)[0])
 
 
-def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[Caution]:
-    """Return what is to be said of a certificate that can be used."""
+def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[Remark]:
+    """Return warnings about a usable certificate."""
     if certificate is None:
-        return [Caution("certificates_unread", "Certificates are not looked into without the package cryptography.")]
+        return [
+            Remark(ServiceWarning.CERTIFICATES_UNREAD, "Certificates are not checked without the package cryptography.")
+        ]
     days = (certificate.ends - now).total_seconds() / 86400.0
     if days >= SOON_DAYS:
         return []
     figures = (
         f"The certificate of {certificate.common_name!r} ends on {certificate.ends:%Y-%m-%d}, in {days:.0f} day(s)."
     )
-    return [Caution("certificate_ends", figures)]
+    return [Remark(ServiceWarning.CERTIFICATE_ENDS, figures)]
 
 
 def _read(source: str, name: str, path: Path, load: Callable[[bytes], Any]) -> Any:

@@ -17,13 +17,13 @@ class Clock(Protocol):
         """Return the wall clock, ns since 1970 UTC. It may be set back or forward."""
 
     def monotonic_ns(self) -> int:
-        """Return a clock that nobody sets, ns."""
+        """Return a clock that is never set, ns."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait."""
 
     async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
-        """Wait until the tasks are done, or for a while; the tasks go on."""
+        """Wait until the tasks are done, or for a while; the tasks continue."""
 
 
 class SystemClock:
@@ -48,17 +48,17 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock that stands still while work is done and leaps when somebody sleeps.
+    """A clock that stands still during work and jumps ahead on `sleep`.
 
-    Only one task may sleep on it, the sampling loop. What it waits for with `settle` runs in real time, each
-    task within its own limit, and virtual time stands still meanwhile.
+    Only one task may sleep on it, the sampling loop. What it awaits with `settle` runs in real time, within its own
+    limits, while virtual time stands still.
 
     Parameters
     ----------
     start_utc_ns : int
         Where it starts, ns since 1970 UTC.
     on_advance : callable, optional
-        Awaited with the seconds since the start whenever the time has moved: the simulated machine moves there.
+        Awaited with the seconds since the start whenever time has advanced, to advance a simulated machine.
     """
 
     def __init__(self, start_utc_ns: int, on_advance: Callable[[float], Awaitable[None]] | None = None) -> None:
@@ -80,7 +80,7 @@ class VirtualClock:
         self._step_ns += round(by_s * NS)
 
     async def sleep(self, seconds: float) -> None:
-        """Leap ahead."""
+        """Jump ahead."""
         self._elapsed_ns += max(round(seconds * NS), 0)
         if self._on_advance is not None:
             await self._on_advance(self._elapsed_ns / NS)

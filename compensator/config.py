@@ -1,11 +1,10 @@
 """The configuration of the service: one TOML file, units in the keys, an unknown key is an error.
 
-Physical limits have no default: whoever commissions the machine states them.
+Physical limits have no default: they are set when the machine is commissioned.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 import tomllib
 from pathlib import Path
@@ -25,7 +24,7 @@ ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 UNIT_SUFFIX = {"degc": "_degc", "um": "_um", "v": "_v", "rpm": "_rpm", "w": "_w"}
 
 _LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):")
-#: Transports on which a certificate says who is there.
+#: Transports on which participants authenticate by certificates.
 _SECURED = ("tls/", "quic/")
 _TLS_KEYS = ("tls_ca", "tls_certificate", "tls_key")
 
@@ -35,7 +34,7 @@ class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Machine(_Table, frozen=True, kw_only=True):
-    """`[machine]`: the name that stands in every message and file."""
+    """`[machine]`: the name in every message and file."""
 
     name: Name
 
@@ -43,8 +42,7 @@ class Machine(_Table, frozen=True, kw_only=True):
 class ModelChoice(_Table, frozen=True, kw_only=True):
     """`[model]`: a model file (relative to the configuration) or `quill`.
 
-    `store`: folder of the models that were adopted, relative to the configuration; `models` in the recording folder
-    where none is given.
+    `store`: folder of adopted models, relative to the configuration; by default `models` in the recording folder.
     """
 
     file: str
@@ -53,16 +51,16 @@ class ModelChoice(_Table, frozen=True, kw_only=True):
 
 
 class Sampling(_Table, frozen=True, kw_only=True):
-    """`[sampling]`: how often devices are asked, and how many readings make a sample."""
+    """`[sampling]`: how often devices are polled, and how many readings make a sample."""
 
     poll_interval_s: Positive = 1.0
     min_good_fraction: Annotated[float, Meta(gt=0, le=1)] = 0.5
 
 
 class Channel(_Table, frozen=True, kw_only=True):
-    """`[[channel]]`: one measured quantity, and what is plausible for it.
+    """`[[channel]]`: one measured quantity and its plausible values.
 
-    The guards are optional for auxiliary channels and required for T_Q, AT and Y.
+    The limits are optional for auxiliary channels and required for T_Q, AT and Y.
     """
 
     name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
@@ -87,7 +85,7 @@ class Validity(_Table, frozen=True, kw_only=True):
 
 
 class Limits(_Table, frozen=True, kw_only=True):
-    """`[limits]`: what the offset may do."""
+    """`[limits]`: limits of the offset."""
 
     offset_max_um: Positive
     offset_rate_max_um_per_min: Positive
@@ -103,7 +101,7 @@ class Loss(_Table, frozen=True, kw_only=True):
 class Zero(_Table, frozen=True, kw_only=True):
     """`[zero]`: when and how the references are set.
 
-    `rest_rate_um_per_min`: a machine that grows slower than this counts as at rest when it is zeroed.
+    `rest_rate_um_per_min`: a machine that grows more slowly than this counts as at rest at the zero.
     """
 
     rest_rate_um_per_min: Positive
@@ -111,10 +109,9 @@ class Zero(_Table, frozen=True, kw_only=True):
 
 
 class Restart(_Table, frozen=True, kw_only=True):
-    """`[restart]`: how a service goes on after an end.
+    """`[restart]`: how a service continues after an interruption.
 
-    `bridge_max_min`: longest time without the service that is interpolated; the model's slowest time constant where
-    none is given.
+    `bridge_max_min`: longest interruption that is interpolated; by default the model's slowest time constant.
     """
 
     bridge_max_min: Positive | None = None
@@ -123,7 +120,7 @@ class Restart(_Table, frozen=True, kw_only=True):
 class Rest(_Table, frozen=True, kw_only=True):
     """`[plausibility.rest]`: when nothing heats the machine, and how far T_Q and AT may then be apart.
 
-    `channel`: what tells it, such as `heat_w` or `spindle_rpm`; at or below `at_most` for `after_min` counts as rest.
+    `channel`: such as `heat_w` or `spindle_rpm`; at or below `at_most` for `after_min` the machine is at rest.
     `t_q_at_max_k`: largest change of T_Q − AT since the zero after such a rest.
     """
 
@@ -138,8 +135,8 @@ class Plausibility(_Table, frozen=True, kw_only=True):
 
     `t_q_below_at_after_min`: T_Q below AT by more than `guards.t_q_below_at_max_k` for so long means exchanged sensors.
     `false_alarm_days`: mean time between two false alarms of the residual. `residual_std_um`: standard deviation of the
-    residual of the healthy machine, the model's own where none is given; `residual_correlation_min`: for how long its
-    errors hang together. `residual_hold_um`: a suspicious residual beyond this holds the offset.
+    residual of the healthy machine, by default the model's own; `residual_correlation_min`: its correlation time.
+    `residual_hold_um`: during an alarm, a residual beyond this holds the offset.
     """
 
     t_q_below_at_after_min: Positive | None = None
@@ -151,12 +148,12 @@ class Plausibility(_Table, frozen=True, kw_only=True):
 
 
 class Zenoh(_Table, frozen=True, kw_only=True):
-    """`[zenoh]`: where the offset goes. Nothing is listened on unless it stands here.
+    """`[zenoh]`: where the offset is published. The service listens only on endpoints that are given here.
 
-    `tls_ca`, `tls_certificate`, `tls_key`: the authority that the router's certificate is of, the machine's own
-    certificate and its key, PEM, relative to the configuration. With them the service connects to a router only, and a
-    command counts as its sender's by what the router's access list lets through. `unproven_commands`: take commands of
-    which nobody proves who sent them; where nothing is said, on loopback without TLS only.
+    `tls_ca`, `tls_certificate`, `tls_key`: the authority of the router's certificate, the machine's own certificate and
+    its key, PEM, relative to the configuration. With them the service connects to a router only, whose access list
+    authenticates the senders of commands. `unproven_commands`: accept commands of senders that are not authenticated;
+    by default only on loopback without TLS.
     """
 
     prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$")]
@@ -169,20 +166,20 @@ class Zenoh(_Table, frozen=True, kw_only=True):
     unproven_commands: bool | None = None
 
     def secured(self) -> bool:
-        """Tell whether both sides of every link prove who they are."""
+        """Return whether both sides of every link are authenticated."""
         return self.tls_key is not None
 
     def on_loopback(self) -> bool:
-        """Tell whether nobody outside this computer is spoken with."""
+        """Return whether all endpoints are on this computer."""
         return all(self.is_loopback(endpoint) for endpoint in self.listen + self.connect)
 
     @staticmethod
     def is_loopback(endpoint: str) -> bool:
-        """Tell whether an endpoint is on this computer only."""
+        """Return whether an endpoint is on this computer."""
         return _LOOPBACK.match(endpoint) is not None
 
-    def takes_unproven(self) -> bool:
-        """Tell whether a command is taken of which nobody proves who sent it."""
+    def accepts_unproven(self) -> bool:
+        """Return whether commands are accepted whose sender is not authenticated."""
         if self.unproven_commands is not None:
             return self.unproven_commands
         return self.on_loopback() and not self.secured()
@@ -192,8 +189,8 @@ class Recording(_Table, frozen=True, kw_only=True):
     """`[recording]`: folder of the MCAP files, relative to the configuration.
 
     `keep_days`, `keep_mb`: finished files beyond that age, or beyond that size of all of them, are removed, the oldest
-    first; everything is kept where nothing is said. `signing_key`: Ed25519 private key, PEM, that seals are signed
-    with; it stands outside the folder.
+    first; by default everything is kept. `signing_key`: Ed25519 private key, PEM, that signs the seals; it must be
+    outside the folder.
     """
 
     folder: str
@@ -222,7 +219,7 @@ class Config(_Table, frozen=True, kw_only=True):
 
 
 class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
-    """A configuration with where it came from.
+    """A configuration with its file.
 
     Parameters
     ----------
@@ -231,22 +228,19 @@ class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
     path : pathlib.Path
         The file.
     data : bytes
-        Its bytes, which travel in every recording.
-    sha256 : str
-        Their hash.
+        Its bytes, which are attached to every recording.
     """
 
     config: Config
     path: Path
     data: bytes
-    sha256: str
 
     def resolve(self, name: str) -> Path:
         """Return a path of the file relative to the file's folder."""
         return (self.path.parent / name).resolve()
 
     def store(self) -> Path:
-        """Return the folder of the models that were adopted."""
+        """Return the folder of adopted models."""
         store = self.config.model.store
         return self.resolve(store) if store is not None else self.resolve(self.config.recording.folder) / "models"
 
@@ -273,11 +267,11 @@ def load_config(path: str | Path) -> LoadedConfig:
     files = {key: getattr(config.zenoh, key) for key in _TLS_KEYS}
     files = {key: str((path.parent / name).resolve()) for key, name in files.items() if name is not None}
     config = msgspec.structs.replace(config, zenoh=msgspec.structs.replace(config.zenoh, **files))
-    return LoadedConfig(config=config, path=path, data=data, sha256=hashlib.sha256(data).hexdigest())
+    return LoadedConfig(config=config, path=path, data=data)
 
 
 def parse_config(data: bytes, *, source: str) -> Config:
-    """Make a configuration of the bytes of its file.
+    """Parse the bytes of a configuration file.
 
     Raises
     ------
@@ -335,7 +329,7 @@ def _check(config: Config) -> None:
     names = [channel.name for channel in config.channel]
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(f"channel: name {name!r} stands twice")
+            raise ConfigError(f"channel: name {name!r} occurs twice")
     for role in ("t_q_degc", "at_degc"):
         if role not in names:
             raise ConfigError(f"channel: no channel named {role!r}; the model needs it")
@@ -356,22 +350,22 @@ def _check_zenoh(zenoh: Zenoh) -> None:
     given = [key for key in _TLS_KEYS if getattr(zenoh, key) is not None]
     for endpoint in zenoh.listen + zenoh.connect:
         if bool(given) != endpoint.startswith(_SECURED) and endpoint in zenoh.connect:
-            expected = "tls/HOST:PORT with tls_ca, tls_certificate and tls_key" if given else "tls_ca, … beside it"
+            expected = "tls/HOST:PORT with tls_ca, tls_certificate and tls_key" if given else "with tls_ca, …"
             raise ConfigError(f"zenoh.connect: {endpoint!r}, expected {expected}")
         if endpoint.startswith(_SECURED) and endpoint in zenoh.listen:
             raise ConfigError(
-                f"zenoh.listen: {endpoint!r}, expected a router (`compensator router`): it has the list "
-                f"of who may do what, the service has none"
+                f"zenoh.listen: {endpoint!r}, expected a router (`compensator router`): it has an "
+                f"access list, the service has none"
             )
     if not given:
         return
     for key in _TLS_KEYS:
         if key not in given:
-            raise ConfigError(f"zenoh.{key}: missing beside {given[0]}")
+            raise ConfigError(f"zenoh.{key}: missing, expected with {given[0]}")
     if zenoh.listen or zenoh.mode == "router" or not zenoh.connect:
         raise ConfigError(
             "zenoh: with tls_key, expected connect alone, no listen and no mode router: whoever "
-            "connected to the service would speak with its certificate"
+            "connected to the service would use its certificate"
         )
 
 

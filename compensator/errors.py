@@ -6,7 +6,7 @@ CompensatorError            one line: file, row or key, value, what was expected
 ├── ConfigError             the configuration cannot be used                 exit code 2
 ├── ModelError              a model file or its dynamics cannot be used      exit code 2
 ├── DataError               a table or recording cannot be used              exit code 2
-└── ServiceError            the service cannot go on                         exit code 1
+└── ServiceError            the service cannot continue                      exit code 1
 ```
 
 Errors of devices are `drivers.DriverError`; the sampler turns them into qualities.
@@ -46,4 +46,4 @@ class DataError(CompensatorError):
 
 
 class ServiceError(CompensatorError):
-    """The service cannot go on."""
+    """The service cannot continue."""

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import resources
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
+
+from compensator.reasons import State
 
 NAN = float("nan")
 
 #: Version of the messages.
 SCHEMA = 1
-
-State = Literal["starting", "ok", "degraded", "hold", "fault"]
 
 
 class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):
@@ -296,7 +296,7 @@ MESSAGES: Mapping[str, type[msgspec.Struct]] = {
 
 def degraded(offset: Offset, reason: str) -> Offset:
     """Return an offset with one reason more; a state of `ok` becomes `degraded`."""
-    state: State = "degraded" if offset.state == "ok" else offset.state
+    state = State.DEGRADED if offset.state == State.OK else offset.state
     return msgspec.structs.replace(offset, state=state, reasons=[*offset.reasons, reason])
 
 
@@ -317,15 +317,16 @@ def schemas() -> dict[str, dict[str, Any]]:
     """Make the JSON Schema of every message from its class."""
     made = {}
     for name, message in MESSAGES.items():
-        schema = msgspec.json.schema(message)
-        definition = schema["$defs"].pop(message.__name__)
+        definitions = msgspec.json.schema(message)["$defs"]
+        definition = definitions.pop(message.__name__)
+        if "state" in definition["properties"]:  # its codes stand where they are used, not behind a reference
+            definition["properties"]["state"] = {"enum": definitions.pop(State.__name__)["enum"]}
         made[name] = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
-            "title": f"thermal.{name}",
             **definition,
-            "$defs": schema["$defs"],
+            "title": f"thermal.{name}",
+            "$defs": definitions,
         }
-        made[name]["title"] = f"thermal.{name}"
     return made
 
 

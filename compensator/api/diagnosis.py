@@ -27,7 +27,7 @@ from compensator.identify.summary import with_std
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -78,13 +78,13 @@ class DiagnosisResult:
         The base model with every deployable effect, as its file gives it back.
     diagnosis : Diagnosis
         Effects with their signals, residuals, errors before and after.
-    remarks : tuple of Caution
+    remarks : tuple of Remark
         What had to be corrected in the data.
     """
 
     model: ThermalModel
     diagnosis: Diagnosis
-    remarks: tuple[Caution, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
     @property
     def verdict(self) -> str:

@@ -22,7 +22,7 @@ from compensator.display import html_table
 from compensator.model.simulation import COLUMNS, Scores, csv_rows, scores
 from compensator.model.simulation import simulate as run_free
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -38,7 +38,7 @@ class SimulationResult(Mapping[str, Vector]):
         `t_s`, `heat_w`, `y_pred_um`, `y_std_um`, the share of each path; `y_um`, `residual_um` where Y was measured.
     records : int
         Number of stretches without a long gap.
-    remarks : tuple of Caution
+    remarks : tuple of Remark
         What had to be corrected in the data, and what makes the prediction doubtful.
     scores : Scores or None
         Fit, rms and peak to peak of the residual, where Y was measured.
@@ -46,7 +46,7 @@ class SimulationResult(Mapping[str, Vector]):
 
     columns: dict[str, Vector]
     records: int
-    remarks: tuple[Caution, ...]
+    remarks: tuple[Remark, ...]
     scores: Scores | None
 
     def __getitem__(self, name: str) -> Vector:
@@ -131,7 +131,7 @@ def simulate(model: ModelLike, data: Any, *, columns: Mapping[str, str] | None =
     """
     what = model_of(model)
     measured = measurements(data, "data", columns)
-    remarks: list[Caution] = []
+    remarks: list[Remark] = []
     parts = []
     for one in measured:
         gridded = one.at_period(what.period_s)
@@ -164,7 +164,7 @@ def _scores(parts: list[dict[str, Vector]]) -> Scores | None:
     return scores(_joined(parts, "y_um"), _joined(parts, "y_pred_um"))
 
 
-def doubts(source: str, model: ThermalModel, record: Record) -> list[Caution]:
+def doubts(source: str, model: ThermalModel, record: Record) -> list[Remark]:
     """Return what makes a prediction from these temperatures doubtful.
 
     Parameters
@@ -187,10 +187,10 @@ def doubts(source: str, model: ThermalModel, record: Record) -> list[Caution]:
         known = values[~np.isnan(values)]
         check_scale(source, name, values)
         if name == "t_q_degc" and known.size >= DEAD_SAMPLES and np.ptp(known) == 0.0:
-            found.append(Caution("stuck", f"{source}: {name} = {known[0]:g} in every row."))
+            found.append(Remark("stuck", f"{source}: {name} = {known[0]:g} in every row."))
         low, high = model.validity.get(name, (-np.inf, np.inf))
         outside = int(np.sum((known < low) | (known > high)))
         if outside:
             words = f"{source}: {name} lies outside {low:g} to {high:g} °C in {outside} of {known.size} samples."
-            found.append(Caution("outside_validity", words))
+            found.append(Remark("outside_validity", words))
     return found

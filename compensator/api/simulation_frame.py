@@ -11,7 +11,7 @@ import pandas
 from compensator.api.simulation import SimulationResult
 from compensator.data.frames import time_index
 from compensator.model.simulation import Scores
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 
 class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
@@ -43,7 +43,7 @@ class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
         return self.result.scores
 
     @property
-    def remarks(self) -> tuple[Caution, ...]:
+    def remarks(self) -> tuple[Remark, ...]:
         """What had to be corrected in the data, and what makes the prediction doubtful."""
         return self.result.remarks
 

@@ -14,7 +14,7 @@ from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind
 from compensator.messages import EstimateMessage, Offset, number
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.recording.container import Container, Contents
 from compensator.recording.reading import in_order
 from compensator.report.history import Spread
@@ -51,7 +51,7 @@ class Comparison:
         The other offset − the recorded one.
     samples : int
         Number of samples.
-    remarks : list of Caution
+    remarks : list of Remark
         What the figures depend on.
     """
 
@@ -63,7 +63,7 @@ class Comparison:
     left_after: Spread
     offsets: Spread
     samples: int
-    remarks: list[Caution]
+    remarks: list[Remark]
 
     def as_json(self) -> dict[str, Any]:
         """Return it as it stands in the result of `--json`."""
@@ -199,7 +199,7 @@ class _Run:
             f"{step.file}: begins on a running machine, of which the other model knows no more than the zero; "
             f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
         )
-        self._result.remarks.append(Caution("begins_running", figures))
+        self._result.remarks.append(Remark("begins_running", figures))
 
     def _compare(self, estimate: EstimateMessage, offset: Offset, outcome: Outcome) -> None:
         result, sample = self._result, outcome.sample

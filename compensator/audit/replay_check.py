@@ -12,14 +12,14 @@ from compensator.audit.result import RecordingAudit
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note, RecordingData, data_of, is_recorded
 from compensator.messages import Event, Offset, degraded, encode
+from compensator.reasons import Reason
 from compensator.recording.container import Contents
 from compensator.recording.reading import Record
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.recording_thread import FAILED, LATE
 from compensator.service.replay import Step, apply, setup_of, step_of
 
 #: Reasons that the disk gives: only the offset itself shows that it was published before it was on disk.
-_DISK_REASONS = tuple((reason, f'"{reason}"'.encode()) for reason in (FAILED, LATE))
+_DISK_REASONS = tuple((reason, f'"{reason}"'.encode()) for reason in (Reason.RECORDING_FAILED, Reason.RECORDING_LATE))
 #: So many removed recordings are believed of one event.
 _REMOVED = 1000
 

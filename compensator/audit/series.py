@@ -12,7 +12,7 @@ from typing import Any
 from compensator.audit.findings import Difference, End, Fault, Finding, utc
 from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.recording.chain import NOTHING
 from compensator.recording.signature import Verifier
 
@@ -33,7 +33,7 @@ class Audit:
         How many there are.
     difference : Difference, optional
         The first sample that the replay does not reproduce.
-    remarks : tuple of Caution
+    remarks : tuple of Remark
         What is worth knowing and not wrong.
     signed : bool
         Whether signatures were checked against a key.
@@ -43,7 +43,7 @@ class Audit:
     findings: tuple[Finding, ...]
     findings_count: int
     difference: Difference | None
-    remarks: tuple[Caution, ...]
+    remarks: tuple[Remark, ...]
     signed: bool
 
     @property
@@ -199,7 +199,7 @@ class _Series:
         self._signed = signed
         #: Findings of whole files; they stand before those within a file.
         self.own = {file.file: RecordingAudit(file=file.file) for file in files}
-        self.remarks: list[Caution] = []
+        self.remarks: list[Remark] = []
 
     def _find(self, fault: Fault, file: RecordingAudit, **figures: Any) -> None:
         self.own[file.file].find(fault, **figures)
@@ -210,25 +210,25 @@ class _Series:
         if file.original != name and _NAME.match(name):
             self._find(Fault.RENAMED, file, original=file.original)
         if file.not_replayed:
-            remark(Caution("not_worked_out", f"{name}: not all samples were replayed: {file.not_replayed}."))
+            remark(Remark("not_worked_out", f"{name}: not all samples were replayed: {file.not_replayed}."))
         if not file.last and file.end in (End.OPEN, End.TORN):
-            remark(Caution("torn", f"{name}: torn before anything was recorded."))
+            remark(Remark("torn", f"{name}: torn before anything was recorded."))
             return
         if file.end == End.RECOVERED:
-            remark(Caution("recovered", f"{name}: the service was killed; every whole record was kept."))
+            remark(Remark("recovered", f"{name}: the service was killed; every whole record was kept."))
         elif file.end in (End.OPEN, End.TORN):
             figures = f"{name}: has no end, still being written, or the service was killed"
             if self._newest[file.machine] == name:
                 figures += "; whether more was there shows the next file, which names the last value of this one"
             if file.end == End.TORN:
-                remark(Caution("torn", f"{figures}. It ends within a group of records."))
+                remark(Remark("torn", f"{figures}. It ends within a group of records."))
             else:
-                remark(Caution("open", f"{figures}. It ends behind a whole group of records."))
+                remark(Remark("open", f"{figures}. It ends behind a whole group of records."))
         if file.skipped:
-            remark(Caution("samples_missing", f"{name}: {file.skipped} sample(s) between others were not recorded."))
+            remark(Remark("samples_missing", f"{name}: {file.skipped} sample(s) between others were not recorded."))
         if file.early:
             figures = f"{file.early} offset(s) were published before they were on disk, which was slow or failed"
-            remark(Caution("published_early", f"{name}: {figures}."))
+            remark(Remark("published_early", f"{name}: {figures}."))
         self._check_signatures(file)
 
     def _check_signatures(self, file: RecordingAudit) -> None:
@@ -240,10 +240,10 @@ class _Series:
                 self._find(Fault.NOTHING_SIGNED, file)
             elif file.unsigned_behind:
                 figures = f"{name}: {file.unsigned_behind} record(s) behind the last signature."
-                remark(Caution("unsigned_behind", figures))
+                remark(Remark("unsigned_behind", figures))
         elif file.signed:
             keys = ", ".join(key[:16] for key in sorted(file.keys))
-            remark(Caution("signature_not_checked", f"{name}: signed by {keys}…, not checked (no --public-key)."))
+            remark(Remark("signature_not_checked", f"{name}: signed by {keys}…, not checked (no --public-key)."))
 
     def check_link(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
         """Check what links a file to the one before it."""
@@ -259,7 +259,7 @@ class _Series:
             self._check_state(before, after)
         elif not after.previous_file:
             figures = f"{after.file}: begins a new chain; it states that no recording was there before it."
-            self.remarks.append(Caution("begins_new_chain", figures))
+            self.remarks.append(Remark("begins_new_chain", figures))
         else:
             self._explain_break(before, after)
 
@@ -279,7 +279,7 @@ class _Series:
         if file.previous != NOTHING.hex() or file.previous_file:
             removed = file.previous_file in self._removed
             lost = "which the limit of what is kept removed" if removed else "not given here"
-            self.remarks.append(Caution("before_not_given", f"{file.file}: begins after {file.previous_file}, {lost}."))
+            self.remarks.append(Remark("before_not_given", f"{file.file}: begins after {file.previous_file}, {lost}."))
 
     def _check_state(self, before: RecordingAudit, after: RecordingAudit) -> None:
         """Check that in one run a file opens with the state in which the one before ended."""

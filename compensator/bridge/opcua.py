@@ -16,7 +16,7 @@ from cryptography import x509
 from compensator.bridge.register import Register
 from compensator.bridge.settings import OpcUa
 from compensator.errors import ConfigError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.receiver import Applied, Receiver
 from compensator.receiver.subscriber import monotonic_s
 
@@ -81,7 +81,7 @@ class Bridge:
                     await self._serve(client, stop)
             except _GONE as error:
                 figures = f"{self._settings.endpoint}: {type(error).__name__} {error}".rstrip(". ")
-                self.register.lost(Caution("plc_not_reached", f"{figures}.").marked)
+                self.register.lost(Remark("plc_not_reached", f"{figures}.").marked)
             await self._wait_disconnected(stop)
 
     async def _client(self) -> Client:

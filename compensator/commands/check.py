@@ -7,8 +7,7 @@ import logging
 
 from compensator.commands import Answer
 from compensator.service.compensation import Compensation
-from compensator.service.composition import load
-from compensator.service.configuration_warnings import precautions
+from compensator.service.loading import load
 
 log = logging.getLogger("compensator")
 
@@ -21,15 +20,16 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         Naming what is wrong with the configuration.
     """
-    loaded, model, _, fleet = load(arguments.config)
-    checks = Compensation(loaded.config, model).plausibility.describe()
-    warnings = precautions(loaded)
+    setup = load(arguments.config)
+    config, model = setup.config, setup.model
+    checks = Compensation(config, model).plausibility.describe()
+    warnings = setup.warnings()
     for warning in warnings:
         log.warning("%s: warning: %s", arguments.config, warning.marked)
-    machine = loaded.config.machine.name
+    machine, devices = config.machine.name, setup.fleet.devices
     text = (
         f"{arguments.config}: good. Machine {machine}, model {model.name} ({model.kind}), "
-        f"{len(fleet.devices)} device(s), {len(loaded.config.channel)} channel(s). Nothing was opened.\n"
+        f"{len(devices)} device(s), {len(config.channel)} channel(s). Nothing was opened.\n"
         f"plausibility: {checks}"
     )
     result = {
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         "machine": machine,
         "model": model.name,
         "model_sha256": model.sha256,
-        "devices": list(fleet.devices),
+        "devices": list(devices),
         "warnings": list(warnings),
         "warning_codes": [warning.code for warning in warnings],
         "checks": checks,

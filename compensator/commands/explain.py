@@ -1,4 +1,4 @@
-"""`compensator explain`: a state, reason or warning in words."""
+"""`compensator explain`: what a state, reason or warning means, and what to do."""
 
 from __future__ import annotations
 
@@ -26,6 +26,6 @@ def run(arguments: argparse.Namespace) -> Answer:
     words = explain(arguments.code) or RECEIVER_WORDS.get(arguments.code)
     if words is None:
         near = difflib.get_close_matches(arguments.code, known, n=3)
-        meant = f"expected one of: {', '.join(near)}" if near else "nothing like it is known"
+        meant = f"expected one of: {', '.join(near)}" if near else "no code is similar"
         raise UsageError(f"{arguments.code}: unknown, {meant}; `compensator explain` has all codes")
     return Answer({"code": arguments.code, "means": words[0], "do": words[1]}, f"{words[0]}\n{words[1]}")

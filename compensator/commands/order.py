@@ -1,4 +1,4 @@
-"""`compensator zero`, `hold` and `resume`: what an operator tells the running service."""
+"""`compensator zero`, `hold` and `resume`: an operator's commands to the running service."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _order(name: str, payload: dict[str, Any], arguments: argparse.Namespace) ->
     if arguments.config is not None:
         settings = load_config(arguments.config).config.zenoh
     elif operator is None:
-        raise UsageError("--zenoh: missing beside --prefix, expected a Zenoh configuration such as operator.json5")
+        raise UsageError("--zenoh: missing with --prefix, expected a Zenoh configuration such as operator.json5")
     else:
         try:
             settings = msgspec.convert({"prefix": arguments.prefix}, Zenoh)

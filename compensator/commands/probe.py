@@ -8,27 +8,31 @@ import logging
 from typing import Any
 
 from compensator.commands import Answer
-from compensator.reasons import Caution
-from compensator.service.composition import load, read_once
+from compensator.reasons import Remark
+from compensator.remarks import ServiceWarning
+from compensator.service.composition import read_once
+from compensator.service.loading import load
 from compensator.service.presence import is_used
 from drivers.errors import DriverError
+from drivers.reading import Quality
 
 log = logging.getLogger("compensator")
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command; the exit code is 1 where a channel gave no good reading.
+    """Run the command; the exit code is 1 if a channel gave no good reading.
 
     Raises
     ------
     CompensatorError
         If the configuration cannot be used.
     """
-    loaded, _, _, fleet = load(arguments.config)
-    config = loaded.config
+    setup = load(arguments.config)
+    config, fleet = setup.config, setup.fleet
     warnings = []
-    if is_used(loaded.resolve(config.recording.folder), config.machine.name):
-        warnings.append(Caution("service_runs", f"The service of {config.machine.name} runs and has the devices."))
+    if is_used(setup.recordings, config.machine.name):
+        figures = f"The service of {config.machine.name} is running and uses the devices."
+        warnings.append(Remark(ServiceWarning.SERVICE_RUNS, figures))
     for warning in warnings:
         log.warning("%s: warning: %s", arguments.config, warning.marked)
     units = {name: dict(device.units) for name, device in fleet.devices.items()}
@@ -42,10 +46,10 @@ def run(arguments: argparse.Namespace) -> Answer:
         else:
             reading = answer[channel.input]
             row |= {"quality": str(reading.quality), "detail": reading.detail}
-            if reading.quality == "good":
+            if reading.quality is Quality.GOOD:
                 row["value"] = reading.value
         rows.append(row)
-    good = all(row["quality"] == "good" for row in rows)
+    good = all(row["quality"] == Quality.GOOD for row in rows)
     result = {"channels": rows, "warnings": list(warnings), "warning_codes": [warning.code for warning in warnings]}
     return Answer(result, "\n".join(map(_line, rows)), 0 if good else 1)
 

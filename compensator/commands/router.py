@@ -15,8 +15,9 @@ import zenoh
 from compensator.certificates import check_files, remarks
 from compensator.commands import Answer
 from compensator.errors import ConfigError, ServiceError
-from compensator.reasons import Caution
-from compensator.service.session import ConfigFile, files_of, get, in_words, put, read_config_file
+from compensator.reasons import Remark
+from compensator.remarks import ServiceWarning
+from compensator.service.session import ConfigFile, files_of, get, in_words, read_config_file, set_key
 
 log = logging.getLogger("compensator")
 
@@ -29,7 +30,7 @@ def run(arguments: argparse.Namespace) -> Answer | None:
     Raises
     ------
     ConfigError
-        If the file has something unknown, or something that would not do what it looks like.
+        If the file has an unknown key, or one that would not have the effect it suggests.
     ServiceError
         If an endpoint cannot be listened on.
     """
@@ -48,7 +49,7 @@ def run(arguments: argparse.Namespace) -> Answer | None:
 
 
 def checked(path: Path, file: ConfigFile) -> zenoh.Config:
-    """Refuse what Zenoh would take without a word and not do; look at the TLS files.
+    """Refuse what Zenoh would accept silently and ignore; check the TLS files.
 
     Raises
     ------
@@ -58,15 +59,15 @@ def checked(path: Path, file: ConfigFile) -> zenoh.Config:
     config = file.config
     if get(config, "mode") not in (None, "router"):
         raise ConfigError(f"{path}: mode = {get(config, 'mode')!r}, expected router")
-    put(config, "mode", "router")
+    set_key(config, "mode", "router")
     endpoints = get(config, "listen/endpoints")
     if not isinstance(endpoints, list) or not endpoints:
         raise ConfigError(f'{path}: listen/endpoints: missing, expected a list, such as ["tls/0.0.0.0:7447"]')
     if get(config, "plugins"):
         raise ConfigError(f"{path}: plugins: this router runs none, expected them in a zenohd only")
-    for name in ("multicast", "gossip"):  # on where nothing is said, which is more than a list of endpoints says
+    for name in ("multicast", "gossip"):  # on by default, which opens more than the listed endpoints
         if get(config, f"scouting/{name}/enabled") is None:
-            put(config, f"scouting/{name}/enabled", False)
+            set_key(config, f"scouting/{name}/enabled", False)
     _check_access(path, config, endpoints)
     if any(endpoint.startswith(_SECURED) for endpoint in endpoints):
         now = datetime.datetime.now(datetime.UTC)
@@ -84,24 +85,24 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
     enabled = access.get("enabled")
     if not enabled:
         if access.get("rules") or access.get("policies"):
-            raise ConfigError(f"{path}: access_control/enabled: expected true beside rules; without it none applies")
-        caution = Caution("no_access_list", "No access list: whoever connects may publish and command everything.")
-        log.warning("%s: warning: %s", path, caution.marked)
+            raise ConfigError(f"{path}: access_control/enabled: expected true with rules; without it none applies")
+        figures = "No access list: anybody who connects may publish and command everything."
+        log.warning("%s: warning: %s", path, Remark(ServiceWarning.NO_ACCESS_LIST, figures).marked)
         return
     if access.get("default_permission") != "deny":
         raise ConfigError(
             f"{path}: access_control/default_permission = {access.get('default_permission')!r}, expected "
-            f"deny: one rule that is missing would open everything"
+            f"deny: a single missing rule would open everything"
         )
     named = any(subject.get("cert_common_names") for subject in access.get("subjects") or [])
     if not named:
         return
     if get(config, "transport/link/tls/enable_mtls") is not True:
-        raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true; the list goes by certificates")
+        raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true; the access list uses certificates")
     for endpoint in endpoints:
         if not endpoint.startswith(_SECURED):
             raise ConfigError(
-                f"{path}: listen/endpoints: {endpoint!r}, expected tls/HOST:PORT; the access list goes by certificates"
+                f"{path}: listen/endpoints: {endpoint!r}, expected tls/HOST:PORT; the access list uses certificates"
             )
 
 
@@ -115,13 +116,13 @@ async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None
         raise ServiceError(f"{path}: {in_words(error)}") from error
     with session:
         log.info("compensator: router listens on %s", ", ".join(endpoints))
-        session.info.declare_link_events_listener(_tell, history=True)
+        session.info.declare_link_events_listener(_log_link, history=True)
         await ended.wait()
 
 
-def _tell(event: Any) -> None:
-    """Say who comes and goes."""
+def _log_link(event: Any) -> None:
+    """Log who connects and disconnects."""
     link = event.link
-    came = event.kind == zenoh.SampleKind.PUT
-    who = link.auth_identifier or "somebody without a certificate"
-    log.info("router: %s (%s, %s) %s", who, link.dst, link.zid, "is connected" if came else "is gone")
+    connected = event.kind == zenoh.SampleKind.PUT
+    who = link.auth_identifier or "a participant without a certificate"
+    log.info("router: %s (%s, %s) %s", who, link.dst, link.zid, "is connected" if connected else "is gone")

@@ -13,45 +13,46 @@ from typing import Any
 
 import msgspec
 
-from compensator.config import load_config
 from compensator.messages import Event, Offset
-from compensator.service import journald
+from compensator.reasons import State
+from compensator.service import systemd
 from compensator.service.composition import run_service
 from compensator.service.daemon import Daemon
-from compensator.service.notify import ServiceManager
+from compensator.service.loading import load
+from compensator.service.systemd import ServiceManager
 
 log = logging.getLogger("compensator")
 
-_LEVELS = {"ok": logging.INFO, "starting": logging.INFO, "fault": logging.ERROR}
+_LEVELS = {State.OK: logging.INFO, State.STARTING: logging.INFO, State.FAULT: logging.ERROR}
 
 
-class Voice:
-    """Says what the service does: to its manager in one line, to the log with fields.
+class Reporter:
+    """Reports what the service does: to its manager in one line, to the log with fields.
 
     Parameters
     ----------
     manager : ServiceManager
-        Who started the service.
+        Started the service.
     """
 
     def __init__(self, manager: ServiceManager) -> None:
         self._manager = manager
         self._polled = False
-        self._state = "starting"
+        self._state: str = State.STARTING
 
-    def polled(self) -> None:
-        """Take a poll that is wholly done: the only thing that counts as a sign of life.
+    def report_poll(self) -> None:
+        """Report a complete poll, the only thing that counts as a sign of life.
 
-        A sensor that does not answer, a disk that is late, or a sample that ended in an internal error and was held is
-        no standstill: the offset says so, and another start would not say more.
+        A silent sensor, a late disk, or an internal error with the offset held is no standstill: the published offset
+        shows it, and a restart would not help.
         """
         if not self._polled:
             self._polled = True
             self._manager.ready()
         self._manager.alive()
 
-    def published(self, name: str, data: bytes) -> None:
-        """Take a message that was published."""
+    def report_message(self, name: str, data: bytes) -> None:
+        """Report a published message."""
         if name == "offset":
             self._manager.status(status(msgspec.json.decode(data, type=Offset)))
         elif name == "event":
@@ -71,7 +72,7 @@ class Voice:
 
 
 def level(event: Event) -> int:
-    """Return how urgent an event is: a number of `logging`.
+    """Return the logging level of an event.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def level(event: Event) -> int:
 
 
 def status(offset: Offset) -> str:
-    """Put state and offset into one line for `systemctl status`.
+    """Return state and offset in one line for `systemctl status`.
 
     Parameters
     ----------
@@ -107,12 +108,12 @@ def run(arguments: argparse.Namespace) -> None:
     Raises
     ------
     CompensatorError
-        If the configuration cannot be used, or the service cannot begin.
+        If the configuration cannot be used, or the service cannot start.
     """
-    # A watchdog ends the service by SIGABRT: then the log says in which line each thread stood.
+    # The watchdog ends the service by SIGABRT; then the log shows the line at which each thread was.
     faulthandler.enable()
-    if journald.is_connected(os.environ, sys.stderr.fileno()):
-        logging.basicConfig(handlers=[journald.JournalHandler()], level=logging.INFO, format="%(message)s", force=True)
+    if systemd.is_connected(os.environ, sys.stderr.fileno()):
+        logging.basicConfig(handlers=[systemd.JournalHandler()], level=logging.INFO, format="%(message)s", force=True)
     with ServiceManager(os.environ) as manager:
         asyncio.run(_serve(arguments.config, manager))
     log.info("compensator: stopped, recording finished")
@@ -120,8 +121,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 async def _serve(path: str, manager: ServiceManager) -> None:
     loop = asyncio.get_running_loop()
-    voice = Voice(manager)
+    reporter = Reporter(manager)
     manager.status("starting: reads the last recording")
+    setup = load(path)
 
     def ready(daemon: Daemon) -> None:
         def stop() -> None:
@@ -130,8 +132,8 @@ async def _serve(path: str, manager: ServiceManager) -> None:
 
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, stop)
-        manager.watch(load_config(path).config.sampling.poll_interval_s)
+        manager.watch(setup.config.sampling.poll_interval_s)
         manager.status("starting: waits for the first poll")
         log.info("compensator: running")
 
-    await run_service(path, on_ready=ready, on_poll=voice.polled, on_publish=voice.published)
+    await run_service(setup, on_ready=ready, on_poll=reporter.report_poll, on_publish=reporter.report_message)

@@ -10,7 +10,7 @@ from compensator.arrays import Indices, Mask, Vector
 from compensator.data.record import SHORT_GAP_SAMPLES, Data, Record
 from compensator.data.table import Table
 from compensator.errors import DataError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: Larger numbers are no measurements, and their powers overflow.
 LARGEST = 1e30
@@ -40,7 +40,7 @@ def to_grid(table: Table, period_s: float) -> Data:
     backwards = np.diff(t_s) < 0
     if backwards.any():
         row, count = table.rows[int(np.argmax(backwards)) + 1], int(np.sum(backwards))
-        remarks.append(Caution("rows_sorted", f"{table.name}: row {row}: {count} row(s) out of order; sorted by time."))
+        remarks.append(Remark("rows_sorted", f"{table.name}: row {row}: {count} row(s) out of order; sorted by time."))
     t_s = t_s[order] - t_s.min()
     slot = (
         np.round(t_s / period_s).astype(int)
@@ -56,9 +56,9 @@ def to_grid(table: Table, period_s: float) -> Data:
     for first, last in _gaps(present):
         gap = f"{table.name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}"
         if last - first <= SHORT_GAP_SAMPLES:
-            remarks.append(Caution("gap_bridged", f"{gap}; bridged."))
+            remarks.append(Remark("gap_bridged", f"{gap}; bridged."))
         else:
-            remarks.append(Caution("gap_splits", f"{gap}; the record is split there."))
+            remarks.append(Remark("gap_splits", f"{gap}; the record is split there."))
             records.append((start, first))
             start = last
     records.append((start, n))

@@ -19,7 +19,7 @@ from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.table import Table
 from compensator.display import html_table
 from compensator.errors import DataError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: Sample period of the models made, s: the service's.
 PERIOD_S = 60.0
@@ -68,7 +68,7 @@ class Measurement:
         Files, or the table in memory.
     roles : dict of str to str
         Columns that had other names.
-    remarks : tuple of Caution
+    remarks : tuple of Remark
         What reading left out.
     in_frame : bool
         Whether it was a pandas DataFrame; tables of results then are, too.
@@ -78,7 +78,7 @@ class Measurement:
     label: str
     origins: tuple[Origin, ...]
     roles: Mapping[str, str] = field(default_factory=dict)
-    remarks: tuple[Caution, ...] = ()
+    remarks: tuple[Remark, ...] = ()
     in_frame: bool = False
 
     @property
@@ -225,7 +225,7 @@ def _origin(path: Path, data: bytes) -> Origin:
     return Origin(name=path.name, sha256=hashlib.sha256(data).hexdigest(), path=path)
 
 
-def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[list[Run], list[Caution]]:
+def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[list[Run], list[Remark]]:
     """Return the runs of measurements, and what had to be corrected.
 
     Parameters
@@ -242,7 +242,7 @@ def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[li
     """
     gridded = [(measured, measured.at_period(period_s)) for measured in data]
     runs: list[Run] = []
-    remarks: list[Caution] = []
+    remarks: list[Remark] = []
     for measured, part in gridded:
         remarks += part.remarks
         for record in part.records:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from compensator.arrays import Vector
 from compensator.errors import DataError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: A gap of up to this many model samples stays inside a record; the engine bridges it.
 SHORT_GAP_SAMPLES = 60
@@ -37,12 +37,12 @@ class Data:
     ----------
     records : tuple of Record
         In order of time; a long gap starts a new one.
-    remarks : tuple of Caution
+    remarks : tuple of Remark
         Corrections: gaps, rows out of order.
     """
 
     records: tuple[Record, ...]
-    remarks: tuple[Caution, ...]
+    remarks: tuple[Remark, ...]
 
 
 def require(name: str, record: Record, columns: Sequence[str]) -> None:

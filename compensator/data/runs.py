@@ -9,7 +9,7 @@ import numpy as np
 
 from compensator.arrays import Mask, Vector
 from compensator.data.record import SHORT_GAP_SAMPLES, Record
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: A single reading this many noise deviations away from both neighbours is an outlier.
 WILD_DEVIATIONS = 12.0
@@ -63,7 +63,7 @@ class Run:
         return np.asarray(self.ambient_k + self.reference[1])
 
 
-def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Caution, ...]]]:
+def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Remark, ...]]]:
     """Yield the runs of a record with remarks on its corrections.
 
     Parameters
@@ -77,7 +77,7 @@ def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Caution, ...
     for column, values in record.columns.items():
         cleaned, wild = without_wild(values) if column != "heat_w" else (values, 0)
         if wild and column in ("t_q_degc", "at_degc", "y_um"):
-            remarks.append(Caution("wild_readings", f"{name}: {column}: {wild} outlier(s) left out."))
+            remarks.append(Remark("wild_readings", f"{name}: {column}: {wild} outlier(s) left out."))
         columns[column] = cleaned
     inputs = ["t_q_degc", "at_degc", *(["heat_w"] if "heat_w" in columns else [])]
     missing = np.any([np.isnan(columns[c]) for c in inputs], axis=0)

@@ -12,7 +12,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.errors import DataError, UsageError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 
@@ -74,7 +74,7 @@ class Table:
         others = {name: values for name, values in self.columns.items() if name not in roles.values()}
         return replace(self, columns=others | {role: self.columns[name] for role, name in roles.items()})
 
-    def measurements_only(self) -> tuple[Table, tuple[Caution, ...]]:
+    def measurements_only(self) -> tuple[Table, tuple[Remark, ...]]:
         """Leave out of an exported recording what the service computed.
 
         Its heat is the model's own estimate: a model fitted to it as to a measured heat would reproduce itself.
@@ -85,7 +85,7 @@ class Table:
         if "heat_measured_w" in kept:
             kept["heat_w"] = kept.pop("heat_measured_w")
         words = f"{self.name}: an exported recording; the service's estimates and offsets are left out, with heat_w."
-        return replace(self, columns=kept), (Caution("estimates_left_out", words),)
+        return replace(self, columns=kept), (Remark("estimates_left_out", words),)
 
 
 def table_of(name: str, cells: Mapping[str, Any], *, rows: Sequence[int] | None = None, has: str = "it has") -> Table:

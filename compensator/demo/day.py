@@ -30,6 +30,7 @@ from compensator.messages import Offset
 from compensator.service.command_client import ask
 from compensator.service.compensation import Outcome
 from compensator.service.composition import run_service
+from compensator.service.loading import load
 from compensator.service.session import session_config
 from sim_hardware.physics import Duty, World, usual_sensors
 from sim_hardware.physics.effects.base import Effect
@@ -182,7 +183,7 @@ async def _serve(
     task = asyncio.create_task(listen())
     try:
         await run_service(
-            str(config),
+            load(str(config)),
             clock=clock,
             samples=samples,
             on_ready=lambda _: ready.set(),

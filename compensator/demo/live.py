@@ -25,6 +25,7 @@ from compensator.demo.machine import MACHINES, Hardware, configuration, hardware
 from compensator.errors import UsageError
 from compensator.service.composition import run_service
 from compensator.service.daemon import Daemon
+from compensator.service.loading import load
 from compensator.service.presence import sole_user
 from sim_hardware.physics import Duty, World, draw_effect, usual_sensors
 from sim_hardware.wire import Faults
@@ -131,7 +132,7 @@ async def _serve(
             for number in (signal.SIGTERM, signal.SIGINT):
                 loop.add_signal_handler(number, stop)
 
-        await run_service(str(config), clock=clock, on_ready=ready)
+        await run_service(load(str(config)), clock=clock, on_ready=ready)
 
 
 def _explain(out: Path, config: Path, port: int) -> None:

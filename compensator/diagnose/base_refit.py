@@ -27,7 +27,7 @@ from compensator.diagnose.outcome import (
 from compensator.diagnose.refit import Refit, refit
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.progress import ExecutorMap, Progress
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
@@ -134,7 +134,7 @@ def _extended(model: ThermalModel, whole: Refit, effects: tuple[Effect, ...]) ->
     )
 
 
-def _refitted(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, ...]:
+def _refitted(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Remark, ...]:
     """Return the warning that the paths are not those of the first model."""
     if not helps:
         return ()
@@ -149,4 +149,4 @@ def _refitted(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Caution, 
         "The first model was calibrated while this acted and misses much of its own data, so its paths were refitted "
         f"together with it; gains changed: {gains}."
     )
-    return (Caution("fitted_anew", text),)
+    return (Remark("fitted_anew", text),)

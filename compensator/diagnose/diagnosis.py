@@ -32,7 +32,7 @@ from compensator.diagnose.outcome import (
 from compensator.diagnose.search import Search, Selection
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: A base refit replaces a search's answer where it leaves no more than this share.
 REFIT_LEAVES = 0.5
@@ -178,10 +178,10 @@ def _stated(model: ThermalModel, after_um: float, noise_um: float, kept_out: Seq
     return max(model.y_std_um, float(np.sqrt(left)))
 
 
-def _companions(everything: Sequence[Effect]) -> tuple[Caution, ...]:
+def _companions(everything: Sequence[Effect]) -> tuple[Remark, ...]:
     """Return a warning for each effect that is deployed without being named."""
     return tuple(
-        Caution(
+        Remark(
             "rounded_off",
             "What the effect leaves is absorbed by a filter bank on heat and ambient "
             f"({float(np.std(e.signal)):.2g} µm rms), an effect of kind {e.place[0]} in model.toml.",

@@ -13,7 +13,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
 from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import EffectTable, ThermalModel
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 
@@ -107,7 +107,7 @@ class Diagnosis:
         The same, each block by a search that did not see it.
     tried : tuple of (str, float)
         Explanations of the largest effect and the rms that each leaves, µm, best first.
-    warnings : tuple of Caution
+    warnings : tuple of Remark
         What to know before relying on it.
     """
 
@@ -121,7 +121,7 @@ class Diagnosis:
     held_out_before: Vector
     held_out_after: Vector
     tried: tuple[tuple[str, float], ...]
-    warnings: tuple[Caution, ...]
+    warnings: tuple[Remark, ...]
 
     @property
     def before(self) -> Scores:
@@ -190,7 +190,7 @@ def _stimulus(term: Term) -> str:
     return "leave the machine at rest"
 
 
-def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[Caution, ...]:
+def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[Remark, ...]:
     """Return what to know before relying on the effects that were found."""
     warnings = []
     rms_before, rms_after = rms_of(before), rms_of(after)
@@ -199,16 +199,16 @@ def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tup
             f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so the "
             "model was left as it is."
         )
-        warnings.append(Caution("made_worse", text))
+        warnings.append(Remark("made_worse", text))
     for effect in effects:
         kind, named = effect.place[0], effect.named
         loose = [name for name, std in effect.std.items() if std > abs(named[name]) > 0.0]
         if loose:
             text = f"{kind}: the standard error of {', '.join(loose)} is larger than the value."
-            warnings.append(Caution("hardly_determined", text))
+            warnings.append(Remark("hardly_determined", text))
         if effect.rivals:
             names = ", ".join(rival.label for rival in effect.rivals)
-            warnings.append(Caution("nearly_as_good", f"{kind}: {names} would explain it nearly as well."))
+            warnings.append(Remark("nearly_as_good", f"{kind}: {names} would explain it nearly as well."))
     return tuple(warnings)
 
 

@@ -13,7 +13,7 @@ from compensator.arrays import ComplexVector, Mask, Vector
 from compensator.data.runs import Run
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 
 #: Lags of the correlations, samples.
 LAGS = 60
@@ -190,13 +190,13 @@ class Criticism:
         TTF (where there is one), DTF, TDTF.
     residuals : tuple of ResidualView
         Of the TTF's and the DTF's fit.
-    warnings : tuple of Caution
+    warnings : tuple of Remark
         The gravest first.
     """
 
     paths: tuple[PathView, ...]
     residuals: tuple[ResidualView, ...]
-    warnings: tuple[Caution, ...]
+    warnings: tuple[Remark, ...]
 
 
 def criticise(calibration: Calibration) -> Criticism:
@@ -233,7 +233,7 @@ class _Warnings:
         self.paths = {path.name: path for path in paths}
         self.hours = [float(np.sum(mask)) * calibration.model.period_s / 3600.0 for mask in calibration.used]
 
-    def all(self) -> tuple[Caution, ...]:
+    def all(self) -> tuple[Remark, ...]:
         found = [
             self.worse_than_nothing(),
             self.quiet_ambient(),
@@ -250,56 +250,56 @@ class _Warnings:
         ]
         return tuple(words for words in found if words is not None)
 
-    def worse_than_nothing(self) -> Caution | None:
+    def worse_than_nothing(self) -> Remark | None:
         for part in self.calibration.parts:
             if part.role == "held out" and part.model.rms_um > part.nothing.rms_um:
-                return Caution(
+                return Remark(
                     "worse_than_nothing",
                     f"On {part.name} (held out) the model is worse than no compensation: {part.model.rms_um:.1f} "
                     f"against {part.nothing.rms_um:.1f} µm rms.",
                 )
         return None
 
-    def quiet_ambient(self) -> Caution | None:
+    def quiet_ambient(self) -> Remark | None:
         swing = max(float(np.ptp(run.ambient_k[mask])) for run, mask in self._pairs())
         path = self.paths["TDTF"]
         if path.gain_std == 0.0:
             return None
         gain = f"the TDTF's gain is {path.gain:.2f} ± {path.gain_std:.2f} µm/K"
         if swing < 2.0:
-            return Caution(
+            return Remark(
                 "quiet_ambient",
                 f"The ambient changed by only {swing:.1f} K; {gain}: do not rely on it for larger changes.",
             )
         if path.gain_std > 0.3 * abs(path.gain):
-            return Caution(
+            return Remark(
                 "undetermined_ambient",
                 f"The TDTF is poorly determined although the ambient changed by {swing:.1f} K: {gain}.",
             )
         return None
 
-    def short_record(self) -> Caution | None:
+    def short_record(self) -> Remark | None:
         slowest = max(path.taus_min[-1] for path in self.paths.values())
         longest = max(self.hours)
         if longest * 60.0 < 3.0 * slowest:
-            return Caution(
+            return Remark(
                 "short_record",
                 f"The longest record has {longest:.1f} h, the slowest time constant is {slowest / 60.0:.1f} h: the "
                 "steady state is extrapolated.",
             )
         return None
 
-    def ramp(self) -> Caution | None:
+    def ramp(self) -> Remark | None:
         main = self.calibration.deformation.main
         if main.taus_min[-1] < 0.95 * main.longest_min:
             return None
-        return Caution(
+        return Remark(
             "drifting_mode",
             f"The slowest mode is slower than the record ({main.longest_min / 60.0:.0f} h) and was limited to it: "
             "a drift is left that the inputs do not explain, and free run beyond the record is extrapolation.",
         )
 
-    def common_cause(self) -> Caution | None:
+    def common_cause(self) -> Remark | None:
         drives = np.concatenate([d[m] for d, m in zip(self.calibration.drives, self.calibration.used, strict=True)])
         ambient = np.concatenate([run.ambient_k[mask] for run, mask in self._pairs()])
         if np.ptp(ambient) == 0.0 or np.ptp(drives) == 0.0:
@@ -307,15 +307,15 @@ class _Warnings:
         together = abs(float(np.corrcoef(drives, ambient)[0, 1]))
         if together < 0.8:
             return None
-        return Caution(
+        return Remark(
             "common_cause",
             f"Drive and ambient changed together (correlation {together:.2f}): how much of the deformation belongs to "
             "the DTF and how much to the TDTF is ambiguous.",
         )
 
-    def undetermined_gain(self) -> list[Caution]:
+    def undetermined_gain(self) -> list[Remark]:
         return [
-            Caution(
+            Remark(
                 "undetermined_gain",
                 f"The gain of the {name} at rest is {path.gain:.3g} ± {path.gain_std:.2g} {_shown(path.unit)}: "
                 "poorly determined.",
@@ -324,14 +324,14 @@ class _Warnings:
             if name != "TDTF" and path.gain_std > 0.3 * abs(path.gain)
         ]
 
-    def odd_zero(self) -> list[Caution]:
+    def odd_zero(self) -> list[Remark]:
         words = []
         for name, path in self.paths.items():
             outside = [z for z in path.zeros if abs(z) > 1.0]
             if outside:
                 worst = max(outside, key=abs)
                 words.append(
-                    Caution(
+                    Remark(
                         "zero_outside",
                         f"The {name} has a zero outside the unit circle (z = {worst.real:.3g}): its response starts "
                         "in the wrong direction. It is never inverted, so stability is not affected.",
@@ -339,12 +339,12 @@ class _Warnings:
                 )
         return words
 
-    def wrong_way(self) -> list[Caution]:
+    def wrong_way(self) -> list[Remark]:
         words = []
         for name, path in self.paths.items():
             if path.gain * path.step[np.argmax(np.abs(path.step))] < 0:
                 words.append(
-                    Caution(
+                    Remark(
                         "turning_response",
                         f"The step response of the {name} reverses: it peaks at {_peak(path):.3g} and settles at "
                         f"{path.gain:.3g} {_shown(path.unit)}.",
@@ -352,13 +352,13 @@ class _Warnings:
                 )
         return words
 
-    def twin_modes(self) -> list[Caution]:
+    def twin_modes(self) -> list[Remark]:
         words = []
         for name, path in self.paths.items():
             twins = [t for t, u in zip(path.taus_min, path.taus_min[1:], strict=False) if u < 1.05 * t]
             if twins and name != "TDTF":
                 words.append(
-                    Caution(
+                    Remark(
                         "twin_modes",
                         f"Two time constants of the {name} coincide at {twins[0]:.3g} min: their standard errors "
                         "mean nothing, and one mode fewer may be enough.",
@@ -366,7 +366,7 @@ class _Warnings:
                 )
         return words
 
-    def inverse_noise(self) -> Caution | None:
+    def inverse_noise(self) -> Remark | None:
         temperature = self.calibration.temperature
         if temperature is None:
             return None
@@ -376,12 +376,12 @@ class _Warnings:
         span = max(float(np.ptp(heat)) for heat in known)
         if watts < 0.2 * span:
             return None
-        return Caution(
+        return Remark(
             "inverse_noise",
             f"The noise of the thermocouples makes {watts:.0f} W of noise in a heat of {span:.0f} W.",
         )
 
-    def coloured(self) -> Caution | None:
+    def coloured(self) -> Remark | None:
         main = self.calibration.deformation.main
         noise = self.calibration.noise["y_um"]
         still = self.residuals[-1]
@@ -390,16 +390,16 @@ class _Warnings:
         if still.white_chance > 0.01 and known[largest] < 1.0:
             return None
         tail = f" and is correlated with {largest}" if known[largest] > 1.0 else ""
-        return Caution(
+        return Remark(
             "coloured_residual",
             f"The residual ({main.sigma:.2f} µm rms, sensor noise {noise:.2f}) is not white{tail}: the model lacks "
             "something. The standard errors allow for it.",
         )
 
-    def narrow_range(self) -> Caution | None:
+    def narrow_range(self) -> Remark | None:
         low, high = self.calibration.model.validity["at_degc"]
         t_low, t_high = self.calibration.model.validity["t_q_degc"]
-        return Caution(
+        return Remark(
             "validity_range",
             f"Valid for AT from {low:.0f} to {high:.0f} °C and T_Q from {t_low:.0f} to {t_high:.0f} °C (the range of "
             "the data and a third more); outside it the service holds the offset.",

@@ -1,4 +1,4 @@
-"""Live MCAP files, of which a kill or a power cut loses nothing that was synced, and names that stay."""
+"""MCAP files that are being written: what is synced survives a kill and a power cut."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ from mcap.writer import CompressionType, Writer
 
 from compensator import __version__
 from compensator.errors import DataError
-from compensator.recording.container import Contents
+from compensator.messages import MESSAGES, encode, shipped_schema
+from compensator.recording import chain
+from compensator.recording.container import Attachment, Channel, Contents
+from compensator.recording.signature import Signer
+
+#: Topics of a recording; `chain` and `seal` come from the recorder itself.
+TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
 
 
 @dataclass(slots=True)
 class _Sink:
-    """What the writer wrote since the last sync; the file gets it in one piece."""
+    """What the MCAP writer wrote since the last sync; the file gets it in one piece."""
 
     data: bytearray = field(default_factory=bytearray)
     size: int = 0
@@ -37,7 +43,7 @@ class _Sink:
 class LiveFile:
     """An MCAP file that is being written.
 
-    Without chunks a message is in the file as soon as it is synced; the CRC over the data covers a finished one.
+    It has no chunks, so a message is in the file as soon as it is synced; a CRC over the data covers a finished one.
 
     Parameters
     ----------
@@ -47,7 +53,7 @@ class LiveFile:
     Raises
     ------
     OSError
-        If the file cannot be made, or every name is in use.
+        If the disk refuses it, or no name is free.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:
@@ -68,13 +74,13 @@ class LiveFile:
         self.synced = self._sink.size
 
     def finish(self) -> None:
-        """Write the end and close the file; from here on it may be made compact."""
+        """Write the end and close the file; from here on others may use it."""
         self.writer.finish()  # type: ignore[no-untyped-call]
         self.sync()
         os.close(self._descriptor)
 
     def give_up(self) -> bool:
-        """Cut off what is not whole and close the file; return whether the disk allowed it."""
+        """Cut off what was not synced and close the file; return whether the disk accepted that."""
         cut = True
         try:
             os.ftruncate(self._descriptor, self.synced)
@@ -135,6 +141,66 @@ class Opening:
             writer.add_attachment(part.create_time_ns, part.log_time_ns, part.name, part.media_type, part.data)
 
 
+class RecordingFile(LiveFile):
+    """A live recording with its hash chain.
+
+    Parameters
+    ----------
+    paths : iterable of pathlib.Path
+        Names to try; the first free one is used.
+    machine : str
+        Name of the machine.
+    before : bytes
+        Last value of the chain in the previous recording.
+    time_ns : int
+        Now, ns since 1970 UTC.
+    """
+
+    def __init__(self, paths: Iterable[Path], machine: str, before: bytes, time_ns: int) -> None:
+        super().__init__(paths)
+        self.time_ns = self.sealed_ns = time_ns
+        self._machine = machine
+        self._channels: dict[str, int] = {}
+        self._sequence = 0
+        self._chain = chain.ChainWriter(machine, before)
+
+    @property
+    def head(self) -> bytes:
+        """Value of the chain at the last record."""
+        return self._chain.head
+
+    def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
+        """Write what the file opens with."""
+        contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
+        for number, topic in enumerate(TOPICS, 1):
+            about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
+            contents.channels[number] = Channel(f"/{topic}", "json", about, kind, "jsonschema", schema)
+        opening = Opening(self.writer)
+        opening.write(contents)
+        self._channels = {topic: number for number, topic in opening.topics.items()}
+        self._write("chain", self._chain.begin(chain.parts_of(contents), self.time_ns))
+
+    def append(self, records: Iterable[tuple[str, bytes]], time_ns: int) -> None:
+        """Write a group of records and the values of the chain."""
+        self.time_ns = time_ns
+        for topic, data in records:
+            self._chain.add(topic, chain.body_of(self._sequence, time_ns, data))
+            self._write(topic, data)
+        self._write("chain", self._chain.message(time_ns))
+
+    def seal(self, reason: str, time_ns: int, signer: Signer | None) -> None:
+        """Write a seal, signed if there is a key."""
+        message = chain.seal(self._machine, time_ns, reason, self._sequence - 1, self.head)
+        if signer is not None:
+            message = signer.sign(message)
+        self.sealed_ns = time_ns
+        self.append([("seal", encode(message))], time_ns)
+
+    def _write(self, topic: str, data: bytes) -> None:
+        self.writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns, sequence=self._sequence)
+        self._sequence += 1
+
+
 def _create(paths: Iterable[Path]) -> tuple[Path, int]:
     path = None
     for path in paths:
@@ -142,19 +208,19 @@ def _create(paths: Iterable[Path]) -> tuple[Path, int]:
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except FileExistsError:
             continue
-        # Held until the file is finished, so that no other program mistakes it for one that was left behind.
+        # Locked until the file is finished, so that it is not mistaken for one that was left behind.
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path, descriptor
     raise OSError(f"{path}: it and every name before it is in use")
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to disk: a new file's, too, must outlive a power cut.
+    """Bring the names in a folder to disk, so that a new file's name survives a power cut.
 
     Raises
     ------
     OSError
-        If it cannot be synced.
+        If the disk refuses it.
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:

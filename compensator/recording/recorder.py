@@ -1,16 +1,16 @@
 """Writes every sample to MCAP so that a kill loses nothing.
 
-One file a day and at each start. The live file is not chunked, and every sample is brought to disk with one sync
-before its offset is published. The configuration, the model and the state of the compensation travel in each file as
-attachments. A hash chain runs over everything (`recording/chain.py`) and from file to file; where a key is configured
-it is signed every hour and at the end. A finished file is rewritten compact by `recording/finishing.py`.
+There is one file a day and one at each start. The live file is not chunked; every sample is synced to disk before its
+offset is published. The configuration, the model and the state of the compensation are attached to each file. A hash
+chain covers everything (`recording/chain.py`) and leads from file to file; where a key is configured it is signed every
+hour and at the end. `recording/finishing.py` rewrites a finished file compactly.
 """
 
 from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,33 +19,30 @@ import mcap
 
 from compensator import __version__
 from compensator.clock import NS
-from compensator.messages import MESSAGES, encode, shipped_schema
 from compensator.recording import chain
-from compensator.recording.container import Attachment, Channel, Contents
+from compensator.recording.container import Attachment
 from compensator.recording.finishing import Finisher, Retention
-from compensator.recording.live_file import LiveFile, Opening, sync_folder
+from compensator.recording.live_file import RecordingFile, sync_folder
 from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 
-#: Topics of a recording; `chain` and `seal` come from the recorder itself.
-TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
 #: How often the chain is signed within a file.
 SEAL_EVERY_NS = 3600 * NS
 
 
-class Recorder:
+class McapRecorder:
     """Recording of one machine.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Made when it is not there.
+        Created if it does not exist.
     machine : str
         Name of the machine.
     attachments : dict of str to bytes
-        Files that travel in each recording, by name; what stands here when a file is opened goes into it.
+        Files that are attached to each recording, by name, as they are when it is opened.
     retention : Retention, optional
-        How much is kept; everything where nothing is said.
+        How much is kept; everything by default.
     signer : Signer, optional
         Signs the chain.
     """
@@ -64,18 +61,18 @@ class Recorder:
         self.attachments = attachments
         self._signer = signer
         self._finisher = Finisher(folder, machine, retention or Retention(), signer)
-        self._live: _Live | None = None
+        self._live: RecordingFile | None = None
         self._day = ""
-        #: A file that was given up with more in it than was synced, and how long it may be.
+        #: A file that was given up and could not be cut, and the size that was synced.
         self._uncut: tuple[Path, int] | None = None
-        #: Why the next file begins, and the last value of the file before it where that is known.
+        #: Why the next file is opened, and the last chain value of the previous file if known.
         self._reason, self._last = "start", b""
         self.path: Path | None = None
 
     def write(
         self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"", sync: bool = True
     ) -> None:
-        """Write records and bring them to disk, all of them before it returns.
+        """Write records and bring all of them to disk before returning.
 
         Parameters
         ----------
@@ -84,16 +81,15 @@ class Recorder:
         time_utc_ns : int
             Time of the records, ns since 1970 UTC.
         state : bytes
-            State of the compensation before these records; travels as `state.json` in a file that opens with them.
-
+            State of the compensation before these records; attached as `state.json` to a file that opens with them.
         sync : bool
-            Without it they come to disk together with the next ones.
+            If false they come to disk together with the next ones.
 
         Raises
         ------
         OSError
-            If they cannot be written. What was written since the last sync is cut off again, the file is given up,
-            and the next call starts a new one.
+            If the disk refuses them. What was written since the last sync is cut off again, the file is given up, and
+            the next call opens a new one.
         """
         day = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%d")
         try:
@@ -101,7 +97,7 @@ class Recorder:
                 self._finish("day")
                 self._open(time_utc_ns, day, state)
             assert self._live is not None
-            self._live.add(records, time_utc_ns)
+            self._live.append(records, time_utc_ns)
             if self._signer is not None and time_utc_ns - self._live.sealed_ns >= SEAL_EVERY_NS:
                 self._live.seal("hour", time_utc_ns, self._signer)
             if sync:
@@ -113,27 +109,31 @@ class Recorder:
             raise
 
     def close(self) -> None:
-        """Finish the file and wait until it is compact; does nothing when there is none."""
+        """Finish the file, if there is one, and wait until it is compact."""
         try:
             self._finish("stop")
         finally:
             self._finisher.wait()
 
-    def start_new(self) -> None:
-        """Finish the file, so that the next write opens a new one with the attachments as they are then.
+    def start_new(self, attachments: Mapping[str, bytes] | None = None) -> None:
+        """Finish the file, so that the next write opens a new one.
+
+        Parameters
+        ----------
+        attachments : mapping of str to bytes, optional
+            Replace those of the same name from here on.
 
         Raises
         ------
         OSError
-            If the end of the file cannot be written; the file is given up, and the next write opens a new one.
+            If the disk refuses the end of the file; the file is given up, and the next write opens a new one.
         """
+        self.attachments = {**self.attachments, **(attachments or {})}
         self._finish("new")
 
     def remarks(self) -> list[tuple[str, dict[str, Any]]]:
         """Return what happened to finished files since the last call: text and data of events."""
         return self._finisher.remarks()
-
-    # ------------------------------------------------------------------ beginning and end of a file
 
     def _finish(self, reason: str) -> None:
         live = self._live
@@ -149,10 +149,10 @@ class Recorder:
         self._finisher.enqueue(live.path, live.time_ns)
 
     def _give_up(self) -> None:
-        """Leave the file as it was after the last sync; what was written since then was not whole."""
+        """Leave the file as it was after the last sync."""
         live, self._live = self._live, None
         self._reason = "failure"
-        # Read from the file when the next one opens: only it knows what it took.
+        # Read from the file when the next one opens: only the file shows what it contains.
         self._last = b""
         if live is not None and not live.give_up():
             self._uncut = live.path, live.synced
@@ -160,7 +160,7 @@ class Recorder:
     def _open(self, time_utc_ns: int, day: str, state: bytes) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         if self._uncut is not None:
-            # What it holds beyond that is written again.
+            # What follows is written again.
             path, size = self._uncut
             if path.exists() and path.stat().st_size > size:
                 os.truncate(path, size)
@@ -172,7 +172,7 @@ class Recorder:
         if previous and not before:
             before = last_value(previous[-1])
         names = self._names(time_utc_ns, previous[-1] if previous else None)
-        live = self._live = _Live(names, self._machine, before or chain.NOTHING, time_utc_ns)
+        live = self._live = RecordingFile(names, self._machine, before or chain.NOTHING, time_utc_ns)
         self.path = live.path
         metadata = {
             "machine": self._machine,
@@ -195,7 +195,7 @@ class Recorder:
         self._day = day
         sync_folder(self._folder)
         if self._reason in ("start", "failure"):
-            # A kill leaves files that are not finished: at a start any of them, after a failure the last.
+            # A kill leaves unfinished files: at a start it may be any of them, after a failure the last.
             for path in previous if self._reason == "start" else previous[-1:]:
                 self._finisher.enqueue(path, time_utc_ns)
 
@@ -204,61 +204,13 @@ class Recorder:
         stamp = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
         number = 0
         if newest is not None:
-            # Names show the order in which files were begun, also where the clock was set back between them.
+            # Names are in the order in which files were opened, even if the clock was set back between them.
             last, _, suffix = newest.stem.removeprefix(f"{self._machine}_").partition("-")
             if last >= stamp:
                 stamp, number = last, int(suffix or 0) + 1
         for count in range(number, number + 1000):
             ending = f"-{count:03d}" if count else ""
             yield self._folder / f"{self._machine}_{stamp}{ending}.mcap"
-
-
-class _Live(LiveFile):
-    """The file that is being written, with its chain."""
-
-    def __init__(self, paths: Iterable[Path], machine: str, before: bytes, time_ns: int) -> None:
-        super().__init__(paths)
-        self.time_ns = self.sealed_ns = time_ns
-        self._machine = machine
-        self._channels: dict[str, int] = {}
-        self._sequence = 0
-        self._chain = chain.ChainWriter(machine, before)
-
-    @property
-    def head(self) -> bytes:
-        """Value of the chain at the last record."""
-        return self._chain.head
-
-    def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
-        """Write what the file opens with."""
-        contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
-        for number, topic in enumerate(TOPICS, 1):
-            about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
-            contents.channels[number] = Channel(f"/{topic}", "json", about, kind, "jsonschema", schema)
-        opening = Opening(self.writer)
-        opening.write(contents)
-        self._channels = {topic: number for number, topic in opening.topics.items()}
-        self._write("chain", self._chain.begin(chain.parts_of(contents), self.time_ns))
-
-    def add(self, records: Iterable[tuple[str, bytes]], time_ns: int) -> None:
-        """Write a group of records and the values of the chain."""
-        self.time_ns = time_ns
-        for topic, data in records:
-            self._chain.add(topic, chain.body_of(self._sequence, time_ns, data))
-            self._write(topic, data)
-        self._write("chain", self._chain.message(time_ns))
-
-    def seal(self, reason: str, time_ns: int, signer: Signer | None) -> None:
-        """Write a seal, signed where there is a key."""
-        message = chain.seal(self._machine, time_ns, reason, self._sequence - 1, self.head)
-        if signer is not None:
-            message = signer.sign(message)
-        self.sealed_ns = time_ns
-        self.add([("seal", encode(message))], time_ns)
-
-    def _write(self, topic: str, data: bytes) -> None:
-        self.writer.add_message(self._channels[topic], self.time_ns, data, self.time_ns, sequence=self._sequence)
-        self._sequence += 1
 
 
 def _attached(name: str, media_type: str, data: bytes, time_ns: int) -> Attachment:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from compensator.atomic_write import whole_file
-from compensator.reasons import Caution, explain
+from compensator.reasons import Remark, explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 
@@ -109,12 +109,12 @@ class Words:
     kind: Literal["warning", "plain"] = "plain"
 
 
-def warnings_of(cautions: Iterable[Caution]) -> Words:
+def warnings_of(cautions: Iterable[Remark]) -> Words:
     """Return warnings as a block with links to their codes."""
     return Words(title="Warnings", lines=[sentence_of(caution) for caution in cautions], kind="warning")
 
 
-def sentence_of(caution: Caution) -> Cell:
+def sentence_of(caution: Remark) -> Cell:
     """Return a warning or remark as a line with a link to its code."""
     return (str(caution), " ", Code(caution.code))
 

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
-from compensator.reasons import Caution, explain
+from compensator.reasons import Remark, explain
 from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
 from compensator.report.notation import plain, signed
@@ -143,12 +143,12 @@ def _against_stated(whole: Period) -> str:
     return f" (the service states a standard deviation of {_short(whole.std.rms)})" if whole.std.rms > 0.0 else ""
 
 
-def _beyond(whole: Period) -> Caution | None:
+def _beyond(whole: Period) -> Remark | None:
     """Warn where the remaining error exceeds what the service states."""
     if not (whole.left.samples and 0.0 < _BEYOND * whole.std.rms < whole.left.rms):
         return None
     remains = f"{_short(whole.left.rms)} rms remain with the correction; the service states {_short(whole.std.rms)}."
-    return Caution("left_beyond_stated", remains)
+    return Remark("left_beyond_stated", remains)
 
 
 def _short(value_um: float) -> str:

@@ -1,4 +1,4 @@
-"""Sends commands to a running service, as an operator's program does."""
+"""Sends commands to a running service, for an operator's program."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from compensator.certificates import check_files, common_name_of
 from compensator.config import Zenoh
 from compensator.errors import ConfigError, ServiceError, UsageError
 from compensator.service.publisher import SENDER
-from compensator.service.session import files_of, get, put, read_config_file, session_config
+from compensator.service.session import files_of, get, read_config_file, session_config, set_key
 
 
 class NotReached(ServiceError):
-    """No service heard the command."""
+    """No service received the command."""
 
 
 class Operator(NamedTuple):
@@ -31,8 +31,8 @@ class Operator(NamedTuple):
     config : zenoh.Config
         Configuration of the session.
     name : str
-        Who it is: the common name of the certificate. Without TLS the user's name on this computer, which is only
-        said. Empty where neither can stand in a key.
+        Common name of the certificate; without TLS the user's name on this computer, which proves nothing. Empty if
+        neither can be part of a key.
     """
 
     config: zenoh.Config
@@ -52,15 +52,15 @@ def operator_of_file(path: Path) -> Operator:
         raise ConfigError(f"{path}: mode = {get(config, 'mode')!r}, expected client")
     if not get(config, "connect/endpoints"):
         raise ConfigError(f"{path}: connect/endpoints: missing, expected the router, such as tls/HOST:7447")
-    put(config, "mode", "client")
-    put(config, "scouting/multicast/enabled", False)
+    set_key(config, "mode", "client")
+    set_key(config, "scouting/multicast/enabled", False)
     _one_attempt(config)
     if not tls:
         return Operator(config, _user())
     files = files_of(path, tls, "connect")
     certificate = check_files(str(path), files)
     wrong = certificate.wrong_at(datetime.datetime.now(datetime.UTC)) if certificate is not None else None
-    if wrong is not None:  # refused by the router, it would look like a service that is not there
+    if wrong is not None:  # the router would refuse it, which looks like a missing service
         raise ConfigError(f"{path}: {wrong}")
     if get(config, "transport/link/tls/enable_mtls") is not True:
         raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true, or no certificate is shown")
@@ -71,16 +71,16 @@ def operator_of_file(path: Path) -> Operator:
 
 
 def operator_here(settings: Zenoh) -> Operator | None:
-    """Return how the service of a configuration is reached from its own computer; None where it is nowhere to be found.
+    """Return how the service of a configuration is reached from its own computer; None if it cannot be.
 
     Raises
     ------
     UsageError
-        If that takes an operator's certificate: the machine's own gives no commands.
+        If that needs an operator's certificate: the machine's own may send no commands.
     """
     if settings.secured():
         raise UsageError(
-            "--zenoh: missing; over TLS commands take an operator's certificate, expected a Zenoh "
+            "--zenoh: missing; over TLS commands need an operator's certificate, expected a Zenoh "
             "configuration such as operator.json5"
         )
     listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
@@ -93,8 +93,8 @@ def operator_here(settings: Zenoh) -> Operator | None:
 
 
 def _one_attempt(config: zenoh.Config) -> None:
-    put(config, "connect/timeout_ms", 0)  # a service that runs is there
-    put(config, "connect/exit_on_failure", True)
+    set_key(config, "connect/timeout_ms", 0)  # a running service answers at once
+    set_key(config, "connect/exit_on_failure", True)
 
 
 def _user() -> str:
@@ -113,7 +113,7 @@ def ask(
     Parameters
     ----------
     settings : Zenoh
-        Settings of the service: it is looked for where it listens, and at the routers that it connects to.
+        Settings of the service; it is reached where it listens, or through the routers that it connects to.
     command : str
         Such as `hold`.
     payload : bytes
@@ -121,7 +121,7 @@ def ask(
     timeout_s : float
         How long to wait for the reply, s.
     operator : Operator, optional
-        Who asks; found out from the settings where nothing is given.
+        Sender; derived from the settings by default.
 
     Returns
     -------
@@ -131,14 +131,14 @@ def ask(
     Raises
     ------
     NotReached
-        If nobody answers at the endpoints, or no service of that prefix is there; it names those that are.
+        If nothing answers at the endpoints, or no service of that prefix is there; it names those that are.
     ServiceError
-        If the service is alive and does not answer.
+        If the service is alive but does not answer.
     """
     operator = operator or operator_here(settings)
-    nobody = f"{settings.prefix}: the service is not reached"
+    unreached = f"{settings.prefix}: the service is not reached"
     if operator is None:
-        raise NotReached(f"{nobody}: zenoh has neither listen nor connect to find it at")
+        raise NotReached(f"{unreached}: zenoh has neither listen nor connect to find it at")
     where = ", ".join(get(operator.config, "connect/endpoints") or ())
     key = f"{settings.prefix}/thermal/command/{command}" + (f"/{operator.name}" if operator.name else "")
     try:
@@ -148,26 +148,26 @@ def ask(
                     reply: dict[str, Any] = json.loads(answer.ok.payload.to_bytes())
                     return reply
             own = f"{settings.prefix}/thermal/alive"
-            # Who may know of this machine alone asks for it alone.
+            # An operator who may see this machine only must ask for it alone.
             alive = [*alive_at(own, session, timeout_s), *alive_at("**/thermal/alive", session, timeout_s)]
     except (zenoh.ZError, ValueError) as error:
-        raise NotReached(f"{nobody}: nobody answers at {where}; does the service, or its router, run?") from error
+        raise NotReached(f"{unreached}: nothing answers at {where}; does the service, or its router, run?") from error
     if settings.prefix in alive:
         raise ServiceError(
-            f"{key}: the service is alive and gives no answer: does the router's access list permit "
+            f"{key}: the service is alive but does not answer: does the router's access list permit "
             f"{operator.name or 'this'}?"
         )
     there = f"alive there: {', '.join(sorted(alive))}" if alive else "none is alive there"
-    raise NotReached(f"{nobody}: none of that prefix at {where}; {there}")
+    raise NotReached(f"{unreached}: none of that prefix at {where}; {there}")
 
 
 def alive_at(key: str, session: zenoh.Session, timeout_s: float) -> list[str]:
-    """Return the prefixes of the services that are alive, as far as whoever asks may know.
+    """Return the prefixes of the services that are alive, as far as the session may see them.
 
     Parameters
     ----------
     key : str
-        Of their tokens, such as `**/thermal/alive` for all.
+        Key of their tokens, such as `**/thermal/alive` for all.
     session : zenoh.Session
         Open.
     timeout_s : float

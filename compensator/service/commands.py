@@ -1,4 +1,4 @@
-"""Commands from outside: checked on the thread that brings them, obeyed between two samples."""
+"""Commands from outside: checked on the thread that receives them, applied between two samples."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from compensator.service.publisher import COMMANDS, Reply, Sender
 from compensator.service.replay import execute
 from compensator.service.takeover import Takeover, refusal, sent_by
 
-#: Longest payload of a command that brings no model, bytes.
+#: Longest payload of a command without a model, bytes.
 LONGEST_COMMAND = 10_000
 #: So many commands wait for the next sample at most.
 WAITING_COMMANDS = 100
-#: So many refused commands are noted between two samples; what floods must not push other events out.
+#: So many refused commands are noted between two samples; a flood must not displace other events.
 NOTED_REFUSALS = 10
 
 
 class Commands:
-    """Takes commands from other threads.
+    """Receives commands from other threads.
 
     Parameters
     ----------
     journal : Journal
-        Where each command is noted.
+        Notes each command.
     takeover : Takeover
-        Takes `adopt` and `back`.
+        Carries out `adopt` and `back`.
     unproven : bool
-        Whether commands are taken of which nobody proves who sent them.
+        Whether commands are accepted whose sender is not authenticated.
     """
 
     def __init__(self, journal: Journal, takeover: Takeover, *, unproven: bool) -> None:
@@ -46,15 +46,15 @@ class Commands:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def open(self) -> None:
-        """Take commands from now on, in the loop that runs."""
+        """Accept commands from now on, in the running loop."""
         self._loop = asyncio.get_running_loop()
 
     def close(self) -> None:
-        """Take none any more."""
+        """Refuse commands from now on."""
         self._loop = None
 
-    def take(self, name: str, payload: bytes, sender: Sender) -> Reply:
-        """Take a command from another thread; see `Daemon.command`."""
+    def receive(self, name: str, payload: bytes, sender: Sender) -> Reply:
+        """Accept or refuse a command from another thread; see `Daemon.command`."""
         loop = self._loop
         try:
             arguments = self._checked(name, payload, sender)
@@ -72,8 +72,8 @@ class Commands:
         loop.call_soon_threadsafe(self._enqueue, name, arguments, sender)
         return {"ok": True, "text": f"{name}: acts at the next sample"}
 
-    def obey(self, compensation: Compensation) -> None:
-        """Let the compensation obey what came since the last sample."""
+    def apply(self, compensation: Compensation) -> None:
+        """Apply the commands that arrived since the last sample."""
         self._refused = 0
         while not self._waiting.empty():
             name, arguments, sender = self._waiting.get_nowait()
@@ -81,7 +81,7 @@ class Commands:
             execute(compensation, name, arguments)
 
     def _checked(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
-        """Return the arguments of a command that can be taken."""
+        """Return the arguments of an acceptable command."""
         if len(payload) > (LONGEST_MODEL if name in ("adopt", "back") else LONGEST_COMMAND):
             raise ServiceError(f"{name}: the payload has {len(payload)} bytes, more than a command may have")
         try:
@@ -95,7 +95,7 @@ class Commands:
             )
         if sender.proof == "none" and not self._unproven:
             raise ServiceError(
-                f"{name}: nobody proves that {sender.name} sends it; expected a router with TLS and the key "
+                f"{name}: the sender {sender.name} is not authenticated; expected a router with TLS and the key "
                 f"thermal/command/{name}/<common name of the certificate>, or zenoh.unproven_commands = true"
             )
         return arguments

@@ -1,8 +1,8 @@
-"""From a sample to an offset: guards, zero, engine, loss of a sensor, limits, state.
+"""From a sample to an offset: guards, zero, engine, plausibility, decision.
 
-This is the whole decision of the service, and it knows no socket, file or clock: a recorded sample gives the
-same estimate and the same offset again, bit for bit. What it publishes never jumps: every change goes
-through the limiter, whatever caused it.
+This is the whole decision of the service. It knows no socket, file or clock, so a recorded sample gives the same
+estimate and the same offset again, bit for bit. The published offset never jumps: every change passes the limiter,
+whatever caused it.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import msgspec
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind, Note, ZeroData
-from compensator.messages import SCHEMA, Offset, Sample, State, number
+from compensator.messages import Offset, Sample, number
 from compensator.model.effects import effect_from
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.guards import HEATED_W, SensorGuards
-from compensator.service.limits import Limited, OffsetLimiter
-from compensator.service.outcome import VALID_SAMPLES, Outcome, Values, estimate_message, offset_message, values_of
-from compensator.service.plausibility import Evidence, PlausibilityCheck, PlausibilityState
+from compensator.reasons import Reason, SampleQuality, State
+from compensator.service.decision import Decision, OffsetDecision, mean
+from compensator.service.outcome import Outcome, Values, estimate_message
+from compensator.service.plausibility import HEATED_W, Evidence, PlausibilityCheck, PlausibilityState, SensorGuards
 from compensator.service.state import (
     STATE_SCHEMA,
     CompensationState,
@@ -39,9 +39,9 @@ NAN = float("nan")
 #: Number of samples over which rate and heat are averaged before they decide anything.
 MEAN_SAMPLES = 5
 
-#: Longest pause that is walked over, in samples: more would delay the sample after it.
+#: Longest pause that is passed over, in samples: a longer one would delay the sample after it.
 MOST_BRIDGED = 1500
-#: A state that began unknown counts as known after so many of the slowest time constants (5 % are left then).
+#: A state that started unknown counts as known after so many of the slowest time constants (5 % are left then).
 KNOWN_AFTER = 3.0
 
 
@@ -53,7 +53,7 @@ class Compensation:
     config : Config
         Limits, guards, loss, zero.
     model : ThermalModel
-        What predicts the deformation.
+        Predicts the deformation.
     """
 
     def __init__(self, config: Config, model: ThermalModel) -> None:
@@ -67,33 +67,24 @@ class Compensation:
             raise ServiceError(f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured")
         self._guards = SensorGuards(config.channel, config.guards, self._period_min)
         self.plausibility = PlausibilityCheck(config, model)
-        self._limiter = OffsetLimiter(config.limits, self._period_min)
+        self._decision = OffsetDecision(config, model, self._engine.channels)
+        self._limiter = self._decision.limiter
         self._zero = ZeroState(wanted=config.zero.at_start)
         self._memory = Memory()
-        self._validity = self._bounds()
         #: The model's slowest time constant, min.
         self.slowest_min = slowest_min(model)
-
-    def _bounds(self) -> dict[str, tuple[float, float]]:
-        """Return the range of validity: the configuration's, narrowed by the model's own."""
-        limits = self._config.limits.validity
-        bounds = {"t_q_degc": limits.t_q_degc, "at_degc": limits.at_degc}
-        for key, (low, high) in self.model.validity.items():
-            configured = bounds.get(key, (-math.inf, math.inf))
-            bounds[key] = (max(low, configured[0]), min(high, configured[1]))
-        return bounds
 
     # ------------------------------------------------------------------ commands
 
     def zero(self, mode: ZeroMode = "auto") -> None:
-        """Ask for a zero at the next sample that has both temperatures.
+        """Request a zero at the next sample that has both temperatures.
 
         Parameters
         ----------
         mode : {"auto", "rest", "warm"}
             `rest`: the machine is in thermal equilibrium; temperatures and deformation count from here.
-            `warm`: it is not; only the deformation counts from here, what the machine has stored goes on.
-            `auto`: `rest` where the predicted growth is below the configured rate, else `warm`.
+            `warm`: it is not; only the deformation counts from here, the stored heat stays in the state.
+            `auto`: `rest` if the predicted growth is below the configured rate, else `warm`.
         """
         self._zero.wanted, self._zero.mode = True, mode
 
@@ -104,35 +95,25 @@ class Compensation:
     def resume(self) -> None:
         """Follow the model again, at the permitted rate.
 
-        After exchanged sensors the state is that of a machine which never was: it begins unknown.
+        After exchanged sensors the state is wrong, so it starts unknown again.
         """
         self._memory.operator_hold = False
         self._memory.internal_error = False
         if self.plausibility.exchanged:
-            self.plausibility.seen()
+            self.plausibility.acknowledge()
             if self._engine.has_reference:
-                self._pass_cold(min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED))
+                self._pass_cold(self._cold_samples)
 
     def fail(self) -> None:
-        """Hold the offset because the service met an error of its own."""
+        """Hold the offset because of an internal error."""
         self._memory.internal_error = True
 
     def held(self, machine: str, seq: int, time_utc_ns: int) -> Offset:
-        """Return the message that the last offset stands, for a sample that could not be worked on."""
-        stands = self._limiter.offset_um if self._memory.estimate else NAN
-        return Offset(
-            schema=SCHEMA,
-            machine=machine,
-            seq=seq,
-            time_utc_ns=time_utc_ns,
-            valid_for_s=VALID_SAMPLES * self.model.period_s,
-            y_offset_um=stands,
-            y_offset_rate_um_per_min=0.0 if self._memory.estimate else NAN,
-            y_offset_std_um=NAN,
-            state="hold" if self._memory.estimate else "fault",
-            reasons=["internal_error"],
-            model_sha256=self.model.sha256,
-        )
+        """Return the message that the last offset is held, for a sample that could not be processed."""
+        known = self._memory.estimate is not None
+        limited = self._limiter.hold() if known else None
+        decision = Decision(State.HOLD if known else State.FAULT, [Reason.INTERNAL_ERROR], limited)
+        return decision.message(self.model, machine, seq, time_utc_ns, NAN)
 
     # ------------------------------------------------------------------ state
 
@@ -153,7 +134,7 @@ class Compensation:
 
     @property
     def target_um(self) -> float:
-        """Where the offset is to go, µm; NaN while there is no estimate."""
+        """The offset that the model asks for, µm; NaN while there is no estimate."""
         estimate = self._memory.estimate
         return self._zero.y_base - estimate.y_um if estimate is not None else NAN
 
@@ -164,7 +145,7 @@ class Compensation:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether the offset is still under way to that of another model."""
+        """Whether the offset is still moving to that of another model."""
         return self._memory.model_changed
 
     @property
@@ -174,7 +155,7 @@ class Compensation:
 
     @property
     def zero_that_stands(self) -> dict[str, float]:
-        """The zero, as `begin` takes it."""
+        """The current zero, as arguments of `begin`."""
         reference = self._engine.reference
         return {
             "t_q_ref_degc": reference.t_q_degc,
@@ -185,7 +166,7 @@ class Compensation:
 
     @property
     def is_cold(self) -> bool:
-        """Whether the state began unknown and that is not forgotten yet."""
+        """Whether the state started unknown and is not known yet."""
         return self._memory.cold_min > 0.0
 
     @property
@@ -211,12 +192,12 @@ class Compensation:
         )
 
     def restore(self, state: bytes) -> None:
-        """Go on from a state; all further outcomes are those that would have followed, bit for bit.
+        """Continue from a state; all further outcomes are those that would have followed, bit for bit.
 
         Raises
         ------
         DataError
-            If it is no state, or that of another model or of other channels. Nothing is changed then.
+            If it is no state, or that of another model or of other channels; then nothing is changed.
         """
         whole = decode_state(state)
         for name, found, expected in (
@@ -238,21 +219,20 @@ class Compensation:
         self._engine, self._zero, self._memory = engine, whole.zero, whole.memory
         self._guards.restore(whole.guards)
         self._limiter.offset_um = whole.offset_um
-        # A state of before there was this check has no part for it: it begins anew.
+        # A state from a version without these checks has none of theirs.
         self.plausibility.state = whole.plausibility or PlausibilityState()
 
     def pause(self, samples: int) -> None:
-        """Pass over samples that nobody took, such as those while the service did not run.
+        """Pass over samples that were not measured, such as those while the service did not run.
 
-        They count as missing: the prediction goes on and its standard deviation grows, and the next sample with both
-        temperatures walks over them again. A pause of more than `bridge_max_min` says nothing certain about the state
-        at its end: the machine is then taken to have been all the while as it is found, and the reason `cold_start`
-        stands until that is forgotten.
+        They count as missing: the prediction continues and its standard deviation grows, and the next sample with both
+        temperatures interpolates them. After more than `bridge_max_min` the state is unknown: the machine is assumed
+        to have been all the time as it is found, and the reason `cold_start` stays until that is forgotten.
 
         Parameters
         ----------
         samples : int
-            How many; nothing is done for none.
+            Their number; nothing is done for none.
         """
         if samples <= 0:
             return
@@ -268,52 +248,57 @@ class Compensation:
             self._memory.estimate = self._engine.skip(samples)
 
     def pause_of_unknown_length(self) -> None:
-        """Pass over a pause whose length nobody knows, as over one that is too long to be bridged."""
+        """Pass over a pause of unknown length, as over one that is too long to be bridged."""
         longest = max(KNOWN_AFTER * self.slowest_min, self.bridge_max_min)
         self.pause(math.floor(longest / self._period_min) + 1)
+
+    @property
+    def _cold_samples(self) -> int:
+        """Samples after which a state that started unknown counts as known."""
+        return min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED)
 
     def _pass_cold(self, samples: int) -> None:
         self._memory.estimate = self._engine.skip(samples, held=True)
         self._memory.cold_min = KNOWN_AFTER * self.slowest_min
 
     def begin(self, *, t_q_ref_degc: float, at_ref_degc: float, y_ref_um: float, y_base_um: float) -> None:
-        """Begin with a zero that was set before there is a record, and with an unknown state.
+        """Start with a zero that was set before the record, and with an unknown state.
 
         Parameters
         ----------
         t_q_ref_degc, at_ref_degc, y_ref_um : float
-            The zero: temperatures, °C, and measured deformation, µm (NaN where it is not known).
+            The zero: temperatures, °C, and measured deformation, µm (NaN if unknown).
         y_base_um : float
             Predicted deformation at the last zero on a warm machine, µm.
         """
         self._engine.set_reference(t_q_ref_degc, at_ref_degc)
         self._zero = ZeroState(y_ref=y_ref_um, y_base=y_base_um)
-        self._pass_cold(min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED))
+        self._pass_cold(self._cold_samples)
 
     def begin_at_zero(self) -> None:
-        """Wait for the zero of a record, whatever the configuration says of the start."""
+        """Wait for the zero of a record, whatever the configuration requests for the start."""
         self._zero = ZeroState()
 
     def go_on_from(self, offset_um: float, *, model_changed: bool = False) -> None:
-        """Go on from the offset that stands; from there it moves at the permitted rate.
+        """Continue from an offset; from there it moves at the permitted rate.
 
         Parameters
         ----------
         offset_um : float
-            What was published last, µm.
+            The last published offset, µm.
         model_changed : bool
-            Whether it is another model's; the reason stands until the offset has arrived at its new value.
+            Whether it is another model's; the reason stays until the offset has reached its new value.
         """
         self._limiter.offset_um = offset_um
         self._memory.model_changed = model_changed
 
     def succeed(self, other: Compensation) -> None:
-        """Take the place of a compensation with another model: its offset, holds and waiting zero stand.
+        """Replace a compensation with another model; its offset, holds and waiting zero are kept.
 
         Parameters
         ----------
         other : Compensation
-            The one before.
+            The previous one.
         """
         memory = other._memory
         self._memory.operator_hold, self._memory.internal_error = memory.operator_hold, memory.internal_error
@@ -323,7 +308,7 @@ class Compensation:
     # ------------------------------------------------------------------ one sample
 
     def process(self, raw: Sample) -> Outcome:
-        """Take one sample.
+        """Process one sample.
 
         Parameters
         ----------
@@ -336,8 +321,8 @@ class Compensation:
             Everything to be recorded and published, in that order.
         """
         heat = self._memory.estimate.heat_w if self._memory.estimate else NAN
-        sample = msgspec.structs.replace(raw, channels=self._guards.judge(raw.channels, heat))
-        values = values_of(sample.channels)
+        sample = msgspec.structs.replace(raw, channels=self._guards.check(raw.channels, heat))
+        values = Values.of(sample.channels)
         notes: list[Note] = []
         self._set_zero(values, notes)
         self._memory.seq, self._memory.time_utc_ns = raw.seq, raw.time_utc_ns
@@ -349,29 +334,29 @@ class Compensation:
             self._memory.heats = [*self._memory.heats[-MEAN_SAMPLES + 1 :], estimate.heat_w]
         y_pred = estimate.y_um - self._zero.y_base if estimate else NAN
         if math.isnan(self._zero.y_ref) and estimate is not None:
-            # The probe was missing at the zero: its reference makes the residual start at zero.
+            # The probe was missing at the zero: with this reference the residual starts at zero.
             self._zero.y_ref = values.y - y_pred
         if self.plausibility.is_on:
-            notes += self.plausibility.take(self._evidence(raw, values, estimate, y_pred))
-        state, reasons, limited = self._decide(values, estimate, y_pred)
-        # Somebody is suspected: the offset may be wrong by what measured and predicted Y differ by.
+            notes += self.plausibility.update(self._evidence(raw, values, estimate, y_pred))
+        decision = self._decision.decide(values, estimate, y_pred, self._memory, self.plausibility)
+        # During an alarm the offset may be wrong by the difference of measured and predicted Y.
         std = math.hypot(estimate.y_std_um, self.plausibility.error_um) if estimate else NAN
         return Outcome(
             sample=sample,
             estimate=estimate_message(sample, values, estimate, self._engine.reference, self._zero, y_pred),
-            offset=offset_message(sample, self.model, std, state, reasons, limited),
+            offset=decision.message(self.model, sample.machine, sample.seq, sample.time_utc_ns, std),
             notes=tuple(notes),
         )
 
     def _evidence(self, raw: Sample, values: Values, estimate: Estimate | None, y_pred: float) -> Evidence:
-        """Return what the checks between the sensors look at."""
+        """Return what the checks between the sensors use."""
         t_q, at = (
-            number(channel.mean) if channel is not None and channel.device_quality == "good" else NAN
+            number(channel.mean) if channel is not None and channel.device_quality == SampleQuality.GOOD else NAN
             for channel in (raw.channels.get(name) for name in ("t_q_degc", "at_degc"))
         )
         reference = self._engine.reference
         rest = self._config.plausibility.rest if self._config.plausibility is not None else None
-        # A prediction without both temperatures, or from an unknown state, is no witness against a sensor.
+        # A prediction without both temperatures, or from an unknown state, proves nothing about a sensor.
         usable = not math.isnan(values.t_q + values.at) and self._memory.cold_min <= 0.0
         return Evidence(
             below_k=at - t_q,
@@ -388,14 +373,14 @@ class Compensation:
             return
         warm = self._engine.has_reference and self._is_warm(zero.mode)
         if warm:
-            # The state is that of the last sample; its growth until this one belongs to what comes.
+            # The state is that of the last sample; the growth since then belongs to what follows.
             zero.y_base = self._memory.estimate.y_um if self._memory.estimate else 0.0
         else:
             self._engine.set_reference(values.t_q, values.at)
             self._memory.estimate, self._memory.rates, self._memory.heats = None, [], []
             zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
-        self.plausibility.zeroed(at_rest=not warm)
+        self.plausibility.reset(at_rest=not warm)
         # Version 0.1.0 recorded this text without data: an audit of its recordings compares it.
         text = (
             f"zero on a {'warm machine' if warm else 'machine at rest'}: T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C"
@@ -407,63 +392,9 @@ class Compensation:
     def _is_warm(self, mode: ZeroMode) -> bool:
         if mode != "auto" or not self._memory.rates:
             return mode == "warm"
-        # A machine on a long plateau hardly grows, but it is heated: its heat must not become the zero.
-        heated = abs(_mean(self._memory.heats)) > HEATED_W
-        return heated or abs(_mean(self._memory.rates)) > self._config.zero.rest_rate_um_per_min
-
-    # ------------------------------------------------------------------ decision
-
-    def _decide(
-        self, values: Values, estimate: Estimate | None, y_pred: float
-    ) -> tuple[State, list[str], Limited | None]:
-        reasons = [
-            code for code, value in (("t_q_missing", values.t_q), ("at_missing", values.at)) if math.isnan(value)
-        ]
-        lost = bool(reasons)
-        self._memory.missing_min = self._memory.missing_min + self._period_min if lost else 0.0
-        expired = lost and self._memory.missing_min > self._config.loss.predict_for_min
-        if estimate is None:
-            state: State = "fault" if expired else "starting"
-            return state, [*reasons, "no_zero"], None
-        reasons += [
-            f"channel_missing:{name}" for name in self._engine.channels if math.isnan(values.others.get(name, NAN))
-        ]
-        if self._memory.cold_min > 0.0:
-            self._memory.cold_min -= self._period_min
-            reasons.append("cold_start")
-        reasons += self.plausibility.reasons
-        blocking = self._blocking(values, expired)
-        if self.plausibility.exchanged:
-            return "fault", [*reasons, *blocking, "t_q_at_exchanged"], self._limiter.hold()
-        if blocking:
-            return "hold", reasons + blocking, self._limiter.hold()
-        if lost:
-            reasons.append("predicting")
-        limited = self._limiter.follow(0.0 - y_pred, -estimate.y_rate_um_per_min)
-        self._memory.model_changed &= "rate_limited" in limited.reasons
-        if self._memory.model_changed:
-            reasons.append("model_changed")
-        reasons += limited.reasons
-        return ("degraded" if reasons else "ok"), reasons, limited
-
-    def _blocking(self, values: Values, expired: bool) -> list[str]:
-        """Return why the offset must stay where it is."""
-        # A single estimate of the heat overshoots when a source is switched; its mean over some samples does not.
-        heat = _mean(self._memory.heats)
-        outside = [
-            f"outside_validity:{name}"
-            for name, value in (("t_q_degc", values.t_q), ("at_degc", values.at), ("heat_w", heat))
-            if name in self._validity
-            and not math.isnan(value)
-            and not self._validity[name][0] <= value <= self._validity[name][1]
-        ]
-        flags = (
-            ("prediction_expired", expired),
-            ("residual_too_large", self.plausibility.too_large),
-            ("operator_hold", self._memory.operator_hold),
-            ("internal_error", self._memory.internal_error),
-        )
-        return outside + [code for code, present in flags if present]
+        # A machine on a long plateau grows slowly but is heated: its heat must not become the zero.
+        heated = abs(mean(self._memory.heats)) > HEATED_W
+        return heated or abs(mean(self._memory.rates)) > self._config.zero.rest_rate_um_per_min
 
 
 def slowest_min(model: ThermalModel) -> float:
@@ -473,7 +404,3 @@ def slowest_min(model: ThermalModel) -> float:
     for effect in model.effects:
         times += effect_from(effect.kind, effect.table).time_constants_min
     return max(times, default=model.period_s / 60.0)
-
-
-def _mean(values: list[float]) -> float:
-    return math.fsum(values) / len(values) if values else NAN

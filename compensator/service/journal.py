@@ -1,70 +1,157 @@
-"""What is said and kept of each sample: events that wait for the disk, the recording, and whether it is taken."""
+"""The way of a sample to disk: samples and events in their order, written by a thread of their own.
+
+A slow disk delays neither polling nor commands. What waits is written together, with one sync, so that a slow disk
+catches up; what a disk refuses waits and is written once the disk accepts it. An offset that cannot wait any longer is
+published with the reason `recording_late` or `recording_failed`.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
 
-from compensator.clock import Clock
+from compensator.clock import NS, Clock
 from compensator.events import RecordingCode, RecordingData
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
-from compensator.reasons import Caution
+from compensator.reasons import Reason, Remark
+from compensator.remarks import ServiceWarning
 from compensator.service.offset_checkpoint import OffsetCheckpoint
-from compensator.service.recording_thread import FAILED, LATE, WAITING_EVENTS, Group, RecordingThread
 
 log = logging.getLogger("compensator")
 
-#: How it is said that the disk refuses the recording, takes it too late, and takes it again.
+#: So many samples wait for the disk at most (four hours at one a minute), so that a lost disk costs no memory; then the
+#: oldest are dropped.
+WAITING_SAMPLES = 240
+#: So many events wait with them; the newest are kept.
+WAITING_EVENTS = 1000
+#: Texts of the events when the disk refuses the recording, accepts it too late, and accepts it again.
 DISK_FAILED = "the disk does not take the recording"
 DISK_LATE = "the disk takes the recording too late"
 DISK_BACK = "the disk takes the recording again"
-#: How often it is said that the service waits for the disk at its end, s.
+#: How often the log warns that the service waits for the disk at its end, s.
 CLOSING_S = 10.0
 
 
-class Entry(NamedTuple):
-    """What is on its way to the disk, and the attempt to bring it there."""
+class Recorder(Protocol):
+    """What the journal needs of a recording; used on the journal's thread, except `path` and `remarks`."""
 
-    group: Group
-    attempt: asyncio.Future[None]
+    @property
+    def path(self) -> Path | None:
+        """The file that is being written."""
+
+    def write(
+        self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"", sync: bool = True
+    ) -> None:
+        """Write records, and bring them to disk unless `sync` is false."""
+
+    def start_new(self, attachments: Mapping[str, bytes] | None = None) -> None:
+        """Finish the file; the next write opens a new one, with attachments that replace those of the same name."""
+
+    def remarks(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return text and data of events about finished files."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class Entry:
+    """A sample on its way to the disk, with everything that is written together with it.
+
+    Parameters
+    ----------
+    time_utc_ns : int
+        Its time, ns since 1970 UTC.
+    state : bytes
+        State of the compensation before it.
+    events : list of Event
+        Events since the previous sample.
+    sample, estimate : bytes
+        JSON; empty if there is none.
+    offset : Offset, optional
+        As decided.
+    new_file : bool
+        Whether it must open a new file.
+    model : bytes, optional
+        Model file that is attached to recordings from here on.
+    """
+
+    time_utc_ns: int
+    state: bytes
+    events: list[Event] = field(default_factory=list)
+    sample: bytes = b""
+    estimate: bytes = b""
+    offset: Offset | None = None
+    new_file: bool = False
+    model: bytes | None = None
+    #: Reason with which the offset was published before it was on disk, empty otherwise.
+    reason: str = ""
+    on_disk: bool = False
+    #: The attempt to bring it to disk.
+    attempt: asyncio.Future[None] = field(init=False)
+
+    def records(self) -> list[tuple[str, bytes]]:
+        """Return topic and JSON of everything; the offset as it was published if it was already."""
+        records = [("event", encode(event)) for event in self.events]
+        records += [(topic, data) for topic, data in (("sample", self.sample), ("estimate", self.estimate)) if data]
+        if self.offset is not None:
+            records.append(("offset", encode(degraded(self.offset, self.reason) if self.reason else self.offset)))
+        return records
+
+    @property
+    def day(self) -> str:
+        """Its day, UTC; a file holds one."""
+        return datetime.fromtimestamp(self.time_utc_ns / NS, UTC).strftime("%Y%m%d")
+
+    def inherit(self, dropped: Entry) -> None:
+        """Take over what must not be lost with a sample that is dropped."""
+        self.events = [*dropped.events, *self.events][-WAITING_EVENTS:]
+        self.model = self.model if self.model is not None else dropped.model
+        self.new_file = True
 
 
 class Journal:
-    """Brings records and events to disk and says when the disk does not take them.
+    """Brings samples and events to disk and reports when the disk does not accept them.
 
     Parameters
     ----------
     machine : str
         Name of the machine.
     recorder : Recorder
-        Where every sample goes first.
+        Writes them.
     publish : callable
-        Takes a message's name and its JSON; never waits.
+        Publishes a message by name and JSON; never waits.
     clock : Clock
         For the time of events.
     sequence : int
         Number of the first sample.
     limit_s : float
-        So long the loop stands still for the disk, s.
+        So long the loop blocks for the disk, s.
     patience_s : float
-        So long an offset waits for the disk while polling goes on, s; not where the disk was late before.
-    early : OffsetCheckpoint, optional
-        Where an offset is noted that is published before it is on disk.
+        So long an offset waits for the disk while polling continues, s; not if the previous one was late already.
+    checkpoint : OffsetCheckpoint, optional
+        Keeps an offset that is published before it is on disk.
     """
 
     def __init__(
         self,
         *,
         machine: str,
-        recorder: Any,
+        recorder: Recorder,
         publish: Callable[[str, bytes], None],
         clock: Clock,
         sequence: int,
         limit_s: float,
         patience_s: float,
-        early: OffsetCheckpoint | None = None,
+        checkpoint: OffsetCheckpoint | None = None,
     ) -> None:
         self._machine = machine
         self._recorder = recorder
@@ -72,23 +159,37 @@ class Journal:
         self._clock = clock
         self._limit_s = limit_s
         self._patience_s = patience_s
-        self._early = early
-        self._thread = RecordingThread(recorder)
+        self._checkpoint = checkpoint
         self._events: list[Event] = []
-        #: What the next sample brings along: whether it opens a file, and another model.
+        #: What the next sample carries: whether it opens a file, and another model.
         self._new_file, self._model = False, None  # type: tuple[bool, bytes | None]
-        #: With which reason the last offset was published, and the last error of the disk.
+        #: Reason with which the last offset was published, and the last error of the disk.
         self._reason, self._error = "", None  # type: tuple[str, BaseException | None]
-        #: Number of the sample under way; events carry it.
+        #: Number of the current sample; events carry it.
         self.sequence = sequence
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="recording")
+        self._lock = threading.Lock()  # for what follows, which both threads use
+        self._waiting: deque[Entry] = deque()
+        self._writing: list[Entry] = []
+        self._failed = False
+        self._attempt: Future[None] | None = None
+        self._dropped = 0
 
     @property
     def file(self) -> str:
-        """Name of the recording, empty where there is none."""
+        """Name of the recording, empty if there is none."""
         return self._recorder.path.name if self._recorder.path else ""
 
+    @property
+    def waiting(self) -> int:
+        """Number of samples that are not on disk."""
+        with self._lock:
+            return sum(bool(entry.sample) for entry in (*self._waiting, *self._writing))
+
+    # ------------------------------------------------------------------ on the loop
+
     def note(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
-        """Keep an event for the recording and publish it."""
+        """Publish an event and keep it for the recording."""
         event = Event(
             schema=SCHEMA,
             machine=self._machine,
@@ -102,7 +203,12 @@ class Journal:
         self._events = [*self._events[1 - WAITING_EVENTS :], event]
         self._publish("event", encode(event))
 
-    def put(
+    def start_new_file(self, model: bytes | None = None) -> None:
+        """Let the next sample open a new file; with another model if one is given."""
+        self._new_file = True
+        self._model = model if model is not None else self._model
+
+    def enqueue(
         self,
         time_utc_ns: int,
         state: bytes,
@@ -111,7 +217,7 @@ class Journal:
         estimate: bytes = b"",
         offset: Offset | None = None,
     ) -> Entry:
-        """Have a sample and the waiting events brought to disk.
+        """Have a sample and the waiting events written after everything that waits.
 
         Parameters
         ----------
@@ -120,11 +226,11 @@ class Journal:
         state : bytes
             State of the compensation before it.
         sample, estimate : bytes
-            JSON; empty where there is none.
+            JSON; empty if there is none.
         offset : Offset, optional
-            What the compensation decided.
+            As decided.
         """
-        group = Group(
+        entry = Entry(
             time_utc_ns=time_utc_ns,
             state=state,
             events=self._events,
@@ -135,81 +241,133 @@ class Journal:
             model=self._model,
         )
         self._events, self._new_file, self._model = [], False, None
-        attempt = asyncio.wrap_future(self._thread.put(group))
-        attempt.add_done_callback(lambda done: done.cancelled() or done.exception())  # seen, also when it ends later
-        return Entry(group, attempt)
+        with self._lock:
+            self._waiting.append(entry)
+            if len(self._waiting) > WAITING_SAMPLES:
+                dropped = self._waiting.popleft()
+                self._waiting[0].inherit(dropped)
+                self._dropped += bool(dropped.sample)
+            # An attempt that has not started yet writes everything that waits by then.
+            if self._attempt is None or self._attempt.running() or self._attempt.done():
+                self._attempt = self._executor.submit(self._write_waiting)
+            attempt = self._attempt
+        entry.attempt = asyncio.wrap_future(attempt)
+        # Retrieve the error, also when the attempt ends later.
+        entry.attempt.add_done_callback(lambda done: done.cancelled() or done.exception())
+        return entry
 
-    async def tried(self, entry: Entry) -> bool:
-        """Stand still for the disk, and not long; tell whether more waiting would be of no use."""
+    async def wait_briefly(self, entry: Entry) -> bool:
+        """Block for the disk; return whether longer waiting would be useless."""
         await self._clock.settle([entry.attempt], self._limit_s)
         return entry.attempt.done() or bool(self._reason)
 
-    async def waited(self, entry: Entry) -> None:
-        """Wait on while others work."""
+    async def wait_patiently(self, entry: Entry) -> None:
+        """Wait longer while polling continues."""
         await self._clock.settle([entry.attempt], self._patience_s)
 
-    def settled(self, entry: Entry) -> Offset | None:
-        """Return the offset as it is to be published now.
+    def resolve(self, entry: Entry) -> Offset | None:
+        """Return the offset to be published now.
 
-        Where the disk has not taken it, or refused, the offset says so; the sample waits and is written in its order.
+        If the disk has not accepted it yet, or refused it, the offset carries the reason; the sample waits and is
+        written in its order.
         """
-        reason, in_flight = self._thread.published(entry.group)
-        self._tell_disk(reason, in_flight, entry.attempt.exception() if entry.attempt.done() else None)
+        with self._lock:
+            if not entry.on_disk:
+                entry.reason = Reason.RECORDING_FAILED if self._failed else Reason.RECORDING_LATE
+            # While it is being written, the disk may get the offset without the reason.
+            in_flight = bool(entry.reason) and entry in self._writing
+        self._note_disk(entry.reason, in_flight, entry.attempt.exception() if entry.attempt.done() else None)
         for text, data in self._recorder.remarks():
             self.note("recording", text, data)
-        offset = entry.group.offset
-        if self._early is not None and not reason:
-            self._early.forget()
-        elif self._early is not None and offset is not None:
-            self._early.keep(offset)
-        return degraded(offset, reason) if offset is not None and reason else offset
+        if self._checkpoint is not None and not entry.reason:
+            self._checkpoint.remove()
+        elif self._checkpoint is not None and entry.offset is not None:
+            self._checkpoint.write(entry.offset)
+        return degraded(entry.offset, entry.reason) if entry.offset is not None and entry.reason else entry.offset
 
     async def record(self, time_utc_ns: int, state: bytes, *, offset: Offset | None = None) -> Offset | None:
-        """Bring an offset without a sample, and the waiting events, to disk; return it as it is to be published."""
-        entry = self.put(time_utc_ns, state, offset=offset)
-        await self.tried(entry)
-        return self.settled(entry)
+        """Bring the waiting events, and an offset without a sample, to disk; return the offset to be published."""
+        entry = self.enqueue(time_utc_ns, state, offset=offset)
+        await self.wait_briefly(entry)
+        return self.resolve(entry)
 
     def expected(self, offset: Offset) -> Offset:
-        """Return the offset as it is published if the disk does as it did with the sample before."""
+        """Return the offset as it will be published if the disk does as it did with the previous sample."""
         return degraded(offset, self._reason) if self._reason else offset
 
-    def _tell_disk(self, reason: str, in_flight: bool, error: BaseException | None) -> None:
-        """Note once when the disk does not take the recording, and once when it does again."""
+    def _note_disk(self, reason: str, in_flight: bool, error: BaseException | None) -> None:
+        """Note once when the disk stops accepting the recording, and once when it accepts it again."""
         early = {"published_early": self.sequence, "reason": reason} if in_flight else {}
-        data = {"code": RecordingCode.DISK_LATE if reason == LATE else RecordingCode.DISK_FAILED, **early}
+        code = RecordingCode.DISK_LATE if reason == Reason.RECORDING_LATE else RecordingCode.DISK_FAILED
+        data = {"code": code, **early}
         if reason and (reason != self._reason or in_flight):
             if error is not None and not isinstance(error, OSError):
                 log.error("internal error", exc_info=error)
                 self.note("recording", f"{DISK_FAILED}: internal error: {type(error).__name__}: {error}", data)
-            elif reason == FAILED:
+            elif reason == Reason.RECORDING_FAILED:
                 self.note("recording", f"{DISK_FAILED}: {error or self._error}", data)
             else:
                 self.note("recording", f"{DISK_LATE}: not within {self._limit_s + self._patience_s:g} s", data)
         elif self._reason and not reason:
-            lost, self._thread.lost = self._thread.lost, 0
+            lost, self._dropped = self._dropped, 0
             text = f"{DISK_BACK}; " + (f"{lost} sample(s) were not recorded" if lost else "nothing was lost")
             self.note("recording", text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
         self._reason, self._error = reason, error or self._error
 
-    def start_new_file(self, model: bytes | None = None) -> None:
-        """Let the next sample open a file of its own; with another model where one is given."""
-        self._new_file = True
-        self._model = model if model is not None else self._model
-
     async def close(self, state: bytes) -> None:
-        """Say that the service ends, and finish the recording, however long the disk takes."""
+        """Note that the service ends, and finish the recording, however long the disk takes."""
         self.note("stop", "the service ends")
         await self.record(self._clock.utc_ns(), state)
-        closing = asyncio.wrap_future(self._thread.close())
+        closing = asyncio.wrap_future(self._executor.submit(self._finish))
+        self._executor.shutdown(wait=False)
         while not (await asyncio.wait([closing], timeout=CLOSING_S))[0]:
-            figures = f"The recording is being finished: the disk has not taken it for {CLOSING_S:g} s."
-            log.warning("%s", Caution("disk_finishing", figures).marked)
-        if self._thread.waiting:
-            log.error("%d sample(s) are not on disk, which did not take them", self._thread.waiting)
+            figures = f"The disk has not accepted the rest of the recording for {CLOSING_S:g} s."
+            log.warning("%s", Remark(ServiceWarning.DISK_FINISHING, figures).marked)
+        if self.waiting:
+            log.error("%d sample(s) are not on disk, which refused them", self.waiting)
         error = closing.exception()
         if isinstance(error, OSError):
             data = RecordingData(code=RecordingCode.NOT_FINISHED)
             self.note("recording", f"the recording could not be finished: {error}", data.table())
         elif error is not None:
             raise error
+
+    # ------------------------------------------------------------------ on the writing thread
+
+    def _finish(self) -> None:
+        try:
+            self._write_waiting()
+        finally:
+            self._recorder.close()
+
+    def _write_waiting(self) -> None:
+        while batch := self._next_batch():
+            written = False
+            try:
+                self._write(batch)
+                written = True
+            finally:
+                with self._lock:
+                    if written:
+                        for entry in batch:
+                            entry.on_disk = True
+                    else:
+                        self._waiting.extendleft(reversed(batch))
+                    self._failed, self._writing = not written, []
+
+    def _next_batch(self) -> list[Entry]:
+        """Return the entries that come next into one file."""
+        with self._lock:
+            while self._waiting:
+                entry = self._waiting[0]
+                if self._writing and (entry.new_file or entry.day != self._writing[0].day):
+                    break
+                self._writing.append(self._waiting.popleft())
+            return self._writing
+
+    def _write(self, batch: list[Entry]) -> None:
+        first = batch[0]
+        if first.new_file:
+            self._recorder.start_new(None if first.model is None else {"model.toml": first.model})
+        for entry in batch:
+            self._recorder.write(entry.records(), entry.time_utc_ns, state=entry.state, sync=entry is batch[-1])

@@ -1,9 +1,8 @@
-"""The last offset that was published while the disk did not take it, kept where a kill of the service leaves it.
+"""The last offset that was published before it was on disk, kept where it survives a kill of the service.
 
-After a kill the service goes on from the last offset on disk. What it published since then, because the disk was full
-or hung, would not count, and the offset would leap back by all of it. So that one offset is noted in the computer's
-memory, which no disk holds up and a kill does not touch; a reboot or power cut does. Once the disk has everything the
-note goes.
+After a kill the service continues from the last offset on disk. If the disk was full or hung, offsets published since
+then are missing there, and the offset would jump back. So the last of them is kept in the computer's memory, which
+needs no disk and survives a kill, but not a reboot or power cut. Once everything is on disk the checkpoint is removed.
 """
 
 from __future__ import annotations
@@ -19,7 +18,8 @@ from pathlib import Path
 import msgspec
 
 from compensator.messages import Offset, number
-from compensator.reasons import Caution
+from compensator.reasons import Remark
+from compensator.remarks import ServiceWarning
 
 log = logging.getLogger("compensator")
 
@@ -28,7 +28,7 @@ MEMORY = Path("/dev/shm")
 _LONGEST = 4096
 
 
-class Early(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class EarlyOffset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An offset that was published before it was on disk.
 
     Parameters
@@ -47,29 +47,29 @@ class Early(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class OffsetCheckpoint:
-    """The note of one machine.
+    """The checkpoint of one machine.
 
     Parameters
     ----------
     recordings : pathlib.Path
-        Folder of the recordings; with the machine's name it tells one service from another.
+        Folder of the recordings; together with the machine's name it identifies the service.
     machine : str
         Name of the machine.
     memory : pathlib.Path, optional
-        Where the note stands.
+        Where the file is.
     """
 
     def __init__(self, recordings: Path, machine: str, memory: Path = MEMORY) -> None:
         name = hashlib.sha256(f"{recordings.resolve()}\0{machine}".encode()).hexdigest()[:32]
         self.path = memory / f"compensator-{name}.json"
-        self._there = True
+        self._written = True
 
-    def keep(self, offset: Offset) -> None:
-        """Note an offset that is published now; a computer that does not take the note goes on without it."""
+    def write(self, offset: Offset) -> None:
+        """Keep an offset that is being published; where that fails the service continues without it."""
         value = number(offset.y_offset_um)
         if math.isnan(value):
             return
-        early = Early(seq=offset.seq, time_utc_ns=offset.time_utc_ns, y_offset_um=value)
+        early = EarlyOffset(seq=offset.seq, time_utc_ns=offset.time_utc_ns, y_offset_um=value)
         part = self.path.with_suffix(".part")
         try:
             part.unlink(missing_ok=True)
@@ -78,24 +78,25 @@ class OffsetCheckpoint:
                 file.write(msgspec.json.encode(early))
             part.replace(self.path)
         except OSError as error:
-            if self._there:
-                caution = Caution("note_not_kept", f"{self.path}: a kill now would lose the offset: {error}.")
-                log.warning("%s", caution.marked)
-            self._there = False
+            if self._written:
+                figures = f"{self.path}: a kill now would lose the offset: {error}."
+                log.warning("%s", Remark(ServiceWarning.NOTE_NOT_KEPT, figures).marked)
+            self._written = False
             with suppress(OSError):
                 part.unlink(missing_ok=True)
         else:
-            self._there = True
+            self._written = True
 
-    def forget(self) -> None:
-        """Take the note away: the disk has everything."""
+    def remove(self) -> None:
+        """Remove the checkpoint: everything is on disk."""
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:
-            log.warning("%s", Caution("note_not_removed", f"{self.path}: cannot be removed: {error}.").marked)
+            figures = f"{self.path}: cannot be removed: {error}."
+            log.warning("%s", Remark(ServiceWarning.NOTE_NOT_REMOVED, figures).marked)
 
-    def read(self, offset_max_um: float) -> Early | None:
-        """Return the note, None where there is none that this user wrote and a service could have published.
+    def read(self, offset_max_um: float) -> EarlyOffset | None:
+        """Return the offset, None if there is none that this user wrote and a service could have published.
 
         Parameters
         ----------
@@ -107,20 +108,20 @@ class OffsetCheckpoint:
         except OSError:
             return None
         with os.fdopen(descriptor, "rb") as file:
-            there = os.fstat(file.fileno())
+            status = os.fstat(file.fileno())
             # Everybody may write into this folder.
-            if not stat.S_ISREG(there.st_mode) or there.st_uid != os.geteuid() or there.st_mode & 0o022:
-                self._refused("not written by this service")
+            if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o022:
+                self._refuse("not written by this service")
                 return None
             try:
-                early = msgspec.json.decode(file.read(_LONGEST), type=Early)
+                early = msgspec.json.decode(file.read(_LONGEST), type=EarlyOffset)
             except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-                self._refused(str(error))
+                self._refuse(str(error))
                 return None
         if not abs(early.y_offset_um) <= offset_max_um or early.seq < 0:
-            self._refused(f"offset {early.y_offset_um:g} µm, number {early.seq}")
+            self._refuse(f"offset {early.y_offset_um:g} µm, number {early.seq}")
             return None
         return early
 
-    def _refused(self, why: str) -> None:
-        log.warning("%s", Caution("note_refused", f"{self.path}: does not count: {why}.").marked)
+    def _refuse(self, why: str) -> None:
+        log.warning("%s", Remark(ServiceWarning.NOTE_REFUSED, f"{self.path}: ignored: {why}.").marked)

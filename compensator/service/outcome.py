@@ -1,34 +1,30 @@
-"""What one sample led to, as it is recorded and published."""
+"""Values that a sample gives, and everything that follows from it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from compensator.events import Note
-from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, State, number
+from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, number
 from compensator.model.engine import Estimate, Reference
-from compensator.model.thermal_model import ThermalModel
-from compensator.service.limits import Limited
+from compensator.reasons import SampleQuality
 from compensator.service.state import ZeroState
 
 NAN = float("nan")
 
-#: A published offset may be used for this many samples.
-VALID_SAMPLES = 2.5
-
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one sample led to.
+    """Everything that one sample leads to.
 
     Parameters
     ----------
     sample : Sample
-        The sample with the guards' verdicts.
+        The sample with its final qualities.
     estimate : EstimateMessage
-        What the model makes of it.
+        The model's estimate.
     offset : Offset
-        What is to be published.
+        What is published.
     notes : tuple of Note
         Events of this sample.
     """
@@ -58,22 +54,23 @@ class Values:
     y: float
     others: dict[str, float]
 
-
-def values_of(channels: dict[str, ChannelSample]) -> Values:
-    """Return what can be used of a sample."""
-    usable = {name: number(channel.mean) if channel.quality == "good" else NAN for name, channel in channels.items()}
-    return Values(
-        t_q=usable.pop("t_q_degc", NAN),
-        at=usable.pop("at_degc", NAN),
-        y=usable.pop("y_um", NAN),
-        others=usable,
-    )
+    @classmethod
+    def of(cls, channels: dict[str, ChannelSample]) -> Values:
+        """Return the usable values of a sample."""
+        good = SampleQuality.GOOD
+        usable = {name: number(channel.mean) if channel.quality == good else NAN for name, channel in channels.items()}
+        return cls(
+            t_q=usable.pop("t_q_degc", NAN),
+            at=usable.pop("at_degc", NAN),
+            y=usable.pop("y_um", NAN),
+            others=usable,
+        )
 
 
 def estimate_message(
     sample: Sample, values: Values, estimate: Estimate | None, reference: Reference, zero: ZeroState, y_pred_um: float
 ) -> EstimateMessage:
-    """Return what the model makes of a sample."""
+    """Return the model's estimate as a message."""
     y = values.y - zero.y_ref
     return EstimateMessage(
         schema=SCHEMA,
@@ -94,23 +91,4 @@ def estimate_message(
         y_rate_um_per_min=estimate.y_rate_um_per_min if estimate else NAN,
         y_um=y,
         residual_um=y - y_pred_um,
-    )
-
-
-def offset_message(
-    sample: Sample, model: ThermalModel, std_um: float, state: State, reasons: list[str], limited: Limited | None
-) -> Offset:
-    """Return what is published."""
-    return Offset(
-        schema=SCHEMA,
-        machine=sample.machine,
-        seq=sample.seq,
-        time_utc_ns=sample.time_utc_ns,
-        valid_for_s=VALID_SAMPLES * model.period_s,
-        y_offset_um=limited.offset_um if limited else NAN,
-        y_offset_rate_um_per_min=limited.rate_um_per_min if limited else NAN,
-        y_offset_std_um=std_um,
-        state=state,
-        reasons=reasons,
-        model_sha256=model.sha256,
     )

@@ -1,8 +1,9 @@
-"""One service for one machine: a second one, started by mistake here or elsewhere, is refused and harms nothing.
+"""One service for each machine: a second one, started by mistake here or elsewhere, is refused and does no harm.
 
-On one computer a lock on a file in the folder of the recordings tells; the kernel lets go of it however the service
-ends. Elsewhere the liveliness token tells. Two that start at the same moment show themselves by a token each before
-they count as alive: one at most goes on. Two that begin while nobody is reached are not noticed.
+On one computer a lock on a file among the recordings shows it; the kernel releases it however the service ends.
+Elsewhere the liveliness token shows it: before anything is published, a client session of its own asks for
+`thermal/alive` (a router does not announce peers to each other). Two that start at the same moment declare a token
+each first: at most one continues. Two that start while no router is reached do not notice each other.
 """
 
 from __future__ import annotations
@@ -22,18 +23,19 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
-from compensator.reasons import Caution
-from compensator.service.session import put, session_config
+from compensator.reasons import Remark
+from compensator.remarks import ServiceWarning
+from compensator.service.session import session_config, set_key
 
 log = logging.getLogger("compensator")
 
-#: So long a router that refuses is asked again at the start, s.
+#: So long a router that refuses is retried at the start, s.
 REACHED_S = 1.0
-#: So long the token of a service that is gone without a sign may stand (the lease, and some more), s.
+#: So long the token of a service that was killed may remain (the lease, and some more), s.
 STALE_S = 6.0
-#: So long one that starts waits for others that do, s.
+#: So long a starting service waits for others that start, s.
 SHOWN_S = 0.4
-#: So long a question for tokens may take, s.
+#: So long a query for tokens may take, s.
 ANSWER_S = 2.0
 
 
@@ -44,8 +46,8 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
     Parameters
     ----------
     folder : pathlib.Path
-        Made when it is not there. Where the disk does not take the lock the service goes on without it: compensation
-        must not wait for a disk.
+        Created if it does not exist. If it cannot be locked the service continues: compensation must not depend on a
+        disk.
     machine : str
         Name of the machine.
 
@@ -61,15 +63,17 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
             held.callback(os.close, descriptor)
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise ServiceError(f"{path}: held by another service of {machine}, which goes on; this one ends") from error
+            raise ServiceError(
+                f"{path}: held by another service of {machine}, which continues; this one ends"
+            ) from error
         except OSError as error:
             figures = f"{path}: cannot be locked, so a second service is not noticed here: {error}."
-            log.warning("%s", Caution("not_locked", figures).marked)
+            log.warning("%s", Remark(ServiceWarning.NOT_LOCKED, figures).marked)
         yield
 
 
 def is_used(folder: Path, machine: str) -> bool:
-    """Tell whether a service of a machine holds the folder of its recordings; changes nothing.
+    """Return whether a service of a machine holds the folder of its recordings; changes nothing.
 
     Parameters
     ----------
@@ -98,71 +102,70 @@ def _opened(path: Path) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError:
-        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)  # on a disk that is read-only by now
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)  # the disk may have become read-only
 
 
 @contextmanager
 def sole_voice(settings: Zenoh) -> Iterator[None]:
-    """See that no service of this prefix is alive; the block declares the own token.
+    """Ensure that no other service of this prefix is alive; the block declares the own token.
 
-    A session of its own asks, a client: a router does not tell peers of each other. Where it reaches nobody nothing is
-    known of others, and compensation begins all the same.
+    If no router is reached nothing is known about others, and compensation starts all the same.
 
     Parameters
     ----------
     settings : Zenoh
-        Of the service.
+        Settings of the service.
 
     Raises
     ------
     ServiceError
-        If another service of this prefix is alive, or starts at the same moment and was first.
+        If another service of this prefix is alive, or was first to start at the same moment.
     zenoh.ZError
-        If a client reaches nobody.
+        If a client reaches no router.
     """
     with ExitStack() as held:
         if settings.connect:
             try:
                 session = held.enter_context(_reached(settings))
             except zenoh.ZError:
-                if settings.mode == "client":  # it can say nothing either
+                if settings.mode == "client":  # it can publish nothing either
                     raise
-                figures = "zenoh: nobody is reached, so whether another service is alive elsewhere is not known."
-                log.warning("%s", Caution("others_unknown", figures).marked)
+                figures = "zenoh: no router is reached, so it is unknown whether another service runs elsewhere."
+                log.warning("%s", Remark(ServiceWarning.OTHERS_UNKNOWN, figures).marked)
             else:
                 held.callback(_claim(session, settings.prefix).undeclare)
         yield
 
 
 def _reached(settings: Zenoh) -> Any:
-    """Open a session; a router that a whole shop asks at once is asked again after a moment.
+    """Open a session; retry a router that a whole shop asks at once.
 
-    A client without its router comes back here by itself.
+    A client without its router is retried by the publisher.
     """
     end = time.monotonic() + REACHED_S
     while True:
         try:
-            return zenoh.open(_asking(settings))
+            return zenoh.open(_client_config(settings))
         except zenoh.ZError:
             if settings.mode == "client" or time.monotonic() > end:
                 raise
             time.sleep(REACHED_S / 5.0)
 
 
-def _asking(settings: Zenoh) -> zenoh.Config:
+def _client_config(settings: Zenoh) -> zenoh.Config:
     config = session_config(msgspec.structs.replace(settings, mode="client", listen=[]))
-    put(config, "connect/timeout_ms", 0)  # one attempt
-    put(config, "connect/exit_on_failure", True)
+    set_key(config, "connect/timeout_ms", 0)  # one attempt
+    set_key(config, "connect/exit_on_failure", True)
     return config
 
 
 def _claim(session: Any, prefix: str) -> Any:
-    """Return the token of a service that starts, where none is alive and no other was first."""
+    """Return the token of a starting service, if none is alive and no other was first."""
     key = f"{prefix}/thermal/alive"
     end = time.monotonic() + STALE_S
     while _tokens(session, key):
         if time.monotonic() > end:
-            raise ServiceError(f"{key}: another service is alive there and goes on; this one ends")
+            raise ServiceError(f"{key}: another service is alive there and continues; this one ends")
         time.sleep(0.5)
     others = f"{prefix}/thermal/starting"
     own = f"{others}/{time.time_ns():020d}-{secrets.token_hex(8)}"
@@ -171,7 +174,7 @@ def _claim(session: Any, prefix: str) -> Any:
     first = min([own, *_tokens(session, f"{others}/*")])
     if first != own or _tokens(session, key):
         candidate.undeclare()
-        raise ServiceError(f"{key}: another service started at the same moment and goes on; this one ends")
+        raise ServiceError(f"{key}: another service started at the same moment and continues; this one ends")
     return candidate
 
 

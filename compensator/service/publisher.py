@@ -1,7 +1,7 @@
 """Publishes over Zenoh: offset, sample, estimate, status and event, and answers queries with the latest offset.
 
-Zenoh calls back on threads of its own. What happens there is kept to answering from a value that is replaced
-as a whole, and to handing commands over to the service's loop.
+Zenoh calls back on threads of its own. They only answer from a value that is replaced as a whole, and pass commands on
+to the service's loop.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
+from compensator.remarks import ServiceWarning
 from compensator.service.presence import sole_voice
-from compensator.service.session import in_words, session_config, tell_links
+from compensator.service.session import in_words, log_links, session_config
 
 log = logging.getLogger("compensator")
 
-#: How long a client waits before it tries its router again, s.
+#: How long a client waits before it retries its router, s.
 RETRY_S = 1.0
-#: Commands that the service takes, each a query on `thermal/command/<name>/<who sends it>` or `thermal/command/<name>`.
+#: Commands of the service, each a query on `thermal/command/<name>/<sender>` or `thermal/command/<name>`.
 COMMANDS = ("zero", "hold", "resume", "adopt", "back")
-#: What a sender's name may be made of; it is a chunk of a key.
+#: Characters of a sender's name, which is a chunk of a key.
 SENDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 _KEYS = {
@@ -40,30 +41,30 @@ _KEYS = {
     "event": "thermal/event",
 }
 
-#: What a command is answered with, or a promise of it where it takes longer than Zenoh's thread may wait.
+#: Answer to a command, or a future of it if it takes longer than Zenoh's thread may wait.
 Reply = dict[str, Any] | Future[dict[str, Any]]
 
 
 class Sender(NamedTuple):
     """Who sent a command.
 
-    Zenoh does not hand the peer's certificate to whoever answers a query. So the name stands in the key, and the
-    router's access list lets each certificate use its own name only.
+    Zenoh does not show the certificate of whoever sends a query. So the name is part of the key, and the router's
+    access list permits each certificate its own name only.
 
     Parameters
     ----------
     name : str
-        `unnamed` where the key has none.
+        `unnamed` if the key has none.
     proof : str
-        `certificate`: the service is reached through its router alone, over links on which both sides prove who they
-        are. `none`: the name is what the sender says.
+        `certificate`: the service is reached only through its router, over mutually authenticated links. `none`: the
+        sender may use any name.
     """
 
     name: str = "unnamed"
     proof: Literal["certificate", "none"] = "none"
 
 
-#: Who sends a command that names nobody.
+#: Sender of a command without a name.
 UNNAMED = Sender()
 #: name, payload, sender → reply
 CommandHandler = Callable[[str, bytes, Sender], Reply]
@@ -82,7 +83,7 @@ class Publisher:
     Raises
     ------
     ServiceError
-        From `open`, when an endpoint cannot be listened on, or the machine has its service.
+        From `open`, if an endpoint cannot be listened on, or another service of the machine is alive.
     """
 
     def __init__(self, settings: Zenoh, on_command: CommandHandler) -> None:
@@ -102,7 +103,7 @@ class Publisher:
     def open(self) -> None:
         """Open the session and declare everything.
 
-        A client that reaches no router goes on trying in the background: compensation and recording wait for nobody.
+        A client that reaches no router retries in the background: compensation and recording do not wait for it.
         """
         try:
             self._begin()
@@ -111,17 +112,17 @@ class Publisher:
             words = f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})"
             if self._settings.mode != "client":
                 raise ServiceError(words) from error
-            caution = Caution("router_not_reached", f"{words.rstrip('.')}; it is tried again.")
-            log.warning("%s", caution.marked)
+            figures = f"{words.rstrip('.')}; it is tried again."
+            log.warning("%s", Remark(ServiceWarning.ROUTER_NOT_REACHED, figures).marked)
             self._waiting = threading.Thread(target=self._begin_later, name="zenoh-router", daemon=True)
             self._waiting.start()
 
     def _begin(self) -> None:
-        with ExitStack() as half_made:  # whatever fails on the way: nothing of it stays, and all of it is tried again
-            # First of all: nothing may be said or answered in the name of a machine that has its service.
+        with ExitStack() as unfinished:  # if a step fails everything is undone, and retried as a whole
+            # First: nothing may be published or answered in the name of a machine that has its service already.
             with sole_voice(self._settings):
                 session = zenoh.open(session_config(self._settings))
-                half_made.callback(session.close)
+                unfinished.callback(session.close)
                 declared: list[Any] = [session.liveliness().declare_token(f"{self._settings.prefix}/thermal/alive")]
             publishers = {name: self._publisher(session, name) for name in _KEYS}
             for name in ("offset", "status", "sample", "estimate"):
@@ -129,8 +130,8 @@ class Publisher:
             for name in COMMANDS:
                 for key in (self.key(name), f"{self.key(name)}/*"):
                     declared.append(session.declare_queryable(key, self._answer_command(name)))
-            tell_links(session, self._settings.connect)
-            half_made.pop_all()
+            log_links(session, self._settings.connect)
+            unfinished.pop_all()
         self._publishers, self._declared = publishers, declared
         self._session = session  # last: from here on other threads publish
 
@@ -140,23 +141,23 @@ class Publisher:
             encoding=zenoh.Encoding.APPLICATION_JSON,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH if name == "offset" else zenoh.Priority.DATA,
-            # Express messages take a packet each, and a router has room for a few packets only: of what a shop of
-            # machines says at one instant it would drop offsets. They save no time that can be measured.
+            # Express messages take a packet each, and a router queues only a few packets: it would drop offsets of a
+            # shop that publishes at one instant. They save no measurable time.
             express=False,
         )
 
     def _begin_later(self) -> None:
-        """Try until the router is there, or the service ends."""
-        said = ""
+        """Retry until the router is reached, or the service ends."""
+        logged = ""
         while not self._closing.wait(RETRY_S):
             try:
                 self._begin()
             except zenoh.ZError:
                 continue
-            except ServiceError as error:  # another service has the machine; the control is to hear one voice only
-                if str(error) != said:
+            except ServiceError as error:  # the control must not receive offsets of two services
+                if str(error) != logged:
                     log.error("%s; nothing is published from here until it is gone", error)
-                    said = str(error)
+                    logged = str(error)
                 continue
             return
 
@@ -216,9 +217,9 @@ class Publisher:
         return answer
 
     def _sender(self, name: str, key: str) -> Sender | None:
-        """Return who sends a command; None for a question to many keys at once, which is no command.
+        """Return the sender of a command; None for a query of many keys at once, which is no command.
 
-        Whoever looks around with `**` must not zero, hold and resume the machine.
+        A query of `**` must not zero, hold and resume the machine.
         """
         if key == self.key(name):
             return UNNAMED

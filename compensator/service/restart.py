@@ -19,7 +19,7 @@ from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.offset_checkpoint import Early
+from compensator.service.offset_checkpoint import EarlyOffset
 from compensator.service.replay import Step, apply, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
 from compensator.service.warm_up import warm_up
@@ -71,7 +71,7 @@ class _LastFile:
         return published
 
 
-def resume(loaded: LoadedConfig, model: ThermalModel, early: Early | None = None) -> Resumed:
+def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None = None) -> Resumed:
     """Bring a compensation to where the last recording ends.
 
     Parameters
@@ -80,7 +80,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: Early | None = None
         The present configuration.
     model : ThermalModel
         The present model.
-    early : Early, optional
+    early : EarlyOffset, optional
         The last offset that was published while the disk failed.
 
     Returns

@@ -1,21 +1,92 @@
-"""From single readings to the sample of a channel: robust mean, extremes, spread, count, quality."""
+"""From single readings to samples: when devices are polled, and the robust mean of what each channel gave.
+
+Samples end at whole multiples of the period in UTC. Waiting always aims at the next point of this grid, so errors do
+not add up. A wall clock that is set changes the labels, not the pace: the step is reported, and the grid starts again.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.clock import NS, Clock
+from compensator.config import Config
 from compensator.messages import ChannelSample
-from drivers.reading import Quality, Reading
+from compensator.reasons import SampleQuality
+from drivers.errors import DriverError
+from drivers.reading import Device, Quality, Reading
 
+#: A poll waits for devices that answered last time for at most this fraction of the poll interval.
+WAIT_PART = 0.5
 #: A reading farther from the median than this many robust standard deviations is left out.
 OUTLIER_SIGMA = 6.0
-#: Median absolute deviation of a normal distribution, as a part of its standard deviation.
+#: Median absolute deviation of a normal distribution, as a fraction of its standard deviation.
 _MAD_OF_SIGMA = 0.6745
+_OUTLIER = "outlier"
+
+
+class Grid:
+    """Times of the polls and samples.
+
+    Parameters
+    ----------
+    clock : Clock
+        Wall and monotonic clock.
+    period_s : float
+        Length of a sample, s.
+    polls : int
+        Polls in a sample; the last one is at its end.
+    """
+
+    def __init__(self, clock: Clock, period_s: float, polls: int) -> None:
+        self._clock = clock
+        self._period_ns = round(period_s * NS)
+        self._polls = polls
+        self._index = 0
+        self._restart()
+
+    def _restart(self) -> None:
+        """Let the current sample end at the next whole multiple of the period."""
+        utc, monotonic = self._clock.utc_ns(), self._clock.monotonic_ns()
+        self.label_ns = (utc // self._period_ns + 1) * self._period_ns
+        self._end_ns = monotonic + self.label_ns - utc
+        gone = self._period_ns - (self.label_ns - utc)
+        self._index = min(gone * self._polls // self._period_ns, self._polls - 1)
+
+    def seconds_to_next_poll(self) -> float:
+        """Return how long to wait for the next poll, s."""
+        point = self._end_ns - self._period_ns + (self._index + 1) * self._period_ns // self._polls
+        return (point - self._clock.monotonic_ns()) / NS
+
+    def count_poll(self) -> bool:
+        """Count a poll; return whether it is the last one of its sample."""
+        self._index += 1
+        return self._index == self._polls
+
+    def next_sample(self) -> float:
+        """Advance to the next sample.
+
+        Returns
+        -------
+        float
+            By how much the wall clock was set since the last sample, s; 0 for the usual small corrections.
+        """
+        off_ns = self._clock.utc_ns() - self._clock.monotonic_ns() - (self.label_ns - self._end_ns)
+        self._index = 0
+        late_ns = self._clock.monotonic_ns() - self._end_ns
+        if abs(off_ns) > NS or late_ns >= self._period_ns:
+            self._restart()
+            return off_ns / NS if abs(off_ns) > NS else 0.0
+        # Small differences come from a time service that slews the clock: follow it, the labels stay on the grid.
+        self.label_ns += self._period_ns
+        self._end_ns += self._period_ns - off_ns
+        return 0.0
 
 
 class ChannelCollector:
@@ -24,7 +95,7 @@ class ChannelCollector:
     Parameters
     ----------
     min_good_fraction : float
-        Part of the polls that must have given a good reading for the mean to count.
+        Fraction of the polls that must have given a good reading for the mean to count.
     """
 
     def __init__(self, min_good_fraction: float) -> None:
@@ -34,24 +105,24 @@ class ChannelCollector:
         self._polls = 0
 
     def add(self, reading: Reading | None, error: str | None = None) -> None:
-        """Take the result of one poll: a reading, or the code of the error."""
+        """Add the result of one poll: a reading, or the code of the error."""
         self._polls += 1
         if reading is not None and reading.quality is Quality.GOOD and math.isfinite(reading.value):
             self._readings.append(reading)
         elif reading is not None:
             self._errors[str(reading.quality)] += 1
         else:
-            self._errors[error or "device_error"] += 1
+            self._errors[error or str(SampleQuality.DEVICE_ERROR)] += 1
 
     def close(self) -> ChannelSample:
-        """Make the sample of what was collected and start the next one."""
+        """Return the sample of what was collected and start the next one."""
         readings, errors, polls = self._readings, self._errors, self._polls
         self._readings, self._errors, self._polls = [], Counter(), 0
         kept, outliers = _without_outliers(readings)
         if outliers:
-            errors["outlier"] += outliers
+            errors[_OUTLIER] += outliers
         enough = len(kept) >= max(1, math.ceil(self._min_good_fraction * polls))
-        quality = "good" if enough else _worst(errors)
+        quality = str(SampleQuality.GOOD) if enough else _most_frequent(errors)
         values = [reading.value for reading in kept]
         mean = math.fsum(values) / len(values) if values else math.nan
         spread = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / len(values)) if values else math.nan
@@ -84,11 +155,105 @@ def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
 
 
 def _near(values: Vector) -> bool:
-    """Tell whether one deviating reading among equal ones is a converter step rather than wild."""
+    """Return whether one deviating reading among equal ones is a step of the converter rather than wild."""
     return bool(np.ptp(values) <= 1e-3 * max(1.0, abs(float(np.median(values)))))
 
 
-def _worst(errors: Mapping[str, int]) -> str:
-    """Name the most frequent cause."""
-    causes = {code: n for code, n in errors.items() if code != "outlier"}
-    return max(sorted(causes), key=lambda code: causes[code]) if causes else "too_few"
+def _most_frequent(errors: Mapping[str, int]) -> str:
+    causes = {code: n for code, n in errors.items() if code != _OUTLIER}
+    return max(sorted(causes), key=lambda code: causes[code]) if causes else str(SampleQuality.TOO_FEW)
+
+
+@dataclass(slots=True)
+class _DeviceState:
+    """A device with its current poll and its last error."""
+
+    device: Device
+    task: asyncio.Task[Mapping[int, Reading]] | None = None
+    error: str = ""
+    answered: bool = True
+
+
+class Sampler:
+    """Polls the devices and collects their readings.
+
+    Parameters
+    ----------
+    config : Config
+        Channels, and how many readings make a sample.
+    devices : mapping of str to Device
+        Open or not; a device opens itself when it is read.
+    clock : Clock
+        For waiting.
+    note : callable
+        Called with kind, text and data of an event when a device stops answering or answers again.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        devices: Mapping[str, Device],
+        clock: Clock,
+        note: Callable[[str, str, dict[str, object]], None],
+    ) -> None:
+        self._channels = config.channel
+        self._devices = {name: _DeviceState(device) for name, device in devices.items()}
+        self._clock = clock
+        self._note = note
+        fraction = config.sampling.min_good_fraction
+        self._collectors = {channel.name: ChannelCollector(fraction) for channel in config.channel}
+
+    async def poll(self, interval_s: float) -> None:
+        """Ask every device once; wait briefly for those that answered last time."""
+        for state in self._devices.values():
+            if state.task is None:
+                state.task = asyncio.create_task(_read(state.device))
+        awaited = [state.task for state in self._devices.values() if state.task is not None and state.answered]
+        await self._clock.settle(awaited, WAIT_PART * interval_s)
+        results = {name: self._result(state) for name, state in self._devices.items()}
+        for channel in self._channels:
+            readings, error = results[channel.device]
+            self._collectors[channel.name].add(readings.get(channel.input) if readings else None, error)
+
+    def close_sample(self) -> dict[str, ChannelSample]:
+        """Return the sample of every channel and start the next one."""
+        return {name: collector.close() for name, collector in self._collectors.items()}
+
+    def device_states(self) -> dict[str, str]:
+        """Return `ok` or the last error of each device."""
+        return {name: state.error or "ok" for name, state in self._devices.items()}
+
+    async def close(self) -> None:
+        """Cancel the polls that are still running."""
+        tasks = [state.task for state in self._devices.values() if state.task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _result(self, state: _DeviceState) -> tuple[Mapping[int, Reading] | None, str | None]:
+        """Return readings or error code of a device's poll; one that is still running counts as missing."""
+        if state.task is None or not state.task.done():
+            state.answered = False
+            return None, SampleQuality.DEVICE_TIMEOUT
+        task, state.task = state.task, None
+        state.answered = True
+        error = task.exception()
+        if error is None:
+            self._note_change(state, "")
+            return task.result(), None
+        if not isinstance(error, DriverError):
+            raise error
+        state.answered = error.code != SampleQuality.DEVICE_TIMEOUT
+        self._note_change(state, str(error))
+        return None, error.code
+
+    def _note_change(self, state: _DeviceState, error: str) -> None:
+        """Note once when a device stops answering, and once when it answers again."""
+        if bool(error) != bool(state.error):
+            name = state.device.name
+            self._note("device", error or f"{name}: answers again", {"device": name, "ok": not error})
+        state.error = error
+
+
+async def _read(device: Device) -> Mapping[int, Reading]:
+    return await device.read()

@@ -1,4 +1,4 @@
-"""Zenoh sessions: nothing is listened on, scouted or told that is not configured."""
+"""Zenoh sessions: they listen and connect only as configured, and do not scout."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ import zenoh
 from compensator.certificates import TlsFiles
 from compensator.config import Zenoh
 from compensator.errors import ConfigError
-from compensator.reasons import Caution
+from compensator.reasons import Remark
+from compensator.remarks import ServiceWarning
 
 log = logging.getLogger("compensator")
 
-#: Participants that a router lets in at one time.
+#: Participants that a router admits at one time.
 PENDING = 1000
 
 
-def put(config: zenoh.Config, key: str, value: object) -> None:
+def set_key(config: zenoh.Config, key: str, value: object) -> None:
     """Set one key of a Zenoh configuration."""
     config.insert_json5(key, json.dumps(value))
 
 
 def get(config: zenoh.Config, key: str) -> Any:
-    """Return one key of a Zenoh configuration, None where it is not there or unset."""
+    """Return one key of a Zenoh configuration, None if it is missing or unset."""
     try:
         return json.loads(config.get_json(key))
     except (zenoh.ZError, KeyError, ValueError):
@@ -36,12 +37,12 @@ def get(config: zenoh.Config, key: str) -> Any:
 
 
 def in_words(error: zenoh.ZError) -> str:
-    """Return what Zenoh says without the place in its source."""
+    """Return the text of an error without the place in Zenoh's source."""
     return re.sub(r"\s+", " ", re.sub(r" at /\S+\.rs:\d+\.", "", str(error))).strip()
 
 
 def session_config(settings: Zenoh) -> zenoh.Config:
-    """Make a Zenoh configuration that listens and scouts for nothing that is not configured.
+    """Make a Zenoh configuration that listens and connects only as configured.
 
     Parameters
     ----------
@@ -49,45 +50,45 @@ def session_config(settings: Zenoh) -> zenoh.Config:
         Mode, endpoints and TLS files.
     """
     config = zenoh.Config()
-    put(config, "mode", settings.mode)
-    put(config, "listen/endpoints", settings.listen)
-    put(config, "connect/endpoints", settings.connect)
-    put(config, "scouting/multicast/enabled", False)
-    put(config, "scouting/gossip/enabled", False)
+    set_key(config, "mode", settings.mode)
+    set_key(config, "listen/endpoints", settings.listen)
+    set_key(config, "connect/endpoints", settings.connect)
+    set_key(config, "scouting/multicast/enabled", False)
+    set_key(config, "scouting/gossip/enabled", False)
     # A router that comes back is found within a second, not within the default's four.
-    put(config, "connect/retry", {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5})
-    # Zenoh's way past the network, for whoever is on the same computer: others there could open it, and a killed
-    # process leaves its files behind in /dev/shm.
-    put(config, "transport/shared_memory/enabled", False)
-    # A dead service loses its liveliness token after this, where the network gives no sign.
-    put(config, "transport/link/tx/lease", 4000)
+    set_key(config, "connect/retry", {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5})
+    # Shared memory between processes of one computer: others there could open it, and a killed process leaves its
+    # files behind in /dev/shm.
+    set_key(config, "transport/shared_memory/enabled", False)
+    # A dead service loses its liveliness token after so many ms if the network gives no sign.
+    set_key(config, "transport/link/tx/lease", 4000)
     if settings.mode == "router":
-        make_room(config)
+        enlarge_queues(config)
     if settings.secured():
         # Zenoh shows its certificate only where `enable_mtls` is set on its side too.
-        put(config, "transport/link/tls/enable_mtls", True)
-        put(config, "transport/link/tls/verify_name_on_connect", True)
-        put(config, "transport/link/tls/root_ca_certificate", settings.tls_ca)
-        put(config, "transport/link/tls/connect_certificate", settings.tls_certificate)
-        put(config, "transport/link/tls/connect_private_key", settings.tls_key)
-        put(config, "transport/link/protocols", ["tls", "quic"])
+        set_key(config, "transport/link/tls/enable_mtls", True)
+        set_key(config, "transport/link/tls/verify_name_on_connect", True)
+        set_key(config, "transport/link/tls/root_ca_certificate", settings.tls_ca)
+        set_key(config, "transport/link/tls/connect_certificate", settings.tls_certificate)
+        set_key(config, "transport/link/tls/connect_private_key", settings.tls_key)
+        set_key(config, "transport/link/protocols", ["tls", "quic"])
     return config
 
 
-def make_room(config: zenoh.Config) -> None:
-    """Have a router keep what a whole shop says at one instant.
+def enlarge_queues(config: zenoh.Config) -> None:
+    """Enlarge a router's queues for a whole shop that publishes at the same instant.
 
-    Services whose clocks agree publish at the same time, and what does not fit on the way to one listener is dropped.
-    Packets of 64 KiB, for each client; 16 are the most that Zenoh takes. After a power cut all of them connect at once,
-    two sessions each; Zenoh's own limit refuses those beyond a hundred that are just being let in.
+    Services whose clocks agree publish at the same time, and what does not fit into a client's queue is dropped. A
+    queue has packets of 64 KiB, 16 at most. After a power cut all services connect at once, two sessions each; by
+    default Zenoh admits a hundred at a time.
     """
-    put(config, "transport/unicast/accept_pending", PENDING)
+    set_key(config, "transport/unicast/accept_pending", PENDING)
     for priority in ("interactive_high", "data"):
-        put(config, f"transport/link/tx/queue/size/{priority}", 16)
+        set_key(config, f"transport/link/tx/queue/size/{priority}", 16)
 
 
 def tls_files(settings: Zenoh) -> TlsFiles | None:
-    """Return the TLS files of the service, None where it uses none."""
+    """Return the TLS files of the service, None if it uses none."""
     if settings.tls_ca is None or settings.tls_certificate is None or settings.tls_key is None:
         return None
     return TlsFiles(Path(settings.tls_ca), Path(settings.tls_certificate), Path(settings.tls_key))
@@ -119,14 +120,14 @@ _FILES = (
 
 
 def read_config_file(path: Path) -> ConfigFile:
-    """Read a Zenoh configuration file (JSON5, JSON or YAML, as zenohd takes it).
+    """Read a Zenoh configuration file (JSON5, JSON or YAML, as for zenohd).
 
-    Paths in it are relative to the file, not to where the command is called.
+    Paths in it are relative to the file.
 
     Raises
     ------
     ConfigError
-        One line that names file and what is wrong.
+        One line that names the file and what is wrong.
     """
     if not path.is_file():
         raise ConfigError(f"{path}: no such file, expected a Zenoh configuration")
@@ -139,7 +140,7 @@ def read_config_file(path: Path) -> ConfigFile:
         value = get(config, f"{_TLS}/{name}")
         if value is not None:
             tls[name] = str((path.parent / value).resolve())
-            put(config, f"{_TLS}/{name}", tls[name])
+            set_key(config, f"{_TLS}/{name}", tls[name])
     return ConfigFile(config, tls)
 
 
@@ -164,22 +165,22 @@ def files_of(source: Path, tls: dict[str, str], side: str) -> TlsFiles:
     )
 
 
-def tell_links(session: Any, endpoints: Sequence[str]) -> None:
-    """Say in the log when a link comes and goes, and once where none is there yet.
+def log_links(session: Any, endpoints: Sequence[str]) -> None:
+    """Log when a link is established or lost, and once if there is none yet.
 
-    Without this a certificate that the router refuses looks like a service that runs.
+    Without this, a certificate that the router refuses looks like a running service.
     """
 
-    def tell(event: Any) -> None:
-        came = event.kind == zenoh.SampleKind.PUT
+    def log_event(event: Any) -> None:
+        established = event.kind == zenoh.SampleKind.PUT
         kind = str(event.transport.whatami).rpartition(".")[2].lower()
         who = f"zenoh: {kind} {event.transport.zid}"
-        if came or kind == "client":  # who looks at the service comes and goes as they like
-            log.info("%s is %s", who, "connected" if came else "gone")
+        if established or kind == "client":  # clients look at the service and leave as they like
+            log.info("%s is %s", who, "connected" if established else "gone")
         else:
-            log.warning("%s", Caution("link_lost", f"{who} is gone; it is tried again.").marked)
+            log.warning("%s", Remark(ServiceWarning.LINK_LOST, f"{who} is gone; it is tried again.").marked)
 
     if endpoints and not session.info.transports():
         figures = f"zenoh: no connection to {', '.join(endpoints)} yet; it is tried again."
-        log.warning("%s", Caution("router_not_reached", figures).marked)
-    session.info.declare_transport_events_listener(tell, history=True)
+        log.warning("%s", Remark(ServiceWarning.ROUTER_NOT_REACHED, figures).marked)
+    session.info.declare_transport_events_listener(log_event, history=True)

@@ -19,7 +19,7 @@ import zenoh
 from compensator.config import Zenoh
 from compensator.errors import ServiceError, UsageError
 from compensator.service.command_client import alive_at, operator_of_file
-from compensator.service.session import get, in_words, put, session_config
+from compensator.service.session import get, in_words, session_config, set_key
 
 #: Time between two attempts to connect, s.
 RETRY_S = 1.0
@@ -110,8 +110,8 @@ class Listener:
             If there is no answer, or an endpoint cannot be used.
         """
         config = self._source.config()
-        put(config, "connect/timeout_ms", 0)
-        put(config, "connect/exit_on_failure", True)
+        set_key(config, "connect/timeout_ms", 0)
+        set_key(config, "connect/exit_on_failure", True)
         try:
             session = self._session = zenoh.open(config)
         except zenoh.ZError as error:

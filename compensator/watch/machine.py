@@ -9,7 +9,7 @@ import msgspec
 
 from compensator.clock import NS
 from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
-from compensator.reasons import Caution
+from compensator.reasons import Remark
 from compensator.watch.history import History, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import TONES, Tone, Words, age, in_words, to_do
@@ -176,40 +176,40 @@ class Machine:
             return "unknown"
         return "silent" if old_s > self._offset.valid_for_s else self._offset.state
 
-    def warnings(self, now_ns: int, monotonic_s: float) -> list[Caution]:
+    def warnings(self, now_ns: int, monotonic_s: float) -> list[Remark]:
         """Return warnings about what was received."""
         found = []
         offset, shown = self._offset, self.shown(now_ns, monotonic_s)
         if self.alive is False and shown not in ("silent", "unknown"):
             found.append(
-                Caution("token_gone", "Its liveliness token is gone: the service has ended or is disconnected.")
+                Remark("token_gone", "Its liveliness token is gone: the service has ended or is disconnected.")
             )
         if self.alive and shown == "silent":
             figures = "Its liveliness token exists: the service is connected, but publishes nothing new."
-            found.append(Caution("alive_but_silent", figures))
+            found.append(Remark("alive_but_silent", figures))
         other, heard_s = self._other
         if offset is not None and monotonic_s - heard_s < 4.0 * offset.valid_for_s:
-            found.append(Caution("two_services", f"Two services publish below this prefix: {other} and {self.name}."))
+            found.append(Remark("two_services", f"Two services publish below this prefix: {other} and {self.name}."))
         if offset is not None and offset.time_utc_ns - now_ns > AHEAD_S * NS:
             figures = f"Its clock is ahead of this computer's by {age((offset.time_utc_ns - now_ns) / NS)}."
-            found.append(Caution("clock_ahead", figures))
+            found.append(Remark("clock_ahead", figures))
         if offset is not None and shown == "silent" and monotonic_s - self._arrived_s < offset.valid_for_s / 2.0:
             figures = "Messages arrive with old times: one of the two clocks is wrong, or messages are repeated."
-            found.append(Caution("old_messages", figures))
+            found.append(Remark("old_messages", figures))
         misfit = self._misfit(now_ns, shown)
         if misfit is not None:
             found.append(misfit)
         if self.malformed:
             figures = f"{self.malformed} malformed message(s), the last: {self.last_malformed}."
-            found.append(Caution("malformed_messages", figures))
+            found.append(Remark("malformed_messages", figures))
         if self.numbers.missed:
-            found.append(Caution("missed_messages", f"{self.numbers.missed} message(s) never arrived here."))
+            found.append(Remark("missed_messages", f"{self.numbers.missed} message(s) never arrived here."))
         if self.numbers.repeated:
             figures = f"{self.numbers.repeated} message(s) had a number that was received before."
-            found.append(Caution("repeated_numbers", figures))
+            found.append(Remark("repeated_numbers", figures))
         return found
 
-    def _misfit(self, now_ns: int, shown: str) -> Caution | None:
+    def _misfit(self, now_ns: int, shown: str) -> Remark | None:
         """Warn if Y differs from its prediction by more than the service states, unless the service warns of it itself.
 
         The median is used because a valid model deviates for some minutes after the heat is switched.
@@ -225,7 +225,7 @@ class Machine:
             f"Over half an hour, measured and predicted Y were {residual_um:.1f} µm apart (median); the service "
             f"states a standard deviation of {std_um:.2f} µm."
         )
-        return Caution("misfit", figures)
+        return Remark("misfit", figures)
 
     def snapshot(self, now_ns: int, monotonic_s: float) -> dict[str, Any]:
         """Return the present state for a view or as JSON.
@@ -309,7 +309,7 @@ class Machine:
         return {"time_utc_ns": event.time_utc_ns, "kind": event.kind, "text": event.text, "do": to_do(event)}
 
 
-def _tone(shown: str, warnings: list[Caution]) -> Tone:
+def _tone(shown: str, warnings: list[Remark]) -> Tone:
     """Return the severity of a machine's state and warnings."""
     codes = {warning.code for warning in warnings}
     if "two_services" in codes:
@@ -318,7 +318,7 @@ def _tone(shown: str, warnings: list[Caution]) -> Tone:
     return "warn" if tone == "good" and codes & ATTENTION else tone
 
 
-def _to_do(shown: str, reasons: list[Words], warnings: list[Caution]) -> str:
+def _to_do(shown: str, reasons: list[Words], warnings: list[Remark]) -> str:
     """Return the actions in one line; the last reasons of a silent machine are out of date and ignored."""
     asked = [words.do for words in reasons if shown not in ("silent", "unknown")]
     if not asked and not (warnings and shown == "ok"):

@@ -12,7 +12,7 @@ import msgspec
 from compensator.config import parse_config
 from compensator.messages import SCHEMA, Event, Sample, encode
 from compensator.model.model_file import parse_model, read_model_bytes
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation
 from tests.service.records import sample
 from tests.service.simulated import START_NS
@@ -103,7 +103,7 @@ class Service:
     ) -> None:
         self.folder = folder
         self.config = parse_config(config, source="test")
-        self.recorder = Recorder(folder, MACHINE, {"config.toml": config, "model.toml": model}, **recorder)
+        self.recorder = McapRecorder(folder, MACHINE, {"config.toml": config, "model.toml": model}, **recorder)
         self.compensation = Compensation(self.config, parse_model(model, source="test"))
         if state:
             self.compensation.restore(state)

@@ -126,9 +126,9 @@ def test_a_model_that_needs_another_channel_is_refused(tmp_path: Path) -> None:
 
 def test_recordings_of_two_machines_are_not_mixed(tmp_path: Path) -> None:
     Service(tmp_path).run(5).stop()
-    from compensator.recording.recorder import Recorder
+    from compensator.recording.recorder import McapRecorder
 
-    other = Recorder(tmp_path, "lathe-1", {"config.toml": CONFIG, "model.toml": QUILL})
+    other = McapRecorder(tmp_path, "lathe-1", {"config.toml": CONFIG, "model.toml": QUILL})
     other.write([("event", b"{}")], START_NS)
     other.close()
     with pytest.raises(DataError, match="lathe-1, vmc-07"):

@@ -18,7 +18,7 @@ from compensator.messages import Event, Offset
 from compensator.model.model_file import parse_model
 from compensator.recording import recorder as recorder_module
 from compensator.recording.reading import first_sequence, read_messages, recordings
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.daemon import Daemon
 from compensator.service.restart import resume
 from drivers.errors import DeviceTimeout
@@ -131,7 +131,7 @@ async def test_over_midnight_the_second_file_stands_by_itself(tmp_path: Path) ->
 
 async def test_a_disk_that_fails_and_returns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = replayable(tmp_path)
-    sync = recorder_module._Live.sync
+    sync = recorder_module.RecordingFile.sync
     full = False
 
     def failing(live: Any) -> None:
@@ -143,7 +143,7 @@ async def test_a_disk_that_fails_and_returns(tmp_path: Path, monkeypatch: pytest
         nonlocal full
         full = value
 
-    monkeypatch.setattr(recorder_module._Live, "sync", failing)
+    monkeypatch.setattr(recorder_module.RecordingFile, "sync", failing)
     bench.at_sample[30], bench.at_sample[42] = lambda: fill(True), lambda: fill(False)
     bench.at_sample[35] = lambda: bench.daemon.command("hold", b"")
     bench.at_sample[45] = lambda: bench.daemon.command("resume", b"")
@@ -184,7 +184,7 @@ async def test_an_internal_error_holds_and_comes_out_again(tmp_path: Path, monke
 def test_a_restart_after_a_stop_or_a_kill(tmp_path: Path, minutes: int) -> None:
     folder = tmp_path / "rec"
     config = parse_config(CONFIG, source="test")
-    loaded = LoadedConfig(config=config, path=tmp_path / "machine.toml", data=CONFIG, sha256="")
+    loaded = LoadedConfig(config=config, path=tmp_path / "machine.toml", data=CONFIG)
     bench = replayable(tmp_path)
     live: list[bytes] = []
     bench.at_sample[80] = lambda: live.append(bench.recorder.path.read_bytes())  # type: ignore[union-attr]
@@ -197,7 +197,7 @@ def test_a_restart_after_a_stop_or_a_kill(tmp_path: Path, minutes: int) -> None:
         config=config,
         compensation=resumed.compensation,
         devices={"module": bench.device},
-        recorder=Recorder(folder, MACHINE, {"config.toml": CONFIG, "model.toml": QUILL}),
+        recorder=McapRecorder(folder, MACHINE, {"config.toml": CONFIG, "model.toml": QUILL}),
         publish=lambda name, data: None,
         clock=bench.clock,
         notes=resumed.notes,

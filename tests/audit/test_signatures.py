@@ -17,7 +17,7 @@ from compensator.errors import ConfigError, UsageError
 from compensator.messages import Seal, encode
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer, Verifier
-from compensator.service.composition import _signer
+from compensator.service.loading import load_signer
 from tests.audit.made import CONFIG, MACHINE, Service
 from tests.audit.tampering import Line, find, lines_of, rewrite, with_new_values
 
@@ -124,10 +124,10 @@ def test_a_key_among_the_recordings_is_refused(tmp_path: Path) -> None:
             CONFIG.replace(b"recording.folder", f'recording.signing_key = "{name}"\nrecording.folder'.encode())
         )
         with pytest.raises(ConfigError, match=reason):
-            _signer(load_config(config))
+            load_signer(load_config(config))
     private.rename(tmp_path / private.name)
     config.write_bytes(CONFIG.replace(b"recording.folder", b'recording.signing_key = "machine.pem"\nrecording.folder'))
-    assert _signer(load_config(config)) is not None
+    assert load_signer(load_config(config)) is not None
 
 
 def test_what_is_no_key_is_said(tmp_path: Path) -> None:

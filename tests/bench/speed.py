@@ -24,6 +24,7 @@ from compensator.demo.machine import configuration, hardware
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model
 from compensator.service.composition import run_service
+from compensator.service.loading import load
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.bench.figures import Figure, spread, told
 
@@ -89,7 +90,7 @@ def simulated_days() -> Iterator[Figure]:
     for _ in range(3):
         with machine(24.0) as (config, clock, _world):
             began = time.perf_counter()
-            daemon = asyncio.run(run_service(str(config), clock=clock, samples=1440))
+            daemon = asyncio.run(run_service(load(str(config)), clock=clock, samples=1440))
             seconds.append(time.perf_counter() - began)
         latency = np.array(daemon.latency.seconds) * 1e3
         medians.append(float(np.median(latency)))

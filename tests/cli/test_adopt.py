@@ -97,7 +97,7 @@ def test_an_adopted_model_that_was_damaged_is_said_and_the_configured_one_stands
     assert main(["check", "--config", str(idle), "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["model_sha256"] == configured
-    assert "the configured one stands in" in captured.err
+    assert "the configured one is used instead" in captured.err
 
 
 @pytest.mark.parametrize(

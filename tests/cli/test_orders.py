@@ -27,7 +27,7 @@ def test_an_endpoint_at_which_nobody_answers_is_named(
     port = free_port()
     assert main([command, "--prefix", "shop/vmc-07", "--zenoh", operator(tmp_path, port)]) == 1
     error = capsys.readouterr().err
-    assert f"shop/vmc-07: the service is not reached: nobody answers at tcp/127.0.0.1:{port}" in error
+    assert f"shop/vmc-07: the service is not reached: nothing answers at tcp/127.0.0.1:{port}" in error
     assert error.count("\n") == 1
 
 

@@ -24,7 +24,8 @@ from compensator.demo.live import apply_fault
 from compensator.demo.machine import CapaNcdt, configuration, hardware
 from compensator.messages import Offset
 from compensator.recording.reading import read_messages, recordings
-from compensator.service.composition import load, read_once
+from compensator.service.composition import read_once
+from compensator.service.loading import load
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire import Faults
 from tests.cli.test_adopt import free_port
@@ -52,7 +53,8 @@ def streaming(capa: CapaNcdt) -> Iterator[None]:
 
 def readings(config: Path) -> list[str]:
     """The qualities of T_Q, AT and Y as a service would read them now; what its device says where that fails."""
-    loaded, _, _, fleet = load(str(config))
+    setup = load(str(config))
+    loaded, fleet = setup.loaded, setup.fleet
     answers = asyncio.run(read_once(fleet))
     found = []
     for channel in loaded.config.channel[:3]:

@@ -22,13 +22,13 @@ import msgspec
 import pytest
 
 from compensator.clock import NS
-from compensator.commands.run import Voice, level, status
+from compensator.commands.run import Reporter, level, status
 from compensator.demo.machine import configuration
 from compensator.messages import Event, Offset
 from compensator.recording.reading import recordings
-from compensator.service import journald
+from compensator.service import systemd
 from compensator.service.compensation import Outcome
-from compensator.service.notify import ServiceManager
+from compensator.service.systemd import ServiceManager
 from tests.cli.test_adopt import LINES, free_port
 from tests.cli.test_commands import load_fast_model
 from tests.service.simulated import Bench
@@ -173,7 +173,7 @@ async def test_a_device_that_never_answers_is_no_standstill(bench: Bench) -> Non
     async def never() -> Any:
         await asyncio.get_running_loop().create_future()
 
-    bench.daemon._clock = ImpatientClock(bench.clock)
+    bench.daemon._clock = bench.daemon._sampler._clock = ImpatientClock(bench.clock)
     bench.at_sample[5] = lambda: setattr(bench.device, "read", never)
 
     def took(outcome: Outcome) -> None:
@@ -199,10 +199,10 @@ def test_no_sign_of_life_while_the_loop_stands_still(bench: Bench, listener: Lis
 
     bench.device.read = blocked  # type: ignore[method-assign]
     with ServiceManager(listener.environment(30.0)) as manager:
-        voice = Voice(manager)
+        reporter = Reporter(manager)
 
         def polled() -> None:
-            voice.polled()
+            reporter.report_poll()
             listener.drain()  # a socket's queue is short
 
         work = threading.Thread(target=lambda: asyncio.run(bench.daemon.run(samples=5, on_poll=polled)))
@@ -220,11 +220,11 @@ def test_no_sign_of_life_while_the_loop_stands_still(bench: Bench, listener: Lis
 
 def test_a_held_internal_error_counts_as_work_and_is_told(bench: Bench, listener: Listener) -> None:
     with ServiceManager(listener.environment(30.0)) as manager:
-        voice = Voice(manager)
+        reporter = Reporter(manager)
         publish = bench.daemon._publish
-        bench.daemon._publish = lambda name, data: (publish(name, data), voice.published(name, data))[0]
+        bench.daemon._publish = lambda name, data: (publish(name, data), reporter.report_message(name, data))[0]
         bench.daemon._compensation.process = lambda raw: 1 / 0  # type: ignore[method-assign,assignment,return-value]
-        asyncio.run(bench.daemon.run(samples=2, on_poll=voice.polled))
+        asyncio.run(bench.daemon.run(samples=2, on_poll=reporter.report_poll))
     assert listener.drain().count("WATCHDOG=1") >= 7
     assert any("internal_error" in line for line in listener.lines if line.startswith("STATUS="))
 
@@ -271,16 +271,16 @@ def parsed(data: bytes) -> dict[str, str]:
 
 def test_events_reach_the_journal_with_their_fields(tmp_path: Path, listener: Listener) -> None:
     log = logging.getLogger("compensator")
-    handler = journald.JournalHandler(str(listener.path))
+    handler = systemd.JournalHandler(str(listener.path))
     log.addHandler(handler)
     log.setLevel(logging.INFO)
     try:
         with ServiceManager({}) as manager:
-            voice = Voice(manager)
+            reporter = Reporter(manager)
             changed = event("state", "hold t_q_missing", state="hold", reasons=["t_q_missing"])
-            voice.published("event", msgspec.json.encode(changed))
+            reporter.report_message("event", msgspec.json.encode(changed))
             first = parsed(listener.socket.recv(65536))
-            voice.published("event", msgspec.json.encode(event("device", "two\nlines", ok=True)))
+            reporter.report_message("event", msgspec.json.encode(event("device", "two\nlines", ok=True)))
             second = parsed(listener.socket.recv(65536))
     finally:
         log.removeHandler(handler)
@@ -301,7 +301,7 @@ def test_events_reach_the_journal_with_their_fields(tmp_path: Path, listener: Li
 
 
 def test_a_journal_that_is_gone_loses_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    handler = journald.JournalHandler(str(tmp_path / "nobody"))
+    handler = systemd.JournalHandler(str(tmp_path / "nobody"))
     handler.emit(logging.LogRecord("compensator", logging.INFO, "", 0, "still said", (), None))
     handler.close()
     assert capsys.readouterr().err == "still said\n"
@@ -311,11 +311,11 @@ def test_only_the_stream_that_systemd_names_is_the_journal(tmp_path: Path) -> No
     with (tmp_path / "file").open("w") as file:
         found = os.fstat(file.fileno())
         named = {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
-        assert journald.is_connected(named, file.fileno())
-        assert not journald.is_connected({}, file.fileno())
+        assert systemd.is_connected(named, file.fileno())
+        assert not systemd.is_connected({}, file.fileno())
         with (tmp_path / "other").open("w") as other:
-            assert not journald.is_connected(named, other.fileno())
-    assert not journald.is_connected(named, 9999)
+            assert not systemd.is_connected(named, other.fileno())
+    assert not systemd.is_connected(named, 9999)
 
 
 # ---------------------------------------------------------------------------- the real process

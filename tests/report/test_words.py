@@ -5,27 +5,35 @@ from __future__ import annotations
 import ast
 import json
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
 import compensator
 from compensator.audit.findings import End, Kind
 from compensator.cli import main
-from compensator.messages import State
-from compensator.reasons import WORDS, Caution
+from compensator.codes import Code
+from compensator.reasons import DOMAINS, WORDS, Remark
 
 PACKAGE = Path(compensator.__file__).parent
 
 
-def cautions() -> set[str]:
+def member(node: ast.AST) -> Code | None:
+    """The code that `DOMAIN.MEMBER` names in the sources."""
+    if not isinstance(node, ast.Attribute) or not isinstance(node.value, ast.Name):
+        return None
+    domain = next((domain for domain in DOMAINS if domain.__name__ == node.value.id), None)
+    return None if domain is None else domain.__members__.get(node.attr)
+
+
+def remarks() -> set[str]:
     """Codes of all warnings that the sources make."""
     found = set()
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Caution":
-                assert isinstance(node.args[0], ast.Constant), f"{path}: {node.lineno}: a code that is not written out"
-                found.add(node.args[0].value)
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Remark":
+                code = member(node.args[0]) or getattr(node.args[0], "value", None)
+                assert isinstance(code, str), f"{path}: {node.lineno}: a code that is not written out"
+                found.add(str(code))
     return found
 
 
@@ -40,12 +48,13 @@ def test_every_warning_in_the_log_has_a_code() -> None:
 
 
 def written() -> set[str]:
-    """Texts in the sources, as far as a colon, without those of the table of words itself."""
+    """Texts in the sources, as far as a colon, and codes that they name, without those of the tables of words."""
     found = set()
     for root in ("compensator", "drivers"):
         for path in (PACKAGE.parent / root).rglob("*.py"):
-            if path != PACKAGE / "reasons.py":
+            if path not in (PACKAGE / "reasons.py", PACKAGE / "remarks.py"):
                 tree = ast.parse(path.read_text(encoding="utf-8"))
+                found |= {str(code) for node in ast.walk(tree) if (code := member(node)) is not None}
                 found |= {
                     node.value.partition(":")[0]
                     for node in ast.walk(tree)
@@ -59,14 +68,14 @@ def test_no_code_is_left_over() -> None:
 
 
 def test_every_code_that_is_shown_has_its_sentences() -> None:
-    assert len(cautions()) >= 18
-    assert cautions() | set(get_args(State)) | set(Kind) | set(End) <= set(WORDS)
+    assert len(remarks()) >= 18
+    assert remarks() | set(Kind) | set(End) <= set(WORDS)
     for code, (means, do) in WORDS.items():
         assert means.endswith(".") and do.endswith(".") and means != do, code
 
 
 @pytest.mark.parametrize(
-    "code", sorted(cautions() | {"hold", "silent", "unknown", "torn", "altered", "outside_validity"})
+    "code", sorted(remarks() | {"hold", "silent", "unknown", "torn", "altered", "outside_validity"})
 )
 def test_explain_says_the_same(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", code, "--json"]) == 0
@@ -74,8 +83,12 @@ def test_explain_says_the_same(code: str, capsys: pytest.CaptureFixture[str]) ->
     assert (said["means"], said["do"]) == WORDS[code]
 
 
+def test_no_code_has_two_meanings() -> None:
+    assert len(WORDS) == sum(len(domain) for domain in DOMAINS)
+
+
 def test_a_warning_says_what_to_do() -> None:
-    said = Caution("twin_modes", "Two time constants of the DTF coincide at 20 min.")
+    said = Remark("twin_modes", "Two time constants of the DTF coincide at 20 min.")
     assert said.startswith("Two time") and said.endswith(WORDS["twin_modes"][1]) and said.code == "twin_modes"
     with pytest.raises(KeyError):
-        Caution("no such code", "Something.")
+        Remark("no such code", "Something.")

@@ -19,7 +19,7 @@ from compensator.config import Config, LoadedConfig
 from compensator.messages import Event, encode, number
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.recording.reading import first_sequence, recordings
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
@@ -84,13 +84,11 @@ class Machine:
     async def run(self, samples: int, until: Callable[[Outcome], bool] = lambda outcome: False) -> None:
         """Start the service, run it, end it cleanly."""
         data = self.store.in_use()
-        loaded = LoadedConfig(
-            config=self.config, path=self.folder / "machine.toml", data=self.config_bytes, sha256="unused"
-        )
+        loaded = LoadedConfig(config=self.config, path=self.folder / "machine.toml", data=self.config_bytes)
         note = OffsetCheckpoint(self.recordings, MACHINE, self.folder)
         early = note.read(self.config.limits.offset_max_um)
         resumed = resume(loaded, check_model(self.config, data, source="test"), early)
-        recorder = Recorder(self.recordings, MACHINE, {"config.toml": self.config_bytes, "model.toml": data})
+        recorder = McapRecorder(self.recordings, MACHINE, {"config.toml": self.config_bytes, "model.toml": data})
         daemon = self.daemon = Daemon(
             config=self.config,
             compensation=resumed.compensation,
@@ -101,7 +99,7 @@ class Machine:
             first_sequence=first_sequence(self.recordings, MACHINE, self.clock.utc_ns(), 60.0),
             adoption=Adoption(self.config, self.recordings, self.store),
             notes=resumed.notes,
-            early=note,
+            checkpoint=note,
         )
 
         def step(outcome: Outcome) -> None:

@@ -10,7 +10,7 @@ import msgspec
 from compensator.clock import NS, VirtualClock
 from compensator.config import Config
 from compensator.model.model_file import load_model
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from drivers.errors import DriverError
@@ -109,7 +109,7 @@ class Bench:
             self.world.advance_to(t_s)
 
         self.clock = VirtualClock(START_NS, advance)
-        self.recorder = Recorder(tmp_path / "rec", "vmc-07", {"model.toml": b"x"})
+        self.recorder = McapRecorder(tmp_path / "rec", "vmc-07", {"model.toml": b"x"})
         self.daemon = Daemon(
             config=self.config,
             compensation=Compensation(self.config, load_model(self.config.model.file)),

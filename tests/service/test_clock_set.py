@@ -14,7 +14,7 @@ from compensator.messages import number
 from compensator.model.model_file import parse_model
 from compensator.receiver import Receiver, Settings
 from compensator.recording.reading import recordings
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.publisher import Publisher
@@ -54,7 +54,7 @@ class Shop:
             config=config,
             compensation=Compensation(config, parse_model(QUILL, source="test")),
             devices={"module": FakeDevice([self.world.source(name) for name in CHANNELS])},
-            recorder=Recorder(folder, MACHINE, {"config.toml": CONFIG, "model.toml": QUILL}),
+            recorder=McapRecorder(folder, MACHINE, {"config.toml": CONFIG, "model.toml": QUILL}),
             publish=self.publisher.publish,
             clock=self.clock,
             first_sequence=0,

@@ -12,7 +12,7 @@ from compensator.audit.series import audit
 from compensator.messages import Offset
 from compensator.recording import recorder as recorder_module
 from compensator.recording.reading import recordings
-from compensator.service.offset_checkpoint import Early, OffsetCheckpoint
+from compensator.service.offset_checkpoint import EarlyOffset, OffsetCheckpoint
 from tests.service.living import MACHINE, Machine, largest_step, settings
 from tests.service.simulated import TABLE
 
@@ -28,14 +28,14 @@ async def test_killed_on_a_full_disk_the_offset_does_not_leap_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine = slow_machine(tmp_path)
-    sync = recorder_module._Live.sync
+    sync = recorder_module.RecordingFile.sync
 
     def full(live: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    machine.at_sample[60] = lambda: monkeypatch.setattr(recorder_module._Live, "sync", full)
+    machine.at_sample[60] = lambda: monkeypatch.setattr(recorder_module.RecordingFile, "sync", full)
     await machine.run_and_kill(100)
-    monkeypatch.setattr(recorder_module._Live, "sync", sync)
+    monkeypatch.setattr(recorder_module.RecordingFile, "sync", sync)
     before = machine.offsets()
     assert abs(before[99] - before[59]) > 20 * RATE_UM_PER_MIN  # so far it would leap
     (note,) = tmp_path.glob("compensator-*.json")
@@ -73,21 +73,21 @@ def offset(value: float, seq: int = 7) -> Offset:
 def test_the_note_is_of_one_machine_and_its_newest(tmp_path: Path) -> None:
     note, other = (OffsetCheckpoint(tmp_path / folder, MACHINE, tmp_path) for folder in ("a", "b"))
     assert note.read(100.0) is None
-    note.keep(offset(1.5))
-    note.keep(offset(float("nan"), 8))  # nothing was published that a control could apply
-    note.keep(offset(-2.5, 9))
-    assert note.read(100.0) == Early(seq=9, time_utc_ns=5, y_offset_um=-2.5)
+    note.write(offset(1.5))
+    note.write(offset(float("nan"), 8))  # nothing was published that a control could apply
+    note.write(offset(-2.5, 9))
+    assert note.read(100.0) == EarlyOffset(seq=9, time_utc_ns=5, y_offset_um=-2.5)
     assert other.read(100.0) is None and note.path.stat().st_mode & 0o777 == 0o600
     assert note.read(2.0) is None  # beyond the limit: no service published that
-    note.forget()
-    note.forget()
+    note.remove()
+    note.remove()
     assert note.read(100.0) is None
 
 
 @pytest.mark.parametrize("what", ["not JSON", "torn", "not a number", "a link", "a pipe", "others may write it"])
 def test_what_no_service_wrote_does_not_count(tmp_path: Path, what: str) -> None:
     note = OffsetCheckpoint(tmp_path / "rec", MACHINE, tmp_path)
-    note.keep(offset(3.0))
+    note.write(offset(3.0))
     whole = note.path.read_bytes()
     if what == "not JSON":
         note.path.write_bytes(b"\xff\0")
@@ -108,6 +108,6 @@ def test_what_no_service_wrote_does_not_count(tmp_path: Path, what: str) -> None
 
 def test_a_computer_that_does_not_take_the_note_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     note = OffsetCheckpoint(tmp_path / "rec", MACHINE, tmp_path / "missing")
-    note.keep(offset(3.0))
-    note.keep(offset(4.0))
+    note.write(offset(3.0))
+    note.write(offset(4.0))
     assert caplog.text.count("a kill now would lose the offset") == 1 and note.read(100.0) is None

@@ -14,7 +14,7 @@ import drivers
 from compensator.clock import VirtualClock
 from compensator.messages import number
 from compensator.model.model_file import load_model
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
@@ -55,7 +55,7 @@ class Wired:
             config=self.config,
             compensation=Compensation(self.config, load_model("quill")),
             devices=self.fleet.devices,
-            recorder=Recorder(folder, "vmc-07", {}),
+            recorder=McapRecorder(folder, "vmc-07", {}),
             publish=lambda name, data: None,
             clock=VirtualClock(START_NS, advance),
             first_sequence=0,

@@ -168,7 +168,7 @@ def test_false_alarms_come_as_rarely_as_stated() -> None:
     """Residuals that hang together just as the check takes them to: the mean time between alarms is the stated one."""
     stated = 5.0
     check = PlausibilityCheck(checked(false_alarm_days=stated), QUILL)
-    check._suspects.fits = lambda blocks: ([], True)  # type: ignore[method-assign,assignment]
+    check._isolation.fits = lambda blocks: ([], True)  # type: ignore[method-assign,assignment]
     random = np.random.default_rng(5)
     blocks = 60_000
     keep, z, alarms = check._keep, 0.0, 0
@@ -177,7 +177,7 @@ def test_false_alarms_come_as_rarely_as_stated() -> None:
         z = keep * z + e
         check.state.sums, check.state.used = ((BLOCK_SAMPLES - 1) * z * std, (BLOCK_SAMPLES - 1) * std**2, 0.0), 9
         check.state.taken = BLOCK_SAMPLES - 1
-        check._take_residual(
+        check._check_residual(
             Evidence(below_k=0.0, apart_k=0.0, rest=0.0, residual_um=z * std, std_um=QUILL.y_std_um, predicted_um=0.0)
         )
         if check.reasons:

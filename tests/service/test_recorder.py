@@ -7,7 +7,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from compensator.recording.reading import recordings
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from tests.service.simulated import START_NS
 
 
@@ -17,7 +17,7 @@ def attached(path: Path) -> dict[str, bytes]:
 
 
 def test_a_file_carries_the_state_that_it_opens_with(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, "vmc-07", {"model.toml": b"first"})
+    recorder = McapRecorder(tmp_path, "vmc-07", {"model.toml": b"first"})
     recorder.write([("sample", b"{}")], START_NS, state=b"one")
     recorder.write([("sample", b"{}")], START_NS, state=b"two")  # the file is open: not this one
     recorder.attachments = {"model.toml": b"second"}
@@ -31,7 +31,7 @@ def test_a_file_carries_the_state_that_it_opens_with(tmp_path: Path) -> None:
 
 
 def test_without_a_state_there_is_no_attachment_of_it(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, "vmc-07", {})
+    recorder = McapRecorder(tmp_path, "vmc-07", {})
     recorder.write([("sample", b"{}")], START_NS)
     recorder.close()
     assert attached(recordings(tmp_path, "vmc-07")[0]) == {}

@@ -14,7 +14,7 @@ from compensator.config import LoadedConfig
 from compensator.messages import number
 from compensator.model.model_file import load_model, read_model_bytes
 from compensator.recording.reading import decode, read_messages, recordings
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.restart import resume
 from drivers.reading import Quality, Reading
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
@@ -195,13 +195,13 @@ async def test_recordings_without_a_state_and_files_that_are_none(
 ) -> None:
     """Recordings of an older version carry no state; something else may lie in the folder under such a name."""
     machine = Machine(tmp_path)
-    write = Recorder.write
+    write = McapRecorder.write
 
-    def stateless(self: Recorder, records: Any, time_utc_ns: int, *, state: bytes = b"", **rest: Any) -> None:
+    def stateless(self: McapRecorder, records: Any, time_utc_ns: int, *, state: bytes = b"", **rest: Any) -> None:
         write(self, records, time_utc_ns, **rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Recorder, "write", stateless)
+        patch.setattr(McapRecorder, "write", stateless)
         await machine.run_and_kill(300)
     (machine.recordings / f"{MACHINE}_20260105T230000Z.mcap").write_bytes(b"")
     await machine.run(30)
@@ -231,7 +231,7 @@ async def test_cut_anywhere_every_whole_record_counts(tmp_path: Path) -> None:
     await machine.run_and_kill(40)
     path = recordings(machine.recordings, MACHINE)[-1]
     data = path.read_bytes()
-    loaded = LoadedConfig(config=machine.config, path=tmp_path / "machine.toml", data=machine.config_bytes, sha256="")
+    loaded = LoadedConfig(config=machine.config, path=tmp_path / "machine.toml", data=machine.config_bytes)
     model = load_model("quill")
     for cut in [*np.random.default_rng(5).integers(0, len(data), 60).tolist(), 0, 5, len(data) - 1]:
         path.write_bytes(data[:cut])
@@ -247,9 +247,9 @@ async def test_a_damaged_state_does_not_keep_the_service_from_starting(
     tmp_path: Path, state: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine = Machine(tmp_path)
-    write = Recorder.write
+    write = McapRecorder.write
     with monkeypatch.context() as patch:
-        patch.setattr(Recorder, "write", lambda self, records, ns, **_: write(self, records, ns, state=state))
+        patch.setattr(McapRecorder, "write", lambda self, records, ns, **_: write(self, records, ns, state=state))
         await machine.run_and_kill(100)
     await machine.run(20)
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
@@ -269,9 +269,9 @@ async def test_every_file_works_out_from_what_travels_in_it(tmp_path: Path, monk
     machine.at_sample[185] = lambda: machine.device.replaced.update({0: lost})  # across midnight
     machine.at_sample[215] = machine.device.replaced.clear
     full = [False]
-    write = Recorder.write
+    write = McapRecorder.write
 
-    def failing(self: Recorder, records: Any, time_utc_ns: int, **rest: Any) -> None:
+    def failing(self: McapRecorder, records: Any, time_utc_ns: int, **rest: Any) -> None:
         if full[0]:
             self._give_up()
             raise OSError(28, "No space left on device")
@@ -279,15 +279,15 @@ async def test_every_file_works_out_from_what_travels_in_it(tmp_path: Path, monk
 
     def break_off() -> None:
         compensation = machine.daemon._compensation  # type: ignore[union-attr]
-        original = compensation._decide
+        original = compensation._decision.decide
 
         def broken(*_: Any) -> Any:
-            compensation._decide = original  # type: ignore[method-assign]
+            compensation._decision.decide = original  # type: ignore[method-assign]
             raise ZeroDivisionError("a defect")
 
-        compensation._decide = broken  # type: ignore[method-assign]
+        compensation._decision.decide = broken  # type: ignore[method-assign]
 
-    monkeypatch.setattr(Recorder, "write", failing)
+    monkeypatch.setattr(McapRecorder, "write", failing)
     machine.at_sample[165] = lambda: (full.__setitem__(0, True), machine.command("zero", b'{"mode": "warm"}'))
     machine.at_sample[175] = lambda: full.__setitem__(0, False)
     machine.at_sample[230] = break_off

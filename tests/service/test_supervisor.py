@@ -59,7 +59,7 @@ async def test_a_defect_holds_the_offset_until_resume(
     assert "internal error: ZeroDivisionError: a defect" in told
 
 
-@pytest.mark.parametrize("where", ["_guards.judge", "_decide", "plausibility.take", "_set_zero"])
+@pytest.mark.parametrize("where", ["_guards.check", "_decision.decide", "plausibility.update", "_set_zero"])
 async def test_a_sample_that_breaks_off_half_way_leaves_a_recording_that_audits_clean(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:

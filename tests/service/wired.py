@@ -24,7 +24,7 @@ from compensator.config import Config, Zenoh
 from compensator.messages import Event, Offset, Sample
 from compensator.model.model_file import load_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.publisher import Publisher, session_config
@@ -132,7 +132,7 @@ class WiredMachine:
             config=self.config,
             compensation=Compensation(self.config, model or load_model("quill")),
             devices=self.fleet.devices,
-            recorder=Recorder(folder, name, {}),
+            recorder=McapRecorder(folder, name, {}),
             publish=publish,
             clock=VirtualClock(START_NS, self._advance),
             first_sequence=0,

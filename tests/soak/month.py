@@ -24,7 +24,7 @@ from compensator.messages import Event, Offset, Sample, number
 from compensator.model.model_file import parse_model
 from compensator.recording import recorder as recorder_module
 from compensator.recording.reading import decode, first_sequence, read_messages, recordings
-from compensator.recording.recorder import Recorder
+from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.restart import resume
@@ -86,7 +86,7 @@ class _Disk:
         self.full = False
         self.moves = threading.Event()
         self.moves.set()
-        sync = recorder_module._Live.sync
+        sync = recorder_module.RecordingFile.sync
 
         def syncing(live: Any) -> None:
             assert self.moves.wait(600.0)
@@ -94,7 +94,7 @@ class _Disk:
                 raise OSError(28, "No space left on device")
             sync(live)
 
-        patch.setattr(recorder_module._Live, "sync", syncing)
+        patch.setattr(recorder_module.RecordingFile, "sync", syncing)
 
 
 class _Machine:
@@ -130,9 +130,9 @@ class _Machine:
 
     async def _once(self) -> None:
         self._ending, self.away_min = "", 0
-        loaded = LoadedConfig(config=self.config, path=self.folder / "m.toml", data=self.config_bytes, sha256="")
+        loaded = LoadedConfig(config=self.config, path=self.folder / "m.toml", data=self.config_bytes)
         resumed = resume(loaded, parse_model(QUILL, source="test"))
-        recorder = Recorder(self.folder / "rec", MACHINE, {"config.toml": self.config_bytes, "model.toml": QUILL})
+        recorder = McapRecorder(self.folder / "rec", MACHINE, {"config.toml": self.config_bytes, "model.toml": QUILL})
         daemon = self.daemon = Daemon(
             config=self.config,
             compensation=resumed.compensation,
@@ -150,7 +150,7 @@ class _Machine:
                 await close(state)
                 return
             # A kill leaves the file as it is, and lets go of it.
-            daemon._journal._thread._thread.shutdown(wait=True)
+            daemon._journal._executor.shutdown(wait=True)
             recorder._finisher.wait()
             if recorder._live is not None:
                 os.close(recorder._live._descriptor)

@@ -1,12 +1,12 @@
-"""Which sensor fits a residual best: T_Q, AT, the measured Y, or the model.
+"""Fault isolation: which sensor, T_Q, AT or measured Y, or the model, explains a residual best.
 
-A fault of T_Q or AT reaches the residual through the model alone, so its shape in time is the model's own response to
-a ramp or a step in that input; a fault of the probe is a ramp or a step itself; a wrong gain of the model, and a probe
-that measures something else or on another scale, look like a part of the prediction. Every shape is fitted with its
-size and its beginning, and the likelihoods are compared: what comes within odds of 20 of the best is a suspect.
+A fault of T_Q or AT reaches the residual through the model, so its shape in time is the model's response to a ramp or
+a step in that input. A fault of the probe is itself a ramp or step. A wrong gain of the model, or a probe with another
+scale, looks like a fraction of the prediction. Size and onset of every shape are fitted and the likelihoods compared;
+whatever comes within odds of 20 of the best is a suspect.
 
-The errors of the model hang together over time, so residual and shapes are filtered by the same first-order whitening
-before they are compared. Plain loops in a fixed order: an audit must come to the same suspects on another processor.
+Model errors are correlated in time, so residual and shapes pass the same first-order whitening filter first. The loops
+have a fixed order, so that an audit finds the same suspects on another processor.
 
 Source: Basseville and Nikiforov, Detection of Abrupt Changes (1993), chapter 7 (generalised likelihood ratio).
 """
@@ -17,15 +17,16 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
 
-#: Suspects whose log likelihood lies within this of the best cannot be told from it: odds of 20.
+#: Suspects whose log likelihood is within this of the best cannot be distinguished from it: odds of 20.
 LOG_ODDS = 3.0
-#: Mean square of what the best shape leaves, in units of what is expected, beyond which no shape fits.
+#: Mean square that the best shape leaves, relative to the expected one, above which no shape fits.
 MISFIT = 4.0
-#: Samples without a change before a response is taken, so that the observer's gains have settled.
+#: Samples without a change before a response is computed, so that the observer's gains have settled.
 _SETTLING = 120
 _HOUR_MIN = 60.0
 
@@ -37,7 +38,7 @@ class Block:
     Parameters
     ----------
     residual_um : float
-        Measured − predicted, µm; NaN where too little could be used.
+        Measured − predicted, µm; NaN if too few samples were usable.
     std_um : float
         Its stated standard deviation, µm.
     predicted_um : float
@@ -58,9 +59,9 @@ class Fit:
     suspect : str
         `t_q_degc`, `at_degc`, `y_um` or `model`.
     words : str
-        What would have happened, with its size.
+        The fault with its size, such as `T_Q drifts by +0.1 K/h`.
     blocks_ago : int
-        How many blocks ago it began.
+        How many blocks ago it started.
     gain : float
         Log likelihood over that of no fault.
     """
@@ -79,17 +80,17 @@ class _Shape:
     values: tuple[float, ...]
 
 
-class Suspects:
-    """Compares the shapes of one model.
+class FaultIsolation:
+    """Fits the fault shapes of one model to residuals.
 
     Parameters
     ----------
     model : ThermalModel
         The running model.
     block_samples, window : int
-        Samples in a block, and blocks that are looked at.
+        Samples in a block, and number of blocks.
     keep : float
-        Correlation of the residual of two blocks that follow each other.
+        Correlation of the residuals of two consecutive blocks.
     """
 
     def __init__(self, model: ThermalModel, block_samples: int, window: int, keep: float) -> None:
@@ -98,10 +99,9 @@ class Suspects:
         self._window = window
         self._keep = keep
         self._hours = block_samples * model.period_s / 3600.0
-        self._made: tuple[_Shape, ...] = ()
 
     def fits(self, blocks: Sequence[Block]) -> tuple[list[Fit], bool]:
-        """Return the best fit of each suspect, the likeliest first, and whether even that one does not fit.
+        """Return the best fit of each suspect, the likeliest first, and whether even that one fits badly.
 
         Parameters
         ----------
@@ -109,7 +109,7 @@ class Suspects:
             The newest last.
         """
         z = [block.residual_um / block.std_um for block in blocks]
-        candidates = [self._beginning_at(begin, blocks, z) for begin in range(len(blocks) - 1)]
+        candidates = [self._starting_at(begin, blocks, z) for begin in range(len(blocks) - 1)]
         best: dict[str, Fit] = {}
         for fit in [fit for each in candidates for fit in each] + [self._as_prediction(blocks, z)]:
             if fit.suspect not in best or fit.gain > best[fit.suspect].gain:
@@ -119,9 +119,9 @@ class Suspects:
         left = 2.0 * (energy - ranked[0].gain) if ranked else 0.0
         return ranked, count > 0 and left > MISFIT * count
 
-    def _beginning_at(self, begin: int, blocks: Sequence[Block], z: Sequence[float]) -> list[Fit]:
+    def _starting_at(self, begin: int, blocks: Sequence[Block], z: Sequence[float]) -> list[Fit]:
         fits = []
-        for shape in self._shapes():
+        for shape in self._shapes:
             v = [0.0] * begin + [
                 value / block.std_um for value, block in zip(shape.values, blocks[begin:], strict=False)
             ]
@@ -136,21 +136,21 @@ class Suspects:
         words = f"measured Y is {1.0 + size:.2f} times the prediction"
         return Fit("model", words, len(blocks), gain)
 
+    @cached_property
     def _shapes(self) -> tuple[_Shape, ...]:
-        if not self._made:
-            made = []
-            for suspect, t_q, at in (("t_q_degc", 1.0, 0.0), ("at_degc", 0.0, 1.0)):
-                name = "T_Q" if t_q else "AT"
-                made.append(_Shape(suspect, "K/h", f"{name} drifts", self._response(t_q, at, ramp=True)))
-                made.append(_Shape(suspect, "K", f"{name} jumped", self._response(t_q, at, ramp=False)))
-            hours = tuple((i + 0.5) * self._hours for i in range(self._window))
-            made.append(_Shape("y_um", "µm/h", "measured Y drifts", hours))
-            made.append(_Shape("y_um", "µm", "measured Y jumped", (1.0,) * self._window))
-            self._made = tuple(made)
-        return self._made
+        """The faults' effects on the residual."""
+        made = []
+        for suspect, t_q, at in (("t_q_degc", 1.0, 0.0), ("at_degc", 0.0, 1.0)):
+            name = "T_Q" if t_q else "AT"
+            made.append(_Shape(suspect, "K/h", f"{name} drifts", self._response(t_q, at, ramp=True)))
+            made.append(_Shape(suspect, "K", f"{name} jumped", self._response(t_q, at, ramp=False)))
+        hours = tuple((i + 0.5) * self._hours for i in range(self._window))
+        made.append(_Shape("y_um", "µm/h", "measured Y drifts", hours))
+        made.append(_Shape("y_um", "µm", "measured Y jumped", (1.0,) * self._window))
+        return tuple(made)
 
     def _response(self, t_q_k: float, at_k: float, *, ramp: bool) -> tuple[float, ...]:
-        """Return what a fault of an input does to the residual, µm by block: minus its part in the prediction."""
+        """Return the effect of a sensor's fault on the residual, µm by block: minus that on the prediction."""
         engine = Engine(dataclasses.replace(self._model, effects=()))
         engine.set_reference(0.0, 0.0)
         for _ in range(_SETTLING):

@@ -1,18 +1,18 @@
-"""Plausibility between T_Q, AT and the measured Y: exchanged, drifted apart, or no longer what the model says.
+"""Plausibility of T_Q, AT and measured Y: exchanged sensors, sensors that drifted apart, a residual that is too large.
 
 Three checks, each on only where the configuration states its limit:
 
-- *exchanged*: T_Q below AT by more than `guards.t_q_below_at_max_k` for longer than `t_q_below_at_after_min`. A machine
-  without heat has both alike, so exchanged wires show once heat has come. The offset has the wrong sign by then:
-  `fault`, latched until somebody has looked (`resume`, or a zero at rest).
-- *at rest*: where a channel tells that nothing heats the machine, T_Q and AT must come back to the difference that they
-  had at the zero. The reason stands until a rest says otherwise.
-- *residual*: measured − predicted, against its own stated standard deviation, by a two-sided CUSUM on its innovations.
-  The errors of a model hang together over `residual_correlation_min`, so what counts is what the last block does not
-  tell: e = z − φ z'. Threshold from the stated time between two false alarms, by Siegmund's formula. Which sensor fits
-  the residual best is said by `suspects`. The offset goes on, with a standard deviation that takes the residual in.
+- *exchanged*: T_Q is below AT by more than `guards.t_q_below_at_max_k` for longer than `t_q_below_at_after_min`.
+  Without heat both are alike, so exchanged wires show only once the machine heats up; by then the offset has the wrong
+  sign. The state is `fault`, latched until `resume` or a zero at rest.
+- *at rest*: where a channel shows that nothing heats the machine, T_Q and AT must return to the difference that they
+  had at the zero. The reason stays until a later rest clears it.
+- *residual*: measured − predicted Y against its stated standard deviation, by a two-sided CUSUM on its innovations.
+  Model errors are correlated over `residual_correlation_min`, so only what the previous block does not predict counts:
+  e = z − φ z'. The threshold follows from the mean time between false alarms, by Siegmund's formula. `isolation` finds
+  the sensor that explains the residual best. The offset continues, its standard deviation includes the residual.
 
-Works on the sample alone and knows no clock; the state travels with that of the compensation.
+The checks use nothing but the sample and know no clock; their state is part of the compensation's.
 
 Source: Page (1954) for the CUSUM; Siegmund, Sequential Analysis (1985), for its mean time between false alarms;
 Basseville and Nikiforov (1993), chapter 8, for whitening first.
@@ -27,21 +27,22 @@ from typing import Any
 from compensator.config import Config, Plausibility
 from compensator.events import EventKind, Implausibility, Note
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.fault_isolation import LOG_ODDS, Block, Fit, Suspects
+from compensator.reasons import Reason
+from compensator.service.plausibility.isolation import LOG_ODDS, Block, FaultIsolation, Fit
 
 NAN = float("nan")
 
-#: Samples in a block of the residual: single minutes after a heat step say nothing of a sensor.
+#: Samples in a block of the residual: single minutes after a heat step say nothing about a sensor.
 BLOCK_SAMPLES = 10
-#: Part of a block that must have been usable.
+#: Fraction of a block that must be usable.
 _USABLE = 0.5
-#: Blocks that suspects are told from: 12 h of one-minute samples.
+#: Blocks that faults are isolated from: 12 h of one-minute samples.
 WINDOW = 72
-#: Shift, in standard deviations of the residual, that the CUSUM is made for.
+#: Shift, in standard deviations of the residual, that the CUSUM is designed for.
 _SHIFT = 5.0
-#: One innovation counts for no more than this many of its standard deviations: wild minutes raise nothing alone.
+#: An innovation is clipped at this many of its standard deviations: a few wild minutes raise no alarm.
 _CLIP = 3.0
-#: The reason goes once so many blocks in a row have been within so many standard deviations.
+#: The alarm ends once so many blocks in a row have been within so many standard deviations.
 CALM_BLOCKS = 6
 _CALM = 2.0
 #: Mean excess of a Gaussian random walk over a boundary, in its standard deviations (Siegmund).
@@ -58,29 +59,29 @@ class PlausibilityState:
     below_min : float
         For how long T_Q has been below AT, min.
     exchanged : bool
-        Whether that has been for too long.
+        Whether that has lasted too long.
     rest_min : float
         For how long nothing has heated the machine, min.
     apart : bool
         Whether T_Q and AT were apart at the last rest.
     taken, used : int
-        Samples in the block under way, and those that could be used.
+        Samples in the current block, and the usable ones among them.
     sums : tuple of three floats
-        Residual, its variance and the prediction, summed over them.
+        Residual, its variance and the prediction, summed over the usable ones.
     blocks : list of Block
-        The last ones, the newest last.
+        The last blocks, the newest last.
     z : float
         Residual of the last usable block in standard deviations; NaN before the first.
     skipped : int
-        Blocks since then that could not be used.
+        Unusable blocks since then.
     high, low : float
         The two CUSUMs.
     suspects : list of str
-        Who is suspected; empty while nothing is.
+        Likely causes of the alarm; empty without an alarm.
     accused : int
-        Blocks since the first one was.
+        Blocks since the alarm.
     calm : int
-        Quiet blocks in a row since.
+        Quiet blocks in a row since then.
     """
 
     below_min: float = 0.0
@@ -102,16 +103,16 @@ class PlausibilityState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """One sample, as the checks see it; NaN where something cannot be used.
+    """One sample, as the checks use it; NaN where something cannot be used.
 
     Parameters
     ----------
     below_k : float
-        AT − T_Q as measured, K, whatever the guards say of it.
+        AT − T_Q as measured, K, whatever the guards decided.
     apart_k : float
         T_Q − AT as a change since the zero, K.
     rest : float
-        Value of the channel that tells the rest.
+        Value of the channel that shows whether the machine rests.
     residual_um, std_um, predicted_um : float
         Measured − predicted, the prediction's stated standard deviation, and the prediction, µm.
     """
@@ -147,18 +148,16 @@ class PlausibilityCheck:
         block_min = BLOCK_SAMPLES * self._period_min
         # No exp(): its last bit depends on the platform, and an audit must come to the same state.
         self._keep = 1.0 / (1.0 + block_min / self._limits.residual_correlation_min)
-        #: Standard deviation of an innovation, the part of it that counts for nothing, and the threshold.
+        #: Standard deviation of an innovation, the CUSUM's allowance, and its threshold.
         self._e_std = math.sqrt(1.0 - self._keep * self._keep)
         self._allowance = 0.5 * _SHIFT * (1.0 - self._keep)
         days = self._limits.false_alarm_days
         self.threshold = (
             cusum_threshold(self._allowance, self._e_std, days * _DAY_MIN / block_min) if days else math.inf
         )
-        self._suspects = Suspects(model, BLOCK_SAMPLES, WINDOW, self._keep)
+        self._isolation = FaultIsolation(model, BLOCK_SAMPLES, WINDOW, self._keep)
         self.state = PlausibilityState()
         self._notes: list[Note] = []
-
-    # ------------------------------------------------------------------ what is on
 
     @property
     def is_on(self) -> bool:
@@ -166,7 +165,7 @@ class PlausibilityCheck:
         return self._watched or self._limits.t_q_below_at_after_min is not None or self._limits.rest is not None
 
     def describe(self) -> str:
-        """Return in words what is checked and what is not."""
+        """Describe what is checked and what is not."""
         parts = []
         limits = self._limits
         parts.append(
@@ -193,72 +192,66 @@ class PlausibilityCheck:
         )
         return "; ".join(parts)
 
-    # ------------------------------------------------------------------ one sample
-
-    def take(self, evidence: Evidence) -> list[Note]:
-        """Take one sample in; return the events that follow from it."""
+    def update(self, evidence: Evidence) -> list[Note]:
+        """Check one sample; return its events."""
         self._notes = []
-        self._take_difference(evidence.below_k)
-        self._take_rest(evidence)
+        self._check_exchanged(evidence.below_k)
+        self._check_rest(evidence)
         if self._watched:
-            self._take_residual(evidence)
+            self._check_residual(evidence)
         return self._notes
 
     @property
     def reasons(self) -> list[str]:
-        """What is implausible now; the offset goes on with these."""
-        state = self.state
-        return ["t_q_at_apart"] * state.apart + [f"implausible:{name}" for name in state.suspects]
+        """What is implausible now; the offset continues with these reasons."""
+        apart: list[str] = [Reason.T_Q_AT_APART] if self.state.apart else []
+        return apart + [f"{Reason.IMPLAUSIBLE}:{name}" for name in self.state.suspects]
 
     @property
     def exchanged(self) -> bool:
-        """Whether T_Q and AT seem to be exchanged: no offset can be relied on."""
+        """Whether T_Q and AT seem to be exchanged: no offset is reliable."""
         return self.state.exchanged
 
     @property
     def error_um(self) -> float:
-        """Last residual, µm, while somebody is suspected; else 0: the offset may be wrong by as much."""
+        """Last residual, µm, during an alarm, else 0: the offset may be wrong by as much."""
         if not self.state.suspects:
             return 0.0
         return next((abs(b.residual_um) for b in reversed(self.state.blocks) if not math.isnan(b.residual_um)), 0.0)
 
     @property
     def too_large(self) -> bool:
-        """Whether the residual is beyond what the configuration wants to be followed."""
+        """Whether the residual is too large for the offset to follow the model."""
         limit = self._limits.residual_hold_um
         return limit is not None and self.error_um > limit
 
-    # ------------------------------------------------------------------ commands, pauses
-
-    def zeroed(self, *, at_rest: bool) -> None:
-        """Begin anew: measured and predicted Y count from here; at rest, T_Q and AT do, too."""
+    def reset(self, *, at_rest: bool) -> None:
+        """Restart at a zero: measured and predicted Y count from here; at rest, T_Q and AT do, too."""
         old = self.state
         self.state = PlausibilityState(below_min=old.below_min, rest_min=old.rest_min)
         if not at_rest:
             self.state.exchanged, self.state.apart = old.exchanged, old.apart
 
-    def seen(self) -> None:
-        """Take the latch of exchanged sensors away: somebody has looked."""
+    def acknowledge(self) -> None:
+        """Clear the latch of exchanged sensors: an operator has checked them."""
         self.state.exchanged, self.state.below_min = False, 0.0
 
     def pass_time(self, samples: int) -> None:
-        """Let samples pass that nobody took."""
+        """Account for samples that were not measured."""
         self.state.rest_min = 0.0
         if self._watched:
             nothing = Evidence(below_k=NAN, apart_k=NAN, rest=NAN, residual_um=NAN, std_um=NAN, predicted_um=NAN)
             for _ in range(min(samples, WINDOW * BLOCK_SAMPLES)):
-                self._take_residual(nothing)
+                self._check_residual(nothing)
 
-    # ------------------------------------------------------------------ T_Q and AT
-
-    def _take_difference(self, below_k: float) -> None:
+    def _check_exchanged(self, below_k: float) -> None:
         limit, state = self._limits.t_q_below_at_after_min, self.state
         if limit is None or math.isnan(below_k):
             return
         state.below_min = state.below_min + self._period_min if below_k > self._below_max_k else 0.0
         if state.below_min >= limit and not state.exchanged:
             state.exchanged = True
-            self._tell(
+            self._note(
                 Implausibility.EXCHANGED,
                 f"T_Q has been more than {self._below_max_k:g} K below AT for {state.below_min:g} min, {below_k:.1f} K "
                 f"now: exchanged wires or addresses, or a couple that has come off; suspects: T_Q, AT",
@@ -266,7 +259,7 @@ class PlausibilityCheck:
                 minutes=state.below_min,
             )
 
-    def _take_rest(self, evidence: Evidence) -> None:
+    def _check_rest(self, evidence: Evidence) -> None:
         rest, state = self._limits.rest, self.state
         if rest is None or math.isnan(evidence.rest):
             return
@@ -275,7 +268,7 @@ class PlausibilityCheck:
             return
         apart = abs(evidence.apart_k) > rest.t_q_at_max_k
         if apart and not state.apart:
-            self._tell(
+            self._note(
                 Implausibility.APART,
                 f"after {state.rest_min:g} min of rest T_Q and AT differ by {evidence.apart_k:+.2f} K more than at the "
                 f"zero, expected within {rest.t_q_at_max_k:g} K; suspects: T_Q, AT, or a zero on a warm machine",
@@ -283,12 +276,10 @@ class PlausibilityCheck:
                 minutes=state.rest_min,
             )
         elif state.apart and not apart:
-            self._tell(Implausibility.TOGETHER, "T_Q and AT have come together at rest")
+            self._note(Implausibility.TOGETHER, "T_Q and AT have come together at rest")
         state.apart = apart
 
-    # ------------------------------------------------------------------ residual
-
-    def _take_residual(self, evidence: Evidence) -> None:
+    def _check_residual(self, evidence: Evidence) -> None:
         state = self.state
         state.taken += 1
         if not math.isnan(evidence.residual_um) and not math.isnan(evidence.std_um):
@@ -309,15 +300,15 @@ class PlausibilityCheck:
             block = Block(NAN, 1.0, NAN)
         state.taken, state.used, state.sums = 0, 0, (0.0, 0.0, 0.0)
         state.blocks = [*state.blocks[-WINDOW + 1 :], block]
-        self._judge(block)
+        self._update_cusum(block)
 
-    def _judge(self, block: Block) -> None:
+    def _update_cusum(self, block: Block) -> None:
         state = self.state
         if math.isnan(block.residual_um):
             state.skipped += 1
             return
         z = block.residual_um / block.std_um
-        # Measured and predicted Y are alike at the zero: that is what comes before the first block.
+        # Measured and predicted Y are equal at the zero, which precedes the first block.
         keep = self._keep
         for _ in range(min(state.skipped, WINDOW)):
             keep *= self._keep
@@ -331,31 +322,31 @@ class PlausibilityCheck:
             state.calm = state.calm + 1 if abs(z) < _CALM else 0
             if state.calm >= CALM_BLOCKS:
                 state.suspects, state.high, state.low, state.calm, state.accused = [], 0.0, 0.0, 0, 0
-                self._tell(Implausibility.RESIDUAL_OVER, "measured and predicted Y agree again")
+                self._note(Implausibility.RESIDUAL_OVER, "measured and predicted Y agree again")
                 return
         if state.suspects or max(state.high, state.low) > self.threshold:
-            self._accuse(block)
+            self._isolate(block)
 
-    def _accuse(self, block: Block) -> None:
-        """Say who fits; every further block may tell it better, until the beginning leaves the window."""
+    def _isolate(self, block: Block) -> None:
+        """Find the likely causes; every further block may improve this until the onset leaves the window."""
         self.state.accused += 1
         if self.state.accused > WINDOW // 2:
             return
-        ranked, misfit = self._suspects.fits(self.state.blocks)
+        ranked, misfit = self._isolation.fits(self.state.blocks)
         named = [fit for fit in ranked if fit.gain >= ranked[0].gain - LOG_ODDS]
         suspects = sorted({fit.suspect for fit in named} | ({"model"} if misfit else set()))
         if suspects == self.state.suspects:
             return
         self.state.suspects = suspects
-        self._tell(
+        self._note(
             Implausibility.RESIDUAL,
-            self._in_words(block, named, misfit),
+            self._describe_alarm(block, named, misfit),
             suspects=suspects,
             residual_um=block.residual_um,
             std_um=block.std_um,
         )
 
-    def _in_words(self, block: Block, named: list[Fit], misfit: bool) -> str:
+    def _describe_alarm(self, block: Block, named: list[Fit], misfit: bool) -> str:
         words = [f"{fit.words} since {self._ago(fit)}" if fit.suspect != "model" else fit.words for fit in named]
         if misfit:
             words.append("none of this fits well: something acts that the model does not know")
@@ -367,13 +358,13 @@ class PlausibilityCheck:
     def _ago(self, fit: Fit) -> str:
         return f"{fit.blocks_ago * BLOCK_SAMPLES * self._period_min:g} min"
 
-    def _tell(self, code: Implausibility, text: str, **data: Any) -> None:
+    def _note(self, code: Implausibility, text: str, **data: Any) -> None:
         # Version 0.1.0 recorded these texts without data: an audit of its recordings compares them.
         self._notes.append(Note(EventKind.PLAUSIBILITY, text, {"code": code, **data}))
 
 
 def cusum_threshold(allowance: float, std: float, blocks: float) -> float:
-    """Return the threshold of a two-sided CUSUM that crosses it once in so many blocks by chance.
+    """Return the threshold that a two-sided CUSUM crosses by chance once in so many blocks.
 
     Siegmund's approximation of the mean time of one side, with increments e − k, e ~ N(0, s²):
     ``(exp(2 Δ b) − 2 Δ b − 1) / (2 Δ²)``, Δ = k / s, b = h / s + 1.166; both sides together cross twice as often.

@@ -1,7 +1,6 @@
-"""Guards of the sensors: a value that cannot be is not used, and the sample says why.
+"""Guards of the channels: an impossible value is not used, and the quality in the sample says why.
 
-Each guard works on the record of the sample alone, so that an audit applies it again to the logged
-values and finds the same.
+The guards use nothing but the recorded sample and their own state, so an audit repeats them on recorded values.
 """
 
 from __future__ import annotations
@@ -13,9 +12,12 @@ import msgspec
 
 from compensator.config import Channel, Guards
 from compensator.messages import ChannelSample, number
+from compensator.reasons import SampleQuality
 
-#: Heat estimate, W, from which the machine counts as heated where no channel tells.
+#: Estimated heat, W, above which the machine counts as heated where heat is not measured.
 HEATED_W = 10.0
+
+GuardState = tuple[float, float, float, float]
 
 
 class ChannelGuard:
@@ -37,31 +39,31 @@ class ChannelGuard:
         self._still_at = math.nan
         self._still_min = 0.0
 
-    def judge(self, sample: ChannelSample) -> str:
-        """Return `good` or the code of what makes the sample unusable, and remember what is needed next."""
+    def check(self, sample: ChannelSample) -> str:
+        """Return the quality of a sample and remember what the next one needs."""
         self._since_good_min += self._period_min
-        if sample.device_quality != "good":
+        if sample.device_quality != SampleQuality.GOOD:
             return sample.device_quality
-        verdict = self._verdict(number(sample.mean), sample)
-        if verdict == "good":
+        quality = self._quality(number(sample.mean), sample)
+        if quality == SampleQuality.GOOD:
             self._last_good, self._since_good_min = number(sample.mean), 0.0
-        return verdict
+        return quality
 
-    def _verdict(self, mean: float, sample: ChannelSample) -> str:
+    def _quality(self, mean: float, sample: ChannelSample) -> SampleQuality:
         channel = self._channel
         if not math.isfinite(mean):
-            return "invalid"
+            return SampleQuality.INVALID
         if channel.range is not None and not channel.range[0] <= mean <= channel.range[1]:
-            return "out_of_range"
+            return SampleQuality.OUT_OF_RANGE
         if self._is_stuck(sample):
-            return "stuck"
+            return SampleQuality.STUCK
         if channel.rate_max_per_min is not None and not math.isnan(self._last_good):
-            # The allowance grows with the time since the last good value, so a sensor that comes back
-            # from a long loss is believed again, and a jump is not.
+            # The permitted change grows with the time since the last good value: a sensor that returns after a long
+            # loss is accepted again, a jump is not.
             allowed = channel.rate_max_per_min * self._since_good_min
             if abs(mean - self._last_good) > allowed:
-                return "too_fast"
-        return "good"
+                return SampleQuality.TOO_FAST
+        return SampleQuality.GOOD
 
     def _is_stuck(self, sample: ChannelSample) -> bool:
         low, high = number(sample.min), number(sample.max)
@@ -74,15 +76,15 @@ class ChannelGuard:
         return limit is not None and self._still_min >= limit
 
     def pass_time(self, minutes: float) -> None:
-        """Let time pass in which nothing was measured."""
+        """Account for time in which nothing was measured."""
         self._since_good_min += minutes
 
-    def snapshot(self) -> tuple[float, float, float, float]:
+    def snapshot(self) -> GuardState:
         """Return the state."""
         return self._last_good, self._since_good_min, self._still_at, self._still_min
 
-    def restore(self, state: tuple[float, float, float, float]) -> None:
-        """Take a state back."""
+    def restore(self, state: GuardState) -> None:
+        """Restore a state."""
         self._last_good, self._since_good_min, self._still_at, self._still_min = state
 
 
@@ -103,7 +105,7 @@ class SensorGuards:
         self._guards = {channel.name: ChannelGuard(channel, period_min) for channel in channels}
         self._limits = guards
 
-    def judge(self, channels: Mapping[str, ChannelSample], heat_w: float) -> dict[str, ChannelSample]:
+    def check(self, channels: Mapping[str, ChannelSample], heat_w: float) -> dict[str, ChannelSample]:
         """Return the channels with their final quality.
 
         Parameters
@@ -111,37 +113,37 @@ class SensorGuards:
         channels : mapping of str to ChannelSample
             What the devices gave.
         heat_w : float
-            The model's estimate before this sample, W; NaN where there is none.
+            The model's estimate before this sample, W; NaN if there is none.
         """
-        verdicts = {name: self._guards[name].judge(sample) for name, sample in channels.items()}
-        if self._t_q_below_at(channels, verdicts, heat_w):
-            # Which of the two is wrong cannot be progress: neither is used.
-            verdicts["t_q_degc"] = verdicts["at_degc"] = "t_q_below_at"
+        qualities = {name: self._guards[name].check(sample) for name, sample in channels.items()}
+        if self._t_q_below_at(channels, qualities, heat_w):
+            # Which of the two is wrong is unknown: neither is used.
+            qualities["t_q_degc"] = qualities["at_degc"] = SampleQuality.T_Q_BELOW_AT
         return {
             name: sample
-            if verdicts[name] == sample.quality
-            else msgspec.structs.replace(sample, quality=verdicts[name])
+            if qualities[name] == sample.quality
+            else msgspec.structs.replace(sample, quality=qualities[name])
             for name, sample in channels.items()
         }
 
-    def _t_q_below_at(self, channels: Mapping[str, ChannelSample], verdicts: Mapping[str, str], heat_w: float) -> bool:
-        if verdicts.get("t_q_degc") != "good" or verdicts.get("at_degc") != "good":
+    def _t_q_below_at(self, channels: Mapping[str, ChannelSample], qualities: Mapping[str, str], heat_w: float) -> bool:
+        if qualities.get("t_q_degc") != SampleQuality.GOOD or qualities.get("at_degc") != SampleQuality.GOOD:
             return False
         below_k = number(channels["at_degc"].mean) - number(channels["t_q_degc"].mean)
         known = channels.get("heat_w")
-        heat = number(known.mean) if known is not None and verdicts["heat_w"] == "good" else heat_w
+        heat = number(known.mean) if known is not None and qualities["heat_w"] == SampleQuality.GOOD else heat_w
         return below_k > self._limits.t_q_below_at_max_k and heat > HEATED_W
 
     def pass_time(self, minutes: float) -> None:
-        """Let time pass in which nothing was measured."""
+        """Account for time in which nothing was measured."""
         for guard in self._guards.values():
             guard.pass_time(minutes)
 
-    def snapshot(self) -> dict[str, tuple[float, float, float, float]]:
+    def snapshot(self) -> dict[str, GuardState]:
         """Return the state of every guard."""
         return {name: guard.snapshot() for name, guard in self._guards.items()}
 
-    def restore(self, state: Mapping[str, tuple[float, float, float, float]]) -> None:
-        """Take the states back."""
+    def restore(self, state: Mapping[str, GuardState]) -> None:
+        """Restore the states."""
         for name, guard_state in state.items():
             self._guards[name].restore(guard_state)

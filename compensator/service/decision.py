@@ -1,0 +1,220 @@
+"""From the estimate of a sample to its offset: state, reasons and limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from compensator.config import Config, Limits
+from compensator.messages import SCHEMA, Offset
+from compensator.model.engine import Estimate
+from compensator.model.thermal_model import ThermalModel
+from compensator.reasons import Reason, State
+from compensator.service.outcome import Values
+from compensator.service.plausibility import PlausibilityCheck
+from compensator.service.state import Memory
+
+NAN = float("nan")
+
+#: A published offset is valid for this many samples.
+VALID_SAMPLES = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Limited:
+    """An offset within its limits.
+
+    Parameters
+    ----------
+    offset_um, rate_um_per_min : float
+        What may be published.
+    reasons : tuple of Reason
+        Limits that acted.
+    """
+
+    offset_um: float
+    rate_um_per_min: float
+    reasons: tuple[Reason, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """State, reasons and offset of one sample; without an offset before the first zero."""
+
+    state: State
+    reasons: list[str]
+    limited: Limited | None
+
+    def message(self, model: ThermalModel, machine: str, seq: int, time_utc_ns: int, std_um: float) -> Offset:
+        """Return what is published."""
+        return Offset(
+            schema=SCHEMA,
+            machine=machine,
+            seq=seq,
+            time_utc_ns=time_utc_ns,
+            valid_for_s=VALID_SAMPLES * model.period_s,
+            y_offset_um=self.limited.offset_um if self.limited else NAN,
+            y_offset_rate_um_per_min=self.limited.rate_um_per_min if self.limited else NAN,
+            y_offset_std_um=std_um,
+            state=self.state,
+            reasons=self.reasons,
+            model_sha256=model.sha256,
+        )
+
+
+class OffsetLimiter:
+    """Keeps the offset within its limits, so that it never jumps.
+
+    Parameters
+    ----------
+    limits : Limits
+        Largest value, µm, and rate, µm/min.
+    period_min : float
+        Length of a sample, min.
+    """
+
+    def __init__(self, limits: Limits, period_min: float) -> None:
+        self._max_um = limits.offset_max_um
+        self._rate_max = limits.offset_rate_max_um_per_min
+        self._period_min = period_min
+        #: The last published offset, µm; a control that never received one applies none.
+        self.offset_um = 0.0
+
+    def follow(self, target_um: float, target_rate_um_per_min: float) -> Limited:
+        """Move towards a target.
+
+        Parameters
+        ----------
+        target_um : float
+            Where the offset should be, µm.
+        target_rate_um_per_min : float
+            How the target will move on, µm/min.
+
+        Returns
+        -------
+        Limited
+            The next offset, and the rate at which the one after it is expected.
+        """
+        reasons = []
+        wanted = target_um
+        if abs(wanted) > self._max_um:
+            wanted = math.copysign(self._max_um, wanted)
+            reasons.append(Reason.OFFSET_LIMITED)
+        step_max = self._rate_max * self._period_min
+        # One sample's worth at most, however long ago the last offset was published.
+        if abs(wanted - self.offset_um) > step_max:
+            wanted = self.offset_um + math.copysign(step_max, wanted - self.offset_um)
+            reasons.append(Reason.RATE_LIMITED)
+        self.offset_um = wanted
+        rate = self._rate_towards(target_um + target_rate_um_per_min * self._period_min)
+        return Limited(wanted, rate, tuple(reasons))
+
+    def hold(self) -> Limited:
+        """Keep the offset."""
+        return Limited(self.offset_um, 0.0)
+
+    def _rate_towards(self, next_target_um: float) -> float:
+        ahead = max(-self._max_um, min(self._max_um, next_target_um))
+        rate = (ahead - self.offset_um) / self._period_min
+        return max(-self._rate_max, min(self._rate_max, rate))
+
+
+class OffsetDecision:
+    """Decides state, reasons and offset of each sample.
+
+    Parameters
+    ----------
+    config : Config
+        Limits, validity, loss.
+    model : ThermalModel
+        Its range of validity narrows the configuration's.
+    channels : sequence of str
+        Channels that the model's effects use.
+    """
+
+    def __init__(self, config: Config, model: ThermalModel, channels: Sequence[str]) -> None:
+        self._channels = tuple(channels)
+        self._period_min = model.period_s / 60.0
+        self._predict_for_min = config.loss.predict_for_min
+        self._validity = _validity(config, model)
+        self.limiter = OffsetLimiter(config.limits, self._period_min)
+
+    def decide(
+        self, values: Values, estimate: Estimate | None, y_pred: float, memory: Memory, plausibility: PlausibilityCheck
+    ) -> Decision:
+        """Decide one sample.
+
+        Parameters
+        ----------
+        values : Values
+            Its usable values.
+        estimate : Estimate, optional
+            The model's estimate, None before the first zero.
+        y_pred : float
+            Predicted deformation since the zero, µm.
+        memory : Memory
+            What is remembered from sample to sample; times in it advance.
+        plausibility : PlausibilityCheck
+            Checks between the sensors, this sample included.
+        """
+        pairs = ((Reason.T_Q_MISSING, values.t_q), (Reason.AT_MISSING, values.at))
+        reasons: list[str] = [reason for reason, value in pairs if math.isnan(value)]
+        lost = bool(reasons)
+        memory.missing_min = memory.missing_min + self._period_min if lost else 0.0
+        expired = lost and memory.missing_min > self._predict_for_min
+        if estimate is None:
+            return Decision(State.FAULT if expired else State.STARTING, [*reasons, Reason.NO_ZERO], None)
+        missing = (name for name in self._channels if math.isnan(values.others.get(name, NAN)))
+        reasons += [f"{Reason.CHANNEL_MISSING}:{name}" for name in missing]
+        if memory.cold_min > 0.0:
+            memory.cold_min -= self._period_min
+            reasons.append(Reason.COLD_START)
+        reasons += plausibility.reasons
+        blocking = self._blocking(values, expired, memory, plausibility)
+        if plausibility.exchanged:
+            return Decision(State.FAULT, [*reasons, *blocking, Reason.T_Q_AT_EXCHANGED], self.limiter.hold())
+        if blocking:
+            return Decision(State.HOLD, reasons + blocking, self.limiter.hold())
+        if lost:
+            reasons.append(Reason.PREDICTING)
+        limited = self.limiter.follow(0.0 - y_pred, -estimate.y_rate_um_per_min)
+        memory.model_changed &= Reason.RATE_LIMITED in limited.reasons
+        if memory.model_changed:
+            reasons.append(Reason.MODEL_CHANGED)
+        reasons += limited.reasons
+        return Decision(State.DEGRADED if reasons else State.OK, reasons, limited)
+
+    def _blocking(self, values: Values, expired: bool, memory: Memory, plausibility: PlausibilityCheck) -> list[str]:
+        """Return why the offset must be held."""
+        # A single estimate of the heat overshoots when a source is switched; its mean over some samples does not.
+        heat = mean(memory.heats)
+        outside = [
+            f"{Reason.OUTSIDE_VALIDITY}:{name}"
+            for name, value in (("t_q_degc", values.t_q), ("at_degc", values.at), ("heat_w", heat))
+            if name in self._validity
+            and not math.isnan(value)
+            and not self._validity[name][0] <= value <= self._validity[name][1]
+        ]
+        flags = (
+            (Reason.PREDICTION_EXPIRED, expired),
+            (Reason.RESIDUAL_TOO_LARGE, plausibility.too_large),
+            (Reason.OPERATOR_HOLD, memory.operator_hold),
+            (Reason.INTERNAL_ERROR, memory.internal_error),
+        )
+        return outside + [code for code, present in flags if present]
+
+
+def _validity(config: Config, model: ThermalModel) -> dict[str, tuple[float, float]]:
+    """Return the range of validity: the configuration's, narrowed by the model's."""
+    limits = config.limits.validity
+    bounds = {"t_q_degc": limits.t_q_degc, "at_degc": limits.at_degc}
+    for key, (low, high) in model.validity.items():
+        configured = bounds.get(key, (-math.inf, math.inf))
+        bounds[key] = (max(low, configured[0]), min(high, configured[1]))
+    return bounds
+
+
+def mean(values: list[float]) -> float:
+    """Return the mean, NaN of nothing."""
+    return math.fsum(values) / len(values) if values else NAN

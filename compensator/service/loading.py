@@ -1,0 +1,218 @@
+"""Everything that a service is made of, read once: configuration, model, signing key, devices, certificate."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drivers
+from compensator.certificates import Certificate, check_files, remarks
+from compensator.config import Config, LoadedConfig, Zenoh, load_config
+from compensator.errors import CompensatorError, ConfigError, ModelError
+from compensator.model.model_file import parse_model, read_model_bytes
+from compensator.model.thermal_model import ThermalModel
+from compensator.reasons import Remark
+from compensator.recording.signature import Signer
+from compensator.remarks import ServiceWarning
+from compensator.service.adoption import check_model
+from compensator.service.model_store import ModelStore
+from compensator.service.session import tls_files
+from drivers.errors import DriverConfigError
+
+log = logging.getLogger("compensator")
+
+#: Names that depend on the order in which adapters are plugged in or found.
+_NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
+_BY_ID = Path("/dev/serial/by-id")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setup:
+    """A service as its configuration describes it; nothing is open.
+
+    Parameters
+    ----------
+    loaded : LoadedConfig
+        The configuration and its file.
+    model : ThermalModel
+        The model in use: the adopted one, else the configured one.
+    model_bytes : bytes
+        Its file.
+    store : ModelStore
+        Adopted models.
+    signer : Signer, optional
+        Signs the recordings.
+    fleet : drivers.Fleet
+        The devices.
+    certificate : Certificate, optional
+        The machine's own; None without TLS or without the package `cryptography`.
+    """
+
+    loaded: LoadedConfig
+    model: ThermalModel
+    model_bytes: bytes
+    store: ModelStore
+    signer: Signer | None
+    fleet: drivers.Fleet
+    certificate: Certificate | None
+
+    @property
+    def config(self) -> Config:
+        """The settings."""
+        return self.loaded.config
+
+    @property
+    def recordings(self) -> Path:
+        """Folder of the recordings."""
+        return self.loaded.resolve(self.config.recording.folder)
+
+    def warnings(self, now: datetime.datetime | None = None) -> list[Remark]:
+        """Return what the configuration permits and should not; `check` shows it, `run` continues.
+
+        Parameters
+        ----------
+        now : datetime.datetime, optional
+            Time at which the certificate is checked, UTC; now by default.
+
+        Raises
+        ------
+        ConfigError
+            If the certificate is not valid at that time: the router will refuse the service.
+        """
+        zenoh = self.config.zenoh
+        found = [remark for line in self.config.line if (remark := _numbered_port(line)) is not None]
+        found += _exposures(zenoh)
+        if zenoh.secured():
+            now = now or datetime.datetime.now(datetime.UTC)
+            wrong = self.certificate.wrong_at(now) if self.certificate is not None else None
+            if wrong is not None:
+                raise ConfigError(f"{self.loaded.path}: zenoh.tls_certificate = {zenoh.tls_certificate!r}: {wrong}")
+            found += remarks(self.certificate, now)
+        return found
+
+
+def load(path: str) -> Setup:
+    """Read configuration, model and keys, and make the devices; nothing is opened.
+
+    Raises
+    ------
+    ConfigError
+        One line that names what is wrong.
+    """
+    loaded = load_config(path)
+    config = loaded.config
+    model, model_bytes, store = _model(loaded)
+    polls = model.period_s / config.sampling.poll_interval_s
+    if abs(polls - round(polls)) > 1e-9 or polls < 1:
+        raise ConfigError(
+            f"{path}: sampling.poll_interval_s = {config.sampling.poll_interval_s:g}, "
+            f"expected a whole part of the model's {model.period_s:g} s"
+        )
+    fleet = _fleet(path, config)
+    signer = load_signer(loaded)
+    files = tls_files(config.zenoh)
+    return Setup(
+        loaded=loaded,
+        model=model,
+        model_bytes=model_bytes,
+        store=store,
+        signer=signer,
+        fleet=fleet,
+        certificate=check_files(str(path), files) if files is not None else None,
+    )
+
+
+def _model(loaded: LoadedConfig) -> tuple[ThermalModel, bytes, ModelStore]:
+    """Return the adopted model, or the configured one if none was adopted or it cannot be used."""
+    config = loaded.config
+    try:
+        configured = read_model_bytes(loaded.model_name())
+        model = parse_model(configured, source=config.model.file)
+        if config.model.alternative:
+            model = model.with_alternative(config.model.alternative)
+    except ModelError as error:
+        raise ConfigError(f"{loaded.path}: model: {error}") from error
+    store = ModelStore(loaded.store(), configured)
+    try:
+        data = store.in_use()
+        if data != configured:
+            return check_model(config, data, source="adopted model"), data, store
+    except CompensatorError as error:
+        figures = f"The adopted model cannot be used, the configured one is used instead: {error}."
+        log.warning("%s", Remark(ServiceWarning.ADOPTED_UNUSABLE, figures).marked)
+    return model, configured, store
+
+
+def _fleet(path: str, config: Config) -> drivers.Fleet:
+    try:
+        fleet = drivers.build(config.line, config.device, source=str(path))
+    except DriverConfigError as error:
+        raise ConfigError(str(error)) from error
+    expected_units = {"t_q_degc": "degc", "at_degc": "degc", "y_um": "um"}
+    for channel in config.channel:
+        units = fleet.devices[channel.device].units
+        if channel.input not in units:
+            raise ConfigError(
+                f"{path}: channel {channel.name!r}: input {channel.input} of device {channel.device!r} is not "
+                f"configured, expected one of: {', '.join(map(str, sorted(units)))}"
+            )
+        unit, expected = units[channel.input], expected_units.get(channel.name)
+        if expected is not None and unit != expected:
+            raise ConfigError(f"{path}: channel {channel.name!r}: its input gives {unit}, expected {expected}")
+    return fleet
+
+
+def load_signer(loaded: LoadedConfig) -> Signer | None:
+    """Return what signs the recordings, None if no key is configured.
+
+    Raises
+    ------
+    ConfigError
+        If the key is among the recordings, or cannot be used.
+    """
+    name = loaded.config.recording.signing_key
+    if name is None:
+        return None
+    path, folder = loaded.resolve(name), loaded.resolve(loaded.config.recording.folder)
+    if path.is_relative_to(folder):
+        raise ConfigError(
+            f"{loaded.path}: recording.signing_key = {name!r}: is among the recordings, expected a place that nobody "
+            f"who can change them can read"
+        )
+    return Signer(path)
+
+
+# ---------------------------------------------------------------------- warnings
+
+
+def _numbered_port(line: Mapping[str, Any]) -> Remark | None:
+    """Warn of a serial port without a name of its own."""
+    port = str(line.get("port", ""))
+    if not _NUMBERED.fullmatch(port):
+        return None
+    lasting = [link for link in sorted(_BY_ID.glob("*")) if link.resolve() == Path(port).resolve()]
+    name = f" Its lasting name is {lasting[0]}." if lasting else ""
+    figures = f"Line {line.get('name')!r}: port {port} is numbered by the order of plugging in; after a restart it may "
+    return Remark(ServiceWarning.NUMBERED_PORT, f"{figures}be another adapter.{name}")
+
+
+def _exposures(zenoh: Zenoh) -> list[Remark]:
+    """Warn where others on the network can act in the name of the machine or its operator."""
+    found = []
+    outside = [endpoint for endpoint in zenoh.listen if not zenoh.is_loopback(endpoint)]
+    if outside:
+        figures = f"zenoh.listen {', '.join(outside)}: anybody who reaches it can publish offsets and send commands."
+        found.append(Remark(ServiceWarning.OPEN_LISTEN, figures))
+    outside = [endpoint for endpoint in zenoh.connect if not zenoh.is_loopback(endpoint)]
+    if outside and not zenoh.secured():
+        figures = f"zenoh.connect {', '.join(outside)}: neither encrypted nor authenticated."
+        found.append(Remark(ServiceWarning.UNSECURED_CONNECT, figures))
+    if zenoh.unproven_commands and not zenoh.on_loopback():
+        figures = "zenoh.unproven_commands: the service accepts commands whose sender is not authenticated."
+        found.append(Remark(ServiceWarning.UNPROVEN_COMMANDS, figures))
+    return found
