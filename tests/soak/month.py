@@ -238,14 +238,14 @@ class _Machine:
             self._later(60, lambda: self.daemon.command("resume", b"") and None)  # type: ignore[union-attr]
 
     def _defect(self) -> None:
-        compensation = self.daemon._compensation  # type: ignore[union-attr]
-        decide = compensation._decide
+        decision = self.daemon._compensation._decision  # type: ignore[union-attr]
+        decide = decision.decide
 
         def broken(*_: Any) -> Any:
-            compensation._decide = decide  # type: ignore[method-assign]
+            decision.decide = decide  # type: ignore[method-assign]
             raise ZeroDivisionError("a defect")
 
-        compensation._decide = broken  # type: ignore[method-assign]
+        decision.decide = broken  # type: ignore[method-assign]
         self._later(20, lambda: self.daemon.command("resume", b"") and None)  # type: ignore[union-attr]
 
     def _stop(self) -> None:
