@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from compensator.codes import Code
@@ -229,10 +229,20 @@ class Remark(str):
         remark.code = known
         return remark
 
+    def __reduce__(self) -> tuple[Callable[[Code, str], Remark], tuple[Code, str]]:
+        return _restored, (self.code, str(self))
+
     @property
     def marked(self) -> str:
         """The remark followed by its code, for a terminal or a log."""
         return f"{self} [{self.code}]"
+
+
+def _restored(code: Code, words: str) -> Remark:
+    """Return a remark that was pickled or copied."""
+    remark = str.__new__(Remark, words)
+    remark.code = code
+    return remark
 
 
 def explain(code: str) -> tuple[str, str] | None:

@@ -146,11 +146,15 @@ def compare(
     CompensatorError
         If there is no model or no measured Y, or the models have different sample periods.
     """
-    found = {name: model_of(model) for name, model in models.items()}
+    if not isinstance(models, Mapping):
+        raise UsageError(f'compare: {type(models).__name__}, expected a dict: {{"first": model, "second": other}}')
+    found = {str(name): model_of(model) for name, model in models.items()}
+    if taken := found.keys() & {NOTHING, PERSISTENCE}:
+        raise UsageError(f"compare: {taken.pop()!r} is a row of its own, expected another name for the model")
     periods = {model.period_s for model in found.values()}
     if len(periods) != 1:
         raise UsageError(f"compare: {len(found)} model(s) of {len(periods)} sample periods, expected models of one")
-    measured = measurements(data, "data", columns)
+    measured = measurements(data, "data", columns, needed=True)
     times: list[Vector] = []
     parts: dict[str, list[Vector]] = {name: [] for name in ("y", *found, NOTHING, PERSISTENCE)}
     begin_h = 0.0
@@ -161,11 +165,11 @@ def compare(
             residuals = {name: run["residual_um"] for name, run in runs.items()}
             y = next(iter(runs.values()))["y_um"]
             known = np.all([np.isfinite(values) for values in (y, *residuals.values())], axis=0)
-            judged = known & (record.t_s >= from_h * 3600.0)
-            residuals |= {NOTHING: y, PERSISTENCE: y - _last_before(y, known, judged)}
-            parts["y"].append(np.where(judged, y, np.nan))
+            compared = known & (record.t_s >= from_h * 3600.0)
+            residuals |= {NOTHING: y, PERSISTENCE: y - _last_before(y, known, compared)}
+            parts["y"].append(np.where(compared, y, np.nan))
             for name, values in residuals.items():
-                parts[name].append(np.where(judged, values, np.nan))
+                parts[name].append(np.where(compared, values, np.nan))
             times.append(record.t_s / 3600.0 + begin_h)
         begin_h += one.hours
     joined = {name: np.concatenate(values) for name, values in parts.items()}
@@ -181,8 +185,8 @@ def compare(
     )
 
 
-def _last_before(y: Vector, known: Mask, judged: Mask) -> float:
-    """Return the last value measured before the samples judged, the first of all where there is none."""
-    before = y[known & (np.arange(y.size) < (int(np.argmax(judged)) if judged.any() else y.size))]
+def _last_before(y: Vector, known: Mask, compared: Mask) -> float:
+    """Return the last value measured before the samples compared, the first of all where there is none."""
+    before = y[known & (np.arange(y.size) < (int(np.argmax(compared)) if compared.any() else y.size))]
     first = y[known][:1]
     return float(before[-1] if before.size else first[0] if first.size else np.nan)

@@ -208,7 +208,7 @@ def diagnose(
         If model or data cannot be read, or there is too little data.
     """
     base = model_of(model)
-    measured = measurements(data, "data", columns)
+    measured = measurements(data, "data", columns, needed=True)
     runs, remarks = runs_in(measured, base.period_s)
     screen_temperatures(", ".join(dict.fromkeys(run.name for run in runs)), runs, quiet_air=True)
 

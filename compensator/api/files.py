@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from compensator.errors import UsageError
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
@@ -17,14 +18,21 @@ ModelLike = ThermalModel | str | os.PathLike[str]
 
 
 def model_of(model: ModelLike) -> ThermalModel:
-    """Return a model: as it is, from a file, or the published one by its name.
+    """Return a model: as it is, of a result that owns one, from a file, or the published one by its name.
 
     Raises
     ------
     ModelError
         If the file cannot be read.
+    UsageError
+        If it is something else.
     """
-    return model if isinstance(model, ThermalModel) else load_model(Path(model))
+    own = getattr(model, "model", model)
+    if isinstance(own, ThermalModel):
+        return own
+    if not isinstance(own, (str, os.PathLike)):
+        raise UsageError(f"model: {type(model).__name__}, expected a model, a result, a path, or the name of a model")
+    return load_model(Path(own))
 
 
 def as_in_file(model: ThermalModel, provenance: Mapping[str, Any]) -> ThermalModel:

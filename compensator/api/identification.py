@@ -93,15 +93,15 @@ def identify(
     settings = Settings(
         kind=kind,
         method=method,
-        ttf=(int(ttf[0]), int(ttf[1]), int(ttf[2])),
-        order=(int(order[0]), int(order[1]), int(order[2])) if order else None,
+        ttf=_orders("ttf", "(nb, nf, nk)", ttf),
+        order=None if order is None else _orders("order", "(nf, nb of the DTF, nb of the TDTF)", order),
         drive=drive,
-        given_tdtf=(float(tdtf[0]), float(tdtf[1])) if tdtf else None,
+        given_tdtf=None if tdtf is None else _gain_and_time(tdtf),
         etve_end_h=float(etve_end_h),
         folds=folds,
     )
     sources = {
-        role: measurements(given, name, columns)
+        role: measurements(given, name, columns, needed=role == "fit")
         for role, name, given in (("fit", "data", data), ("etve", "etve", etve), ("validation", "validate", validate))
     }
     _check_validation(sources)
@@ -134,6 +134,22 @@ def identify(
         comparison=tuple(compare(model, model_of(reference))) if reference is not None else (),
         in_frame=any(measured.in_frame for measured in sources["fit"]),
     )
+
+
+def _orders(name: str, meaning: str, values: Sequence[int]) -> tuple[int, int, int]:
+    try:
+        first, second, third = (int(value) for value in values if not isinstance(value, str))
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name} {values!r}, expected three integers: {meaning}") from error
+    return first, second, third
+
+
+def _gain_and_time(tdtf: Sequence[float]) -> tuple[float, float]:
+    try:
+        gain, tau_min = (float(value) for value in tdtf)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"tdtf {tdtf!r}, expected two numbers: gain in µm/K and time constant in min") from error
+    return gain, tau_min
 
 
 def _check_validation(sources: Mapping[str, Sequence[Measurement]]) -> None:

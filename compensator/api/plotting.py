@@ -37,7 +37,7 @@ def stacked(panels: Iterable[tuple[str, Iterable[Curve]]]) -> tuple[Plot, list[A
     for axis, (label, curves) in zip(axes, panels, strict=True):
         for name, hours, values in curves:
             axis.plot(hours, values, label=name, linewidth=1.0)
-        axis.set_ylabel(label)
+        axis.set_ylabel(label, wrap=True)
         axis.grid(alpha=0.3)
         axis.legend(loc="best", fontsize="small")
     axes[-1].set_xlabel("time, h")

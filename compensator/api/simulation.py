@@ -130,7 +130,7 @@ def simulate(model: ModelLike, data: Any, *, columns: Mapping[str, str] | None =
         If model or data cannot be read.
     """
     what = model_of(model)
-    measured = measurements(data, "data", columns)
+    measured = measurements(data, "data", columns, needed=True)
     remarks: list[Remark] = []
     parts = []
     for one in measured:
@@ -151,7 +151,8 @@ def simulate(model: ModelLike, data: Any, *, columns: Mapping[str, str] | None =
     from compensator.api.simulation_frame import SimulationFrame
 
     start = measured[0].table.start_utc_s if len(measured) == 1 else None
-    return SimulationFrame.of(result, start and start + float(measured[0].table.t_s.min()))
+    begin = start and start + float(measured[0].table.t_s.min())
+    return SimulationFrame.of(result, begin, local=all(one.local_time for one in measured))
 
 
 def _joined(parts: list[dict[str, Vector]], name: str) -> Vector:

@@ -27,9 +27,9 @@ class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
     result: SimulationResult
 
     @classmethod
-    def of(cls, result: SimulationResult, start_utc_s: float | None) -> SimulationFrame:
-        """Make a DataFrame of a result; `start_utc_s` is the time of `t_s` = 0, s since 1970."""
-        frame = cls(result.columns, index=time_index(result["t_s"], start_utc_s))
+    def of(cls, result: SimulationResult, start_utc_s: float | None, *, local: bool) -> SimulationFrame:
+        """Make a DataFrame of a result; `start_utc_s`: the time of `t_s` = 0, s since 1970 (`local`: no zone)."""
+        frame = cls(result.columns, index=time_index(result["t_s"], start_utc_s, local=local))
         frame.result = result
         return frame
 

@@ -97,7 +97,17 @@ def read_mat(path: Path) -> Table:
         raise DataError(
             f"{path}: a MAT file of version 7.3 (HDF5), expected version 7: save(FILE, ..., '-v7'), or a CSV; {_AS_CSV}"
         ) from error
-    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, MemoryError) as error:
+    except (
+        MatReadError,
+        ValueError,
+        TypeError,
+        KeyError,
+        IndexError,
+        EOFError,
+        OverflowError,
+        MemoryError,
+        OSError,
+    ) as error:
         raise DataError(f"{path}: not a MAT file that can be read ({str(error)[:80]}); {_AS_CSV}") from error
     columns: Mapping[str, Any] = {name: value for name, value in content.items() if not name.startswith("__")}
     while len(columns) == 1 and (fields := _fields(next(iter(columns.values())))):

@@ -23,6 +23,13 @@ def is_frame(data: object) -> bool:
     return pandas is not None and isinstance(data, pandas.DataFrame)
 
 
+def has_local_time(frame: Any) -> bool:
+    """Whether the time of a DataFrame is a date and time without a zone; it is taken as UTC."""
+    pandas = sys.modules["pandas"]
+    time = frame["time_utc"] if "time_utc" in frame.columns else frame.index
+    return bool(pandas.api.types.is_datetime64_dtype(time.dtype))
+
+
 def table_in_memory(name: str, data: Any) -> Table:
     """Make a table of a DataFrame or a mapping of arrays.
 
@@ -81,9 +88,12 @@ def frame_of(columns: Mapping[str, Any], index: Any = None) -> Any:
     return sys.modules["pandas"].DataFrame(columns, index=index)
 
 
-def time_index(t_s: Vector, start_utc_s: float | None) -> Any:
-    """Return the index of a DataFrame: times in UTC where that of `t_s` = 0 is known, None for rows by number."""
+def time_index(t_s: Vector, start_utc_s: float | None, *, local: bool = False) -> Any:
+    """Return the index of a DataFrame: times in UTC where that of `t_s` = 0 is known, None for rows by number.
+
+    Where the times that came in had no zone (`local`), these have none either.
+    """
     if start_utc_s is None:
         return None
     times = np.round((start_utc_s + t_s) * 1e6).astype(np.int64)
-    return sys.modules["pandas"].to_datetime(times, unit="us", utc=True)
+    return sys.modules["pandas"].to_datetime(times, unit="us", utc=not local)

@@ -89,7 +89,7 @@ def _check_size(table: Table, period_s: float) -> None:
             raise DataError(
                 f"{name}: row {table.rows[i]}: {column} = {values[i]:g}, expected a number below {LARGEST:g}"
             )
-    apart_s = float(np.median(np.abs(np.diff(t_s)))) if t_s.size > 1 else 0.0
+    apart_s = float(np.median(np.diff(np.sort(t_s)))) if t_s.size > 1 else 0.0
     if apart_s > SHORT_GAP_SAMPLES * period_s:
         raise DataError(
             f"{name}: its rows are {apart_s:g} s apart, expected at most {period_s:g} s: is the time in seconds?"

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from compensator.data.files import read_csv, read_mat, read_recordings
-from compensator.data.frames import hash_of, is_frame, table_in_memory
+from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
 from compensator.data.record import Data, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.table import Table
 from compensator.display import html_table
-from compensator.errors import DataError
+from compensator.errors import DataError, UsageError
 from compensator.reasons import Remark
 
 #: Sample period of the models made, s: the service's.
@@ -72,6 +72,8 @@ class Measurement:
         What reading left out.
     in_frame : bool
         Whether it was a pandas DataFrame; tables of results then are, too.
+    local_time : bool
+        Whether that had times without a zone.
     """
 
     table: Table
@@ -80,6 +82,7 @@ class Measurement:
     roles: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[Remark, ...] = ()
     in_frame: bool = False
+    local_time: bool = False
 
     @property
     def name(self) -> str:
@@ -148,13 +151,15 @@ def read(data: Any, *, columns: Mapping[str, str] | None = None, name: str = "da
       samples: 2 of 60 s
       columns: at_degc, t_q_degc
     """
-    found = measurements(data, name, columns)
+    found = measurements(data, name, columns, needed=True)
     if len(found) != 1:
         raise DataError(f"{name}: {len(found)} tables, expected one; hand several runs over as a list")
     return found[0]
 
 
-def measurements(data: Any, role: str, columns: Mapping[str, str] | None = None) -> list[Measurement]:
+def measurements(
+    data: Any, role: str, columns: Mapping[str, str] | None = None, *, needed: bool = False
+) -> list[Measurement]:
     """Read a DATA argument: one source or a list of them.
 
     Recordings follow each other and are one; they come after the tables.
@@ -165,6 +170,8 @@ def measurements(data: Any, role: str, columns: Mapping[str, str] | None = None)
         As :func:`read`, and lists of them.
     role : str
         What messages call data that is no file; numbered where there are several.
+    needed : bool
+        Whether an empty list is refused.
 
     Raises
     ------
@@ -173,6 +180,10 @@ def measurements(data: Any, role: str, columns: Mapping[str, str] | None = None)
     """
     several = isinstance(data, Sequence) and not isinstance(data, (str, bytes))
     sources = list(data) if several else [] if data is None else [data]
+    if columns is not None and not isinstance(columns, Mapping):
+        raise UsageError(f'columns: {type(columns).__name__}, expected names by role: {{"t_q_degc": "t5"}}')
+    if needed and not sources:
+        raise DataError(f"{role}: empty, expected a path, a DataFrame, a dict of arrays, or a list of those")
     roles = dict(columns or {})
     found, recordings = [], []
     for number, source in enumerate(sources, start=1):
@@ -218,6 +229,7 @@ def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
         roles=roles,
         remarks=remarks,
         in_frame=is_frame(source),
+        local_time=is_frame(source) and has_local_time(source),
     )
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from compensator.errors import DataError
 
+Kind = Literal["auto", "heat", "direct"]
 Method = Literal["I", "II", "III", "IV"]
+Drive = Literal["ttf", "known"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,17 +39,20 @@ class Settings:
         Largest number of modes considered.
     """
 
-    kind: Literal["auto", "heat", "direct"] = "auto"
+    kind: Kind = "auto"
     method: Method = "IV"
     ttf: tuple[int, int, int] = (2, 2, 0)
     order: tuple[int, int, int] | None = None
-    drive: Literal["ttf", "known"] = "ttf"
+    drive: Drive = "ttf"
     given_tdtf: tuple[float, float] | None = None
     etve_end_h: float = 6.0
     folds: int = 5
     max_order: int = 4
 
     def __post_init__(self) -> None:
+        for name, choices in (("kind", get_args(Kind)), ("method", get_args(Method)), ("drive", get_args(Drive))):
+            if getattr(self, name) not in choices:
+                raise DataError(f"{name} {getattr(self, name)!r}, expected one of: {', '.join(choices)}")
         nb, nf, nk = self.ttf
         if nk != 0:
             raise DataError(f"TTF structure nb {nb}, nf {nf}, nk {nk}: nk must be 0, or its inverse needs the future")
@@ -61,8 +66,9 @@ class Settings:
             )
         if self.given_tdtf is not None and self.given_tdtf[1] <= 0.0:
             raise DataError(f"given TDTF: time constant {self.given_tdtf[1]:g} min, expected a number above 0")
-        if self.folds < 2 or self.max_order < 1 or self.etve_end_h <= 0.0:
-            raise DataError(
-                f"folds {self.folds}, max order {self.max_order}, ETVE end {self.etve_end_h:g} h: "
-                "expected at least 2, at least 1 and above 0"
-            )
+        if self.folds < 2:
+            raise DataError(f"folds {self.folds}, expected at least 2")
+        if self.max_order < 1:
+            raise DataError(f"max order {self.max_order}, expected at least 1")
+        if self.etve_end_h <= 0.0:
+            raise DataError(f"ETVE end {self.etve_end_h:g} h, expected more than 0")

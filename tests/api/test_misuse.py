@@ -1,0 +1,96 @@
+"""A slip in a notebook: one line that says what was expected, and results that survive a pickle."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import compensator as tc
+from compensator.reasons import Remark
+from tests.api.tables import frame, write_run
+from tests.identify.quill_runs import VALIDATION_W
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+    return frame(write_run(tmp_path_factory.mktemp("data") / "run.csv", VALIDATION_W, 3))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"drive": "x"}, "drive 'x', expected one of: ttf, known"),
+        ({"kind": "foo"}, "kind 'foo', expected one of"),
+        ({"method": "V"}, "method 'V', expected one of"),
+        ({"order": 3}, "order 3, expected three integers"),
+        ({"order": (2, 2)}, "expected three integers"),
+        ({"order": "222"}, "expected three integers"),
+        ({"tdtf": 10.0, "method": "I"}, "expected two numbers"),
+        ({"folds": 0}, "folds 0, expected at least 2"),
+        ({"columns": ["t_q_degc"]}, "columns: list, expected names by role"),
+    ],
+)
+def test_a_wrong_option_is_named(table: pd.DataFrame, options: dict[str, object], words: str) -> None:
+    with pytest.raises(tc.CompensatorError, match=words) as raised:
+        tc.identify(table, **options)  # type: ignore[arg-type]
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("nothing", [[], None])
+def test_no_data_is_refused(nothing: object) -> None:
+    for verb in (tc.identify, lambda data: tc.simulate("quill", data), lambda data: tc.diagnose("quill", data)):
+        with pytest.raises(tc.CompensatorError, match="empty, expected a path"):
+            verb(nothing)
+
+
+def test_what_is_no_model_is_refused(table: pd.DataFrame) -> None:
+    for call in (lambda: tc.simulate(table, "quill"), lambda: tc.simulate(3, table), lambda: tc.diagnose(None, table)):
+        with pytest.raises(tc.CompensatorError, match="expected a model, a result, a path"):
+            call()
+    for models in (["quill"], "quill", {}):
+        with pytest.raises(tc.CompensatorError):
+            tc.compare(models, table)  # type: ignore[arg-type]
+
+
+def test_a_result_stands_for_its_model(table: pd.DataFrame) -> None:
+    found = tc.identify(table, order=(2, 2, 2))
+    same = tc.simulate(found, table)["y_pred_um"].equals(tc.simulate(found.model, table)["y_pred_um"])
+    assert same and found.criticism.warnings
+    for again in (pickle.loads(pickle.dumps(found)), copy.deepcopy(found)):
+        assert again.to_dict() == found.to_dict()
+        assert [w.code for w in again.criticism.warnings] == [w.code for w in found.criticism.warnings]
+
+
+def test_a_remark_survives_a_copy() -> None:
+    remark = Remark("stuck", "t_q_degc = 20 in every row.")
+    again = pickle.loads(pickle.dumps(remark))
+    assert (again, again.code, again.marked) == (remark, remark.code, remark.marked)
+
+
+def test_shuffled_rows_are_sorted(table: pd.DataFrame) -> None:
+    shuffled = table.sample(frac=1.0, random_state=1)
+    out, wanted = tc.simulate("quill", shuffled), tc.simulate("quill", table)
+    assert np.array_equal(out["y_pred_um"], wanted["y_pred_um"])
+    assert any(remark.code == "rows_sorted" for remark in out.remarks)
+
+
+@pytest.mark.parametrize("zone", [None, "UTC"])
+def test_times_come_out_with_the_zone_that_came_in(table: pd.DataFrame, zone: str | None) -> None:
+    timed = table.drop(columns="t_s").set_index(pd.date_range("2026-03-28", periods=len(table), freq="min", tz=zone))
+    timed["y_pred_um"] = tc.simulate("quill", timed)["y_pred_um"]
+    assert timed["y_pred_um"].notna().all()
+
+
+def test_a_broken_mat_file_is_named(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    path = tmp_path / "run.mat"
+    savemat(path, {"t_s": np.arange(100.0), "t_q_degc": np.full(100, 20.0)})
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(tc.CompensatorError, match=r"run\.mat: not a MAT file that can be read"):
+        tc.read(path)
