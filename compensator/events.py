@@ -43,6 +43,16 @@ class EventKind(StrEnum):
     ERROR = "error"
 
 
+class CommandName(StrEnum):
+    """Commands to the service, as they stand in the key and in the event."""
+
+    ZERO = "zero"
+    HOLD = "hold"
+    RESUME = "resume"
+    ADOPT = "adopt"
+    BACK = "back"
+
+
 class Note(NamedTuple):
     """An event before it gets its number and time.
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from compensator.reasons import State
+from compensator.reasons import SampleQuality, State
 
 NAN = float("nan")
 
@@ -51,6 +51,11 @@ class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):
     quality: str
     device_quality: str
     errors: dict[str, int] = {}
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the value can be used."""
+        return self.quality == SampleQuality.GOOD
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True):

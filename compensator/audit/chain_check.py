@@ -20,6 +20,7 @@ from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Contents, Flaw
 from compensator.recording.reading import Record
 from compensator.recording.signature import Verifier
+from compensator.remarks import RecordingEnd
 
 _sha256 = hashlib.sha256
 _DECODER = msgspec.json.Decoder(Chain)
@@ -123,7 +124,7 @@ class ChainCheck:
         for name, flaw in self._contents.flaws:
             result.find(Fault.PART_CRC if flaw is Flaw.WRONG_CRC else Fault.PART_LATE, topic=name, what=flaw.value)
         result.previous = self.previous.hex()
-        result.last = (self._before_last if result.seal == "recovered" else self.head).hex()
+        result.last = (self._before_last if result.seal == RecordingEnd.RECOVERED else self.head).hex()
 
     # ------------------------------------------------------------------ opening
 

@@ -17,6 +17,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Remark
 from compensator.recording.container import Container, Contents
 from compensator.recording.reading import in_order
+from compensator.remarks import AuditRemark
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import FreeRun, Step, setup_of, steps_in
@@ -199,7 +200,7 @@ class _Run:
             f"{step.file}: begins on a running machine, of which the other model knows no more than the zero; "
             f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
         )
-        self._result.remarks.append(Remark("begins_running", figures))
+        self._result.remarks.append(Remark(AuditRemark.BEGINS_RUNNING, figures))
 
     def _compare(self, estimate: EstimateMessage, offset: Offset, outcome: Outcome) -> None:
         result, sample = self._result, outcome.sample

@@ -9,10 +9,11 @@ import numpy as np
 
 from compensator import __version__
 from compensator.audit.comparison import Comparison, worst_utc
-from compensator.audit.findings import Difference, End, Kind, utc
+from compensator.audit.findings import Difference, utc
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit
 from compensator.recording.chain import NOTHING
+from compensator.remarks import AuditFinding, RecordingEnd
 from compensator.report.envelope import Envelope, line_of
 from compensator.report.history import Spread
 from compensator.report.page import (
@@ -38,9 +39,9 @@ _ROWS = 20
 _REMARKS = 40
 #: Values that are brought to a curve together.
 _TOGETHER = 5000
-_ENDS_WHOLE = (End.FINISHED, End.RECOVERED)
+_ENDS_WHOLE = (RecordingEnd.FINISHED, RecordingEnd.RECOVERED)
 #: Kinds of findings that are about several files.
-_OF_FILES = (Kind.MISSING_FILE, Kind.BROKEN, Kind.STATE, Kind.REORDERED)
+_OF_FILES = (AuditFinding.MISSING_FILE, AuditFinding.BROKEN, AuditFinding.STATE, AuditFinding.REORDERED)
 
 
 # ---------------------------------------------------------------------------- audit
@@ -142,9 +143,11 @@ def _proven(found: Audit) -> Table:
     ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]
     whole = bool(chained) and len(chained) == len(found.files)
     worked_out = bool(found.samples) and not any(file.not_replayed for file in found.files)
-    not_signed = sum(finding.kind in (Kind.UNSIGNED, Kind.FALSE_SIGNATURE) for finding in found.findings)
-    cut = sum(finding.kind == Kind.TRUNCATED for finding in found.findings)
-    index = sum(finding.kind == Kind.INDEX for finding in found.findings)
+    not_signed = sum(
+        finding.kind in (AuditFinding.UNSIGNED, AuditFinding.FALSE_SIGNATURE) for finding in found.findings
+    )
+    cut = sum(finding.kind == AuditFinding.TRUNCATED for finding in found.findings)
+    index = sum(finding.kind == AuditFinding.INDEX for finding in found.findings)
     inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
         [

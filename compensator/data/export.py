@@ -93,7 +93,7 @@ def _cells(message: Sample | EstimateMessage | Offset) -> dict[str, Any]:
     if isinstance(message, Sample):
         for name, channel in message.channels.items():
             # A mean that the guards refused is missing from the table; the quality says why.
-            cells["heat_measured_w" if name == "heat_w" else name] = channel.mean if channel.quality == "good" else None
+            cells["heat_measured_w" if name == "heat_w" else name] = channel.mean if channel.is_good else None
             cells[f"{name}_quality"] = channel.quality
         return cells
     fields = msgspec.structs.asdict(message)

@@ -10,6 +10,7 @@ import numpy as np
 from compensator.arrays import Mask, Vector
 from compensator.data.record import SHORT_GAP_SAMPLES, Record
 from compensator.reasons import Remark
+from compensator.remarks import DataRemark
 
 #: A single reading this many noise deviations away from both neighbours is an outlier.
 WILD_DEVIATIONS = 12.0
@@ -77,7 +78,7 @@ def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Remark, ...]
     for column, values in record.columns.items():
         cleaned, wild = without_wild(values) if column != "heat_w" else (values, 0)
         if wild and column in ("t_q_degc", "at_degc", "y_um"):
-            remarks.append(Remark("wild_readings", f"{name}: {column}: {wild} outlier(s) left out."))
+            remarks.append(Remark(DataRemark.WILD_READINGS, f"{name}: {column}: {wild} outlier(s) left out."))
         columns[column] = cleaned
     inputs = ["t_q_degc", "at_degc", *(["heat_w"] if "heat_w" in columns else [])]
     missing = np.any([np.isnan(columns[c]) for c in inputs], axis=0)

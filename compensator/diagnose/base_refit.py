@@ -28,6 +28,7 @@ from compensator.diagnose.refit import Refit, refit
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.progress import ExecutorMap, Progress
 from compensator.reasons import Remark
+from compensator.remarks import ModelWarning
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
@@ -149,4 +150,4 @@ def _refitted(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Remark, .
         "The first model was calibrated while this acted and misses much of its own data, so its paths were refitted "
         f"together with it; gains changed: {gains}."
     )
-    return (Remark("fitted_anew", text),)
+    return (Remark(ModelWarning.FITTED_ANEW, text),)

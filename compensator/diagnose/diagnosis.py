@@ -33,6 +33,7 @@ from compensator.diagnose.search import Search, Selection
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
 from compensator.reasons import Remark
+from compensator.remarks import ModelWarning
 
 #: A base refit replaces a search's answer where it leaves no more than this share.
 REFIT_LEAVES = 0.5
@@ -182,7 +183,7 @@ def _companions(everything: Sequence[Effect]) -> tuple[Remark, ...]:
     """Return a warning for each effect that is deployed without being named."""
     return tuple(
         Remark(
-            "rounded_off",
+            ModelWarning.ROUNDED_OFF,
             "What the effect leaves is absorbed by a filter bank on heat and ambient "
             f"({float(np.std(e.signal)):.2g} µm rms), an effect of kind {e.place[0]} in model.toml.",
         )

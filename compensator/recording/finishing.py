@@ -26,6 +26,7 @@ from compensator.recording.compaction import Copy, rewrite
 from compensator.recording.container import Contents, Message
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
+from compensator.remarks import RecordingEnd
 
 log = logging.getLogger("compensator")
 
@@ -257,7 +258,7 @@ class _ChainedCopy(Copy):
             if self.recovered:
                 self._append("chain", self._chain.message(self._last.log_time_ns))
             time_ns, sequence = self._last.log_time_ns, self._last.sequence
-            seal = chain.seal(self._chain.machine, time_ns, "recovered", sequence, self._chain.head)
+            seal = chain.seal(self._chain.machine, time_ns, RecordingEnd.RECOVERED, sequence, self._chain.head)
             self._append("seal", encode(self._signer.sign(seal) if self._signer else seal))
             self._append("chain", self._chain.message(time_ns))
         super().finish()

@@ -17,8 +17,10 @@ import numpy as np
 
 from compensator.errors import DataError
 from compensator.messages import MESSAGES, EstimateMessage, Event, Offset, Sample, number
+from compensator.reasons import State
 from compensator.recording.container import PAYLOAD, Container, Contents, Damaged, Torn
 from compensator.recording.reading import in_order
+from compensator.remarks import RecordingEnd
 from compensator.report.envelope import Envelope, Stretches
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, File, History, Missed, Period
 
@@ -106,9 +108,9 @@ class _Reader:
                         file.add(message.time_utc_ns * _NS)
                     self._add[topic](message)
                 yield i
-            file.end = "finished" if container.contents.ended else "no end"
+            file.end = RecordingEnd.FINISHED if container.contents.ended else RecordingEnd.OPEN
         except Torn:
-            file.end = "no end"
+            file.end = RecordingEnd.OPEN
         except Damaged as damage:
             file.end = f"damaged from byte {damage.offset} on"
 
@@ -146,7 +148,7 @@ class _Reader:
         self.history.whole.samples += 1
         self._day(t).samples += 1
         for name, channel in sample.channels.items():
-            good = channel.quality == "good"
+            good = channel.is_good
             self._append(f"channel {name}", t, number(channel.mean) if good else math.nan)
             missed = self.history.channels.get(name)
             if missed is None:
@@ -222,7 +224,7 @@ class _Reader:
             self._episode = replace(episode, seconds=last - episode.first_s, last_s=last)
             return
         self._close()
-        if state != "ok":
+        if state != State.OK:
             self._episode = Episode(last - first, next(self._numbers), first, last, state, reasons)
 
     def _close(self) -> None:

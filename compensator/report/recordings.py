@@ -7,7 +7,8 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
-from compensator.reasons import Remark, explain
+from compensator.reasons import Remark, State, explain
+from compensator.remarks import AuditRemark, RecordingEnd
 from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
 from compensator.report.notation import plain, signed
@@ -29,9 +30,9 @@ from compensator.report.page import (
 
 TIME = "time, UTC"
 #: Order of the states on the page.
-STATES = ("ok", "degraded", "starting", "hold", "fault", NO_RECORDING)
+STATES = (State.OK, State.DEGRADED, State.STARTING, State.HOLD, State.FAULT, NO_RECORDING)
 #: States in which the offset follows the machine.
-_FOLLOWS = ("ok", "degraded")
+_FOLLOWS = (State.OK, State.DEGRADED)
 #: Share of the time without a following offset (or degraded) above which the verdict is worse.
 _MUCH = 0.1
 #: A remaining error beyond this multiple of the stated standard deviation is not noise: the model or a sensor is wrong.
@@ -40,8 +41,6 @@ _BEYOND = 3.0
 _DAYS = 31
 #: Longest table that is shown unfolded, rows.
 _ROWS = 12
-#: Ends of a recording that are codes.
-_ENDS: Mapping[str, Cell] = {"finished": Code("finished"), "no end": Code("open")}
 #: Largest numbers of curves and of shaded intervals in a figure.
 _CURVES, _SHADED = 5, 100
 _UNITS = (
@@ -148,7 +147,7 @@ def _beyond(whole: Period) -> Remark | None:
     if not (whole.left.samples and 0.0 < _BEYOND * whole.std.rms < whole.left.rms):
         return None
     remains = f"{_short(whole.left.rms)} rms remain with the correction; the service states {_short(whole.std.rms)}."
-    return Remark("left_beyond_stated", remains)
+    return Remark(AuditRemark.LEFT_BEYOND_STATED, remains)
 
 
 def _short(value_um: float) -> str:
@@ -160,9 +159,9 @@ def _tone(history: History) -> Tone:
     total = sum(seconds.values())
     without = total - sum(seconds[state] for state in _FOLLOWS)
     worse = history.whole.left.samples and history.whole.left.rms > history.whole.measured.rms
-    if "fault" in history.states or without > _MUCH * total or worse:
+    if State.FAULT in history.states or without > _MUCH * total or worse:
         return "bad"
-    doubtful = without or seconds["degraded"] > _MUCH * total or _beyond(history.whole) is not None
+    doubtful = without or seconds[State.DEGRADED] > _MUCH * total or _beyond(history.whole) is not None
     return "warn" if doubtful else "good"
 
 
@@ -198,7 +197,7 @@ def _curves(
 def _offset(history: History) -> Figure:
     stood = [
         Span("offset held", *piece)
-        for state in ("hold", "fault")
+        for state in (State.HOLD, State.FAULT)
         if state in history.states
         for piece in history.states[state].pieces
     ]
@@ -212,7 +211,7 @@ def _offset(history: History) -> Figure:
 
 def _band(history: History) -> Figure:
     strips = [
-        Strip(state, tuple(history.states[state].pieces), 1 if state == "ok" else 0)
+        Strip(state, tuple(history.states[state].pieces), 1 if state == State.OK else 0)
         for state in STATES
         if state in history.states
     ]
@@ -354,8 +353,8 @@ def _days(history: History) -> list[Block]:
 
 def _day(name: str, period: Period) -> list[Cell]:
     seconds = period.seconds
-    held = sum(seconds[state] for state in ("starting", "hold", "fault"))
-    times = (seconds["ok"], seconds["degraded"], held, seconds[NO_RECORDING])
+    held = sum(seconds[state] for state in (State.STARTING, State.HOLD, State.FAULT))
+    times = (seconds[State.OK], seconds[State.DEGRADED], held, seconds[NO_RECORDING])
     return [
         name,
         str(period.samples),
@@ -406,7 +405,13 @@ def _events(history: History) -> Block:
 
 def _files(history: History) -> Details:
     files: list[list[Cell]] = [
-        [file.name, str(file.samples), _utc(file.first_s), _utc(file.last_s), _ENDS.get(file.end, file.end)]
+        [
+            file.name,
+            str(file.samples),
+            _utc(file.first_s),
+            _utc(file.last_s),
+            Code(file.end) if isinstance(file.end, RecordingEnd) else file.end,
+        ]
         for file in history.files
     ]
     models: list[list[Cell]] = [[name, _utc(first), sha] for sha, (name, first) in history.models.items()]

@@ -14,6 +14,7 @@ from typing import Any
 
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError, ModelError, ServiceError
+from compensator.events import CommandName
 from compensator.messages import Sample
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
@@ -94,7 +95,7 @@ class Wanted:
             text=arguments.get("model", ""),
             force=arguments.get("force", False),
         )
-        if action == "adopt" and not (wanted.sha256 or wanted.text):
+        if action == CommandName.ADOPT and not (wanted.sha256 or wanted.text):
             raise ServiceError("adopt: expected model, the text of a model file, or sha256, that of one adopted before")
         if wanted.text and wanted.sha256 and sha256_of(wanted.text.encode()) != wanted.sha256:
             raise ServiceError(f"adopt: the model's sha256 is {sha256_of(wanted.text.encode())}, not {wanted.sha256}")
@@ -176,14 +177,14 @@ class Adoption:
                 f"model {model.name}: sample_period_s = {model.period_s:g}, the service runs at {running.period_s:g} s"
             )
         prepared = Prepared(data=data, warm=self._warmed(model, zero, wanted.force))
-        if wanted.action == "back":
+        if wanted.action == CommandName.BACK:
             self._store.back(name=model.name, time_utc_ns=now_ns)
         else:
             self._store.adopt(data, name=model.name, time_utc_ns=now_ns)
         return prepared
 
     def _data(self, wanted: Wanted) -> bytes:
-        if wanted.action == "adopt":
+        if wanted.action == CommandName.ADOPT:
             return wanted.text.encode() if wanted.text else self._store.load(wanted.sha256)
         before = self._store.before()
         if before is None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from compensator.clock import NS, Clock
-from compensator.events import RecordingCode, RecordingData
+from compensator.events import EventKind, RecordingCode, RecordingData
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
 from compensator.reasons import Reason, Remark
 from compensator.remarks import ServiceWarning
@@ -188,7 +188,7 @@ class Journal:
 
     # ------------------------------------------------------------------ on the loop
 
-    def note(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
+    def note(self, kind: EventKind, text: str, data: Mapping[str, Any] | None = None) -> None:
         """Publish an event and keep it for the recording."""
         event = Event(
             schema=SCHEMA,
@@ -278,7 +278,7 @@ class Journal:
             in_flight = bool(entry.reason) and entry in self._writing
         self._note_disk(entry.reason, in_flight, entry.attempt.exception() if entry.attempt.done() else None)
         for text, data in self._recorder.remarks():
-            self.note("recording", text, data)
+            self.note(EventKind.RECORDING, text, data)
         if self._checkpoint is not None and not entry.reason:
             self._checkpoint.remove()
         elif self._checkpoint is not None and entry.offset is not None:
@@ -303,20 +303,20 @@ class Journal:
         if reason and (reason != self._reason or in_flight):
             if error is not None and not isinstance(error, OSError):
                 log.error("internal error", exc_info=error)
-                self.note("recording", f"{DISK_FAILED}: internal error: {type(error).__name__}: {error}", data)
+                self.note(EventKind.RECORDING, f"{DISK_FAILED}: internal error: {type(error).__name__}: {error}", data)
             elif reason == Reason.RECORDING_FAILED:
-                self.note("recording", f"{DISK_FAILED}: {error or self._error}", data)
+                self.note(EventKind.RECORDING, f"{DISK_FAILED}: {error or self._error}", data)
             else:
-                self.note("recording", f"{DISK_LATE}: not within {self._limit_s + self._patience_s:g} s", data)
+                self.note(EventKind.RECORDING, f"{DISK_LATE}: not within {self._limit_s + self._patience_s:g} s", data)
         elif self._reason and not reason:
             lost, self._dropped = self._dropped, 0
             text = f"{DISK_BACK}; " + (f"{lost} sample(s) were not recorded" if lost else "nothing was lost")
-            self.note("recording", text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
+            self.note(EventKind.RECORDING, text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
         self._reason, self._error = reason, error or self._error
 
     async def close(self, state: bytes) -> None:
         """Note that the service ends, and finish the recording, however long the disk takes."""
-        self.note("stop", "the service ends")
+        self.note(EventKind.STOP, "the service ends")
         await self.record(self._clock.utc_ns(), state)
         closing = asyncio.wrap_future(self._executor.submit(self._finish))
         self._executor.shutdown(wait=False)
@@ -328,7 +328,7 @@ class Journal:
         error = closing.exception()
         if isinstance(error, OSError):
             data = RecordingData(code=RecordingCode.NOT_FINISHED)
-            self.note("recording", f"the recording could not be finished: {error}", data.table())
+            self.note(EventKind.RECORDING, f"the recording could not be finished: {error}", data.table())
         elif error is not None:
             raise error
 

@@ -26,7 +26,7 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Config, parse_config
 from compensator.errors import DataError
-from compensator.events import EventKind, PauseData, command_of, data_of
+from compensator.events import CommandName, EventKind, PauseData, command_of, data_of
 from compensator.messages import EstimateMessage, Event, Offset, Sample
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
@@ -163,12 +163,12 @@ def _attachment(contents: Contents, name: str, file: str) -> bytes:
 
 def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
     """Execute a command, live or recorded; `adopt` and `back` are not the compensation's own and change nothing."""
-    if name == "zero":
+    if name == CommandName.ZERO:
         mode = arguments.get("mode", "auto")
         compensation.zero(mode if mode in ("auto", "rest", "warm") else "auto")
-    elif name == "hold":
+    elif name == CommandName.HOLD:
         compensation.hold()
-    elif name == "resume":
+    elif name == CommandName.RESUME:
         compensation.resume()
 
 

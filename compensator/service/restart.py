@@ -14,7 +14,7 @@ from typing import Any
 
 from compensator.config import Config, LoadedConfig
 from compensator.errors import CompensatorError, DataError
-from compensator.events import EventKind, Note, command_of
+from compensator.events import CommandName, EventKind, Note, command_of
 from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import recordings
@@ -67,7 +67,7 @@ class _LastFile:
         for event in step.events:
             if event.kind == EventKind.COMMAND:
                 name = command_of(event)
-                self.operator_hold = name == "hold" or (self.operator_hold and name != "resume")
+                self.operator_hold = name == CommandName.HOLD or (self.operator_hold and name != CommandName.RESUME)
         return published
 
 

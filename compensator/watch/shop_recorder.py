@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from compensator import __version__
 from compensator.clock import NS, Clock
 from compensator.errors import DataError
+from compensator.events import EventKind
 from compensator.messages import MESSAGES, shipped_schema
 from compensator.recording.compaction import rewrite
 from compensator.recording.live_file import LiveFile
@@ -184,7 +185,7 @@ class ShopRecorder:
         if kind in ("offset", "sample", "estimate"):
             numbers.setdefault((prefix, rest), Sequence()).update(message.seq, message.time_utc_ns)
         started_ns = message.started_utc_ns if kind == "status" else 0
-        if kind == "event" and message.kind == "start":
+        if kind == "event" and message.kind == EventKind.START:
             started_ns = message.time_utc_ns
         for other in ("y/offset", "sample", "estimate") if started_ns else ():
             numbers.setdefault((prefix, other), Sequence()).started(started_ns)
