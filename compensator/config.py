@@ -20,8 +20,6 @@ Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
 #: Roles that the model and the residual need; every other channel is auxiliary.
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
-#: Unit suffix of a channel name for each unit that a device gives.
-UNIT_SUFFIX = {"degc": "_degc", "um": "_um", "v": "_v", "rpm": "_rpm", "w": "_w"}
 
 _LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):")
 #: Transports on which participants authenticate by certificates.

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from compensator.arrays import Vector
-from compensator.data.runs import Run, noise_std
+from compensator.data.runs import Run, noise_of
 from compensator.model.thermal_model import ThermalModel
 
 #: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
@@ -93,7 +93,7 @@ def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:
 
     White noise of the probe, and that of both thermocouples through the model.
     """
-    noise = {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc", "y_um")}
+    noise = noise_of(runs)
     impulse = np.zeros(3000)
     impulse[0] = 1.0
     by_t_q = model.dtf.sampled.response(drive_of(model, impulse))

@@ -25,7 +25,6 @@ from compensator.model.transfer_function import SampledTransferFunction, Transfe
 
 Kind = Literal["heat", "direct"]
 Method = Literal["kalman", "inverse"]
-PathName = Literal["TTF", "DTF", "TDTF"]
 
 #: Unit of every path, by the kind of model.
 PATH_UNITS: Mapping[Kind, Mapping[str, str]] = {

@@ -26,8 +26,6 @@ from compensator.recording.container import Attachment, Channel, Contents
 
 #: Value before the first file of a machine.
 NOTHING = bytes(32)
-#: Topics that a `/chain` message lists; it does not list itself.
-LISTED = ("sample", "estimate", "offset", "event", "seal")
 
 _DOMAIN = b"compensator chain 1\n"
 _BODY = struct.Struct("<IQQ")

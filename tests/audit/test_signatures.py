@@ -135,7 +135,7 @@ def test_what_is_no_key_is_said(tmp_path: Path) -> None:
     wrong = tmp_path / "x25519.pem"
     key = X25519PrivateKey.from_private_bytes(b"1" * 32)
     wrong.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
-    with pytest.raises(ConfigError, match="expected an Ed25519 key"):
+    with pytest.raises(ConfigError, match="expected an Ed25519 private key"):
         Signer(wrong)
     with pytest.raises(ConfigError, match="no PEM private key"):
         Signer(public)
