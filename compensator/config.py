@@ -131,7 +131,8 @@ class Rest(_Table, frozen=True, kw_only=True):
 class Plausibility(_Table, frozen=True, kw_only=True):
     """`[plausibility]`: T_Q, AT and measured Y against each other; a check without its limit is off.
 
-    `t_q_below_at_after_min`: T_Q below AT by more than `guards.t_q_below_at_max_k` for so long means exchanged sensors.
+    `t_q_below_at_after_min`: T_Q below AT by more than `guards.t_q_below_at_max_k` for this long means
+    exchanged sensors.
     `false_alarm_days`: mean time between two false alarms of the residual. `residual_std_um`: standard deviation of the
     residual of the healthy machine, by default the model's own; `residual_correlation_min`: its correlation time.
     `residual_hold_um`: during an alarm, a residual beyond this holds the offset.

@@ -37,7 +37,7 @@ class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):
     quality : str
         `good`, or the code of what makes it unusable.
     device_quality : str
-        What the device alone said, before the guards.
+        What the device alone reported, before the guards.
     errors : dict of str to int
         Codes of bad readings and device errors in this sample, with their number.
     """
@@ -262,7 +262,7 @@ class Chain(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Seal(msgspec.Struct, frozen=True, kw_only=True):
-    """Says that a recording was whole up to here, `/seal`; the last record of a finished file.
+    """States that a recording was complete up to here, `/seal`; the last record of a finished file.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def schemas() -> dict[str, dict[str, Any]]:
     for name, message in MESSAGES.items():
         definitions = msgspec.json.schema(message)["$defs"]
         definition = definitions.pop(message.__name__)
-        if "state" in definition["properties"]:  # its codes stand where they are used, not behind a reference
+        if "state" in definition["properties"]:  # its codes are listed in place, without a reference
             definition["properties"]["state"] = {"enum": definitions.pop(State.__name__)["enum"]}
         made[name] = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -28,7 +28,7 @@ _UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, ValueError)
 
 
 class _Prefixes(dict[str, bytes]):
-    """What stands before the body of a record of each topic; an unknown one comes from a channel that was altered."""
+    """What precedes the body of a record of each topic; an unknown one comes from a channel that was altered."""
 
     def __missing__(self, topic: str) -> bytes:
         self[topic] = topic.encode() + b"\0"
@@ -56,7 +56,7 @@ class ChainCheck:
         #: Value at the last record, and before a seal of a torn end that was finished afterwards.
         self.head = b""
         self._before_last = b""
-        #: Value that the chain of this file claims to go on from.
+        #: Value that the chain of this file claims to continue from.
         self.previous = chain.NOTHING
         self._next = 0
         self._run = contents.metadata.get("run", {})
@@ -72,7 +72,7 @@ class ChainCheck:
         records : list of Record
             The records, in the order of the file.
         message : Record
-            The message behind them.
+            The message after them.
         """
         _, sequence, time_ns, body = message
         if not self.head:
@@ -106,7 +106,7 @@ class ChainCheck:
         self._explain(records, value, message)
 
     def add_rest(self, records: list[Record]) -> None:
-        """Count the records behind the last `/chain` message: the file ends within a group."""
+        """Count the records after the last `/chain` message: the file ends within a group."""
         result = self._result
         for record in records:
             self.head = chain.link(self.head, record.topic, record.body)
@@ -176,7 +176,7 @@ class ChainCheck:
     # ------------------------------------------------------------------ what happened
 
     def _explain(self, records: list[Record], computed: bytes, message: Record) -> None:
-        """Name what makes a group differ from its `/chain` message, and go on behind it."""
+        """Name what makes a group differ from its `/chain` message, and continue after it."""
         result, sequence = self._result, message.sequence
         try:
             stated = _DECODER.decode(message.data)
@@ -209,7 +209,7 @@ class ChainCheck:
         return True
 
     def _place(self, records: list[Record], first: int, message: Record) -> bool:
-        """Tell whether whole groups are missing before this one, or whether it stands in the wrong place."""
+        """Tell whether whole groups are missing before this one, or whether it is in the wrong place."""
         sequence, time_ns = message.sequence, message.log_time_ns
         present = {record.sequence for record in records}
         if first > self._next and not present & set(range(self._next, first)):
@@ -254,7 +254,7 @@ class ChainCheck:
             seen.add(record.sequence)
 
     def _find_missing(self, records: list[Record], listed: list[ChainLink], message: Record) -> None:
-        """Name records that are listed and missing, or stand in another order."""
+        """Name records that are listed and missing, or are in another order."""
         present = [record.sequence for record in records]
         for entry in listed:
             if entry.sequence not in present:

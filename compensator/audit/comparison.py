@@ -67,7 +67,7 @@ class Comparison:
     remarks: list[Remark]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
+        """Return it as in the result of `--json`."""
         return {
             "recorded_model": self.recorded,
             "other_model": self.other,
@@ -133,7 +133,7 @@ def compare(
         If one of them is no recording, they belong to several machines, or the model needs a channel that is not there.
     """
     ordered = in_order(paths)
-    whole = sum(path.stat().st_size for path in ordered)
+    total = sum(path.stat().st_size for path in ordered)
     run = _Run(model, row, point)
     done = 0
     for path in ordered:
@@ -141,7 +141,7 @@ def compare(
             for count, step in enumerate(steps_in(container)):
                 run.add(step, container.contents)
                 if progress is not None and count % 1000 == 0:
-                    progress(done + container.position, whole)
+                    progress(done + container.position, total)
         done += path.stat().st_size
     return run.result(ordered)
 

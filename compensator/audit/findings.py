@@ -9,7 +9,7 @@ from typing import Any
 
 from compensator.remarks import AuditFinding
 
-#: So many findings of one file are kept; the others are counted.
+#: Number of findings of one file that are kept; the others are counted.
 KEPT = 50
 
 
@@ -26,7 +26,7 @@ class Fault(Enum):
     PART_MISSING = AuditFinding.REMOVED, "the recording began with it, but it is missing"
     PART_ADDED = AuditFinding.INSERTED, "the recording did not begin with it"
     PART_CHANGED = AuditFinding.ALTERED, "not what the recording began with"
-    PARTS_REORDERED = AuditFinding.REORDERED, "attachments or metadata stand in another order"
+    PARTS_REORDERED = AuditFinding.REORDERED, "attachments or metadata are in another order"
     NO_HASH = AuditFinding.ALTERED, "a hash that is not one"
     OPENING_CHANGED = AuditFinding.ALTERED, "differs from what follows from the file"
     OTHER_PREVIOUS = AuditFinding.ALTERED, "names another last value of the previous file than the metadata"
@@ -41,14 +41,14 @@ class Fault(Enum):
         "the values before and after this message do not belong together: one side was rewritten",
     )
     RECORDS_MISSING = AuditFinding.REMOVED, "{numbers} missing before it"
-    RECORDS_MOVED = AuditFinding.REORDERED, "{numbers} standing behind later ones"
-    RECORDS_AGAIN = AuditFinding.INSERTED, "{numbers} standing there again"
+    RECORDS_MOVED = AuditFinding.REORDERED, "{numbers} after later ones"
+    RECORDS_AGAIN = AuditFinding.INSERTED, "{numbers} repeated"
     NOT_LISTED = AuditFinding.INSERTED, "the chain does not list it"
     LISTED_MISSING = AuditFinding.REMOVED, "the chain lists it, but it is missing"
-    EXCHANGED = AuditFinding.REORDERED, "stands in the place of record {record}"
-    MOVED = AuditFinding.REORDERED, "stands in another place than before"
+    EXCHANGED = AuditFinding.REORDERED, "is in the place of record {record}"
+    MOVED = AuditFinding.REORDERED, "is in another place than before"
     RECORD_CHANGED = AuditFinding.ALTERED, "does not match its value in the chain"
-    BEHIND_CHAIN = AuditFinding.INSERTED, "{count} record(s) behind the last message of the chain"
+    BEHIND_CHAIN = AuditFinding.INSERTED, "{count} record(s) after the last message of the chain"
     NO_SEAL = AuditFinding.REMOVED, "the file has its end, but not the seal before it"
     SEAL_CHANGED = AuditFinding.ALTERED, "does not seal the records before it"
     FALSE_SIGNATURE = AuditFinding.FALSE_SIGNATURE, "not signed by the key given"
@@ -58,7 +58,7 @@ class Fault(Enum):
     DAMAGED = AuditFinding.DAMAGED, "byte {offset}: {what}"
     LENGTH_CHANGED = (
         AuditFinding.DAMAGED,
-        "byte {offset}: a record whose length leads beyond the end, but what stands there is whole",
+        "byte {offset}: a record whose length leads beyond the end, but its content is complete",
     )
     CUT_OFF = AuditFinding.TRUNCATED, "a finished file that ends at byte {offset}; its end is missing"
     INDEX = AuditFinding.INDEX, "{what}"
@@ -66,10 +66,10 @@ class Fault(Enum):
     RENAMED = AuditFinding.REORDERED, "it has the name of another file: it was begun as {original}"
     END_UNSIGNED = AuditFinding.UNSIGNED, "its end is not signed"
     NOTHING_SIGNED = AuditFinding.UNSIGNED, "has no hash chain, so nothing is signed"
-    MORE_WAS_THERE = AuditFinding.TRUNCATED, "{next} goes on from records that are missing here: its end was cut off"
-    FILE_MISSING = AuditFinding.MISSING_FILE, "{previous}, from which it goes on, is {lost}; it stood behind {before}"
-    FILES_REORDERED = AuditFinding.REORDERED, "goes on from {previous}, but {before} stands between"
-    FILES_BROKEN = AuditFinding.BROKEN, "does not go on from the last value of {previous}: one of them was rewritten"
+    MORE_WAS_THERE = AuditFinding.TRUNCATED, "{next} continues from records that are missing here: its end was cut off"
+    FILE_MISSING = AuditFinding.MISSING_FILE, "{previous}, from which it continues, is {lost}; it followed {before}"
+    FILES_REORDERED = AuditFinding.REORDERED, "continues from {previous}, but {before} is between them"
+    FILES_BROKEN = AuditFinding.BROKEN, "does not continue from the last value of {previous}: one of them was rewritten"
     NUMBERS_AGAIN = AuditFinding.BROKEN, "sample numbers from {seq} on are also in {previous}"
     OTHER_STATE = AuditFinding.STATE, "opens with another state than {previous} ends with"
 
@@ -117,7 +117,7 @@ class Finding:
         return ": ".join(filter(None, (self.file, self.kind, self.place, self.text)))
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
+        """Return it as in the result of `--json`."""
         return {
             "kind": self.kind,
             "file": self.file,
@@ -168,7 +168,7 @@ class Difference:
         return [head, *rows]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
+        """Return it as in the result of `--json`."""
         fields = [{"field": f.name, "recorded": f.recorded, "recomputed": f.recomputed} for f in self.fields]
         return {
             "file": self.file,

@@ -33,7 +33,7 @@ from compensator.report.page import (
 )
 
 _TIME = "time, UTC"
-#: So many files and findings stand on the page at once; more are there to open.
+#: Number of files and findings shown at once; more are folded.
 _ROWS = 20
 #: Remarks that are shown; a year of files may have one each.
 _REMARKS = 40
@@ -75,12 +75,12 @@ def verdict(found: Audit) -> str:
     """Return one sentence: proven or not, and of how much."""
     files = f"{len(found.files)} recording(s)"
     if not found.clean:
-        said = []
+        wrong = []
         if found.findings_count:
-            said.append(f"{found.findings_count} finding(s)")
+            wrong.append(f"{found.findings_count} finding(s)")
         if found.differing:
-            said.append(f"{found.differing} sample(s) that differ in the replay")
-        return f"Not proven: {' and '.join(said)} in {files} with {found.samples} samples."
+            wrong.append(f"{found.differing} sample(s) that differ in the replay")
+        return f"Not proven: {' and '.join(wrong)} in {files} with {found.samples} samples."
     if _partly(found):
         return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
     words = (
@@ -178,7 +178,7 @@ def _proven(found: Audit) -> Table:
             else "only a signature can exclude that: --public-key, and [recording] signing_key on the machine",
         ],
         [
-            "Nothing was cut off behind the last record",
+            "Nothing was cut off after the last record",
             no if cut or ends else yes if whole else open_,
             f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end",
         ],
@@ -223,7 +223,7 @@ def _files(files: Sequence[RecordingAudit]) -> Block:
         for file in files
     ]
     head = ["file", "end", "samples", "records", "findings", "differ", "signed"]
-    return _folded("File by file", head, rows, "The values of the hash chain stand below, to open.")
+    return _folded("File by file", head, rows, "The values of the hash chain are below, folded.")
 
 
 def _hashes(found: Audit) -> Details:
@@ -237,7 +237,7 @@ def _hashes(found: Audit) -> Details:
         for file in found.files
     ]
     keys = sorted({key for file in found.files for key in file.keys})
-    blocks: list[Block] = [Table(head=["file", "chain goes on from", "chain ends with", "model, SHA-256"], rows=rows)]
+    blocks: list[Block] = [Table(head=["file", "chain continues from", "chain ends with", "model, SHA-256"], rows=rows)]
     if keys:
         blocks.append(Table(head=["public keys in the seals"], rows=[[key] for key in keys]))
     blocks.append(Words(title="Made by", lines=[f"compensator {__version__} replay"]))

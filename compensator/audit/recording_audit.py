@@ -57,7 +57,7 @@ class _Audit:
         self._verifier, self._progress = verifier, progress
         self._chain: ChainCheck | None = None
         self._replay: ReplayCheck | None = None
-        #: Records behind the last whole group.
+        #: Records after the last complete group.
         self._rest: list[Record] = []
         self._position = 0
 
@@ -89,7 +89,7 @@ class _Audit:
     # ------------------------------------------------------------------ reading
 
     def _read(self) -> None:
-        """Check group by group; what stands behind the last whole group stays in `_rest`."""
+        """Check group by group; what follows the last complete group stays in `_rest`."""
         for number, (records, message, whole) in enumerate(groups_of(self._container)):
             if not whole:
                 self._rest = records
@@ -178,7 +178,7 @@ class _Audit:
             result.end = RecordingEnd.TORN if rest or error.rest or error.offset < result.size else RecordingEnd.OPEN
 
     def _was_compact(self, torn: Torn) -> bool:
-        """Tell whether the file had been finished: only then metadata and attachments stand before the channels."""
+        """Tell whether the file had been finished: only then metadata and attachments come before the channels."""
         contents = self._contents
         if contents.channels:
             return contents.chunked
@@ -187,7 +187,7 @@ class _Audit:
 
 
 def _covers_others(rest: bytes) -> bool:
-    """Tell a length that was changed from a torn end: there, the one message behind it is not whole."""
+    """Tell a length that was changed from a torn end: there, the one message after it is not complete."""
     if rest.count(b'{"schema":') > 1 or len(rest) >= 2**20:
         return True
     try:

@@ -23,7 +23,7 @@ class RecordingAudit:
     original, machine, began, previous_file : str
         From its metadata: the name that it was begun with, the machine, why it began, the previous file.
     previous, last : str
-        Value of the hash chain that it goes on from, and the one it hands on; empty where it has no chain.
+        Value of the hash chain that it continues from, and its last one; empty where it has no chain.
     end : RecordingEnd or AuditFinding
         How it ends: with or without an end of its own, or as what cut it off or damaged it.
     findings, findings_count : list of Finding, int
@@ -31,7 +31,7 @@ class RecordingAudit:
     records : int
         Records in the chain.
     signed, unsigned_behind : int
-        Signed seals, and records behind the last of them.
+        Signed seals, and records after the last of them.
     keys : set of str
         Public keys in the seals.
     seal, sealed_signed : str, bool

@@ -1,4 +1,4 @@
-"""Audits the recordings of a machine together: none is missing or exchanged, each goes on where the last one ended."""
+"""Audits the recordings of a machine together: none is missing or exchanged, each continues the one before."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Audit:
         return not self.findings_count and not self.differing
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
+        """Return it as in the result of `--json`."""
         files = [
             {
                 "file": f.file,
@@ -126,14 +126,14 @@ def audit(
     verifier = Verifier(public_key) if public_key else None
     paths = list(dict.fromkeys(paths))
     sizes = {path: path.stat().st_size if path.exists() else 0 for path in paths}
-    whole = sum(sizes.values())
+    total = sum(sizes.values())
     done = 0
 
     def add(size: int) -> None:
         nonlocal done
         done += size
         if progress is not None:
-            progress(done, whole)
+            progress(done, total)
 
     if executor is not None:
         audits = _side_by_side(executor, paths, public_key, lambda path: add(sizes[path]))
@@ -198,7 +198,7 @@ class _Series:
         self._removed = {name for file in files for name in file.removed}
         self._newest = {file.machine: file.file for file in files}
         self._signed = signed
-        #: Findings of whole files; they stand before those within a file.
+        #: Findings of whole files; they come before those within a file.
         self.own = {file.file: RecordingAudit(file=file.file) for file in files}
         self.remarks: list[Remark] = []
 
@@ -216,7 +216,7 @@ class _Series:
             remark(Remark(RecordingEnd.TORN, f"{name}: torn before anything was recorded."))
             return
         if file.end == RecordingEnd.RECOVERED:
-            remark(Remark(RecordingEnd.RECOVERED, f"{name}: the service was killed; every whole record was kept."))
+            remark(Remark(RecordingEnd.RECOVERED, f"{name}: the service was killed; every complete record was kept."))
         elif file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
             figures = f"{name}: has no end, still being written, or the service was killed"
             if self._newest[file.machine] == name:
@@ -224,7 +224,7 @@ class _Series:
             if file.end == RecordingEnd.TORN:
                 remark(Remark(RecordingEnd.TORN, f"{figures}. It ends within a group of records."))
             else:
-                remark(Remark(RecordingEnd.OPEN, f"{figures}. It ends behind a whole group of records."))
+                remark(Remark(RecordingEnd.OPEN, f"{figures}. It ends after a complete group of records."))
         if file.skipped:
             remark(
                 Remark(
@@ -244,7 +244,7 @@ class _Series:
             elif not file.last:
                 self._find(Fault.NOTHING_SIGNED, file)
             elif file.unsigned_behind:
-                figures = f"{name}: {file.unsigned_behind} record(s) behind the last signature."
+                figures = f"{name}: {file.unsigned_behind} record(s) after the last signature."
                 remark(Remark(AuditRemark.UNSIGNED_BEHIND, figures))
         elif file.signed:
             keys = ", ".join(key[:16] for key in sorted(file.keys))

@@ -116,7 +116,7 @@ def _held_out(
 ) -> tuple[Vector, Vector]:
     """Return the residual before and after on every sample, each block by a search that did not see it.
 
-    Only the zero of each run is taken as unknown, or its initial state too: whichever leaves less before.
+    Only the zero of each run counts as unknown, or its initial state too: whichever leaves less before.
     """
     raw, nothing = evidence.residual, np.zeros(evidence.used.size)
     observed = [term.hypothesis.effect.observed for term in found.fit.terms]
@@ -172,8 +172,8 @@ def _effects(evidence: Evidence, found: Selection) -> tuple[Effect, ...]:
 def _stated(model: ThermalModel, after_um: float, noise_um: float, kept_out: Sequence[Vector]) -> float:
     """Return the standard deviation that an extended model states, µm: what it leaves where nothing was fitted.
 
-    Without it, a service would go on to publish that of the calibration, on a machine without the effect. What was
-    found and cannot be deployed (`kept_out`) goes on acting.
+    Without it, a service would still publish that of the calibration, on a machine without the effect. What was
+    found and cannot be deployed (`kept_out`) still acts.
     """
     left = max(after_um**2 - noise_um**2, 0.0) + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
     return max(model.y_std_um, float(np.sqrt(left)))

@@ -80,7 +80,7 @@ class NoiseTest:
 
 
 def own_error(model: ThermalModel, noise_um: float, spread_um: float) -> float:
-    """Return the base model's own error from its calibration, the noise taken off, µm rms.
+    """Return the base model's own error from its calibration, less the noise, µm rms.
 
     A calibration that misses by more than a share of the spread of the deformation lacks something.
     """

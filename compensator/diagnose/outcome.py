@@ -103,7 +103,7 @@ class Diagnosis:
     evidence : Evidence
         Residual and signals.
     residual_before, residual_after : numpy.ndarray, shape (n,)
-        Of the fit to everything, nuisances taken out, µm; NaN where y is missing.
+        Of the fit to everything, nuisances projected out, µm; NaN where y is missing.
     held_out_before, held_out_after : numpy.ndarray, shape (n,)
         The same, each block by a search that did not see it.
     tried : tuple of (str, float)

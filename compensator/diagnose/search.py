@@ -1,7 +1,7 @@
 """Search for the effects that a model lacks: added one after another, refitted together, compared by a criterion.
 
 An effect is worth its parameters where the residual's sum of squares falls by more than chance would make it fall
-with so many hypotheses tried:
+with the number of hypotheses tried:
 
     J = N/c · log(Σ e² + A) + Σ_effects [ p log(N/c) + 2 log M ]
 
@@ -174,23 +174,23 @@ class Search:
         return self._forward([fit_terms(self.evidence, starts)])
 
     def _settle_background(self, fit: Fit, before: Fit) -> Fit:
-        """Decide whether a background effect stands for itself, by which name, or is a companion of others.
+        """Decide whether a background effect is an effect of its own, by which name, or is a companion of others.
 
-        Where other effects explain most without it, it only absorbs what they leave. Where it stands alone and effects
+        Where other effects explain most without it, it only absorbs what they leave. Where it is alone and effects
         of a simpler name explain most of it, it gets their name.
         """
-        behind = next((term for term in fit.terms if term.hypothesis.effect.background), None)
-        if behind is None:
+        background = next((term for term in fit.terms if term.hypothesis.effect.background), None)
+        if background is None:
             return fit
         others = [term.start for term in _foreground(fit)]
         if not others:
             simpler: list[Start] = [(h, ()) for h in self.scan.hypotheses if h.effect.names_background]
             if not self._explain_most(simpler, fit, before):
                 return fit
-            others = [start for start in simpler if start[0].place[1] == behind.hypothesis.place[1]]
+            others = [start for start in simpler if start[0].place[1] == background.hypothesis.place[1]]
         elif not self._explain_most(others, fit, before):
             return fit
-        fitted = fit_terms(self.evidence, [*others, (behind.hypothesis, ())])
+        fitted = fit_terms(self.evidence, [*others, (background.hypothesis, ())])
         *named, last = fitted.terms
         return dataclasses.replace(fitted, terms=(*named, dataclasses.replace(last, companion=True)))
 
@@ -241,7 +241,7 @@ class Search:
         return sorted(found, key=lambda item: item.score)
 
     def _improved(self, fit: Fit) -> Fit:
-        """Exchange effects one at a time as long as that helps: what was found first may have stood for two."""
+        """Exchange effects one at a time as long as that helps: what was found first may have absorbed two."""
         if len(fit.terms) < 2:
             return fit
         for _ in range(2):
@@ -280,7 +280,7 @@ class Search:
         return fit
 
     def _is_plausible(self, term: Term) -> bool:
-        """Refuse an effect whose columns cancel: two lags that stand for a derivative or a ramp are not physical."""
+        """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
         if len(term.amplitudes) < 2 or term.hypothesis.effect.ridge:
             return True
         table = columns_of(self.evidence, *term.start)[0] * np.array(term.amplitudes)
@@ -301,5 +301,5 @@ class Search:
 
 
 def _foreground(fit: Fit) -> list[Term]:
-    """Return the effects that stand for themselves."""
+    """Return the effects that are no background."""
     return [term for term in fit.terms if not term.hypothesis.effect.background]

@@ -169,7 +169,7 @@ def error_rows(calibration: Calibration, *, folds: str, arx: str) -> list[list[s
 
 
 def aligned(rows: Sequence[Sequence[str]], *, left: int) -> list[str]:
-    """Return the lines of a table of text; the first columns stand at the left.
+    """Return the lines of a table of text; the first columns are left-aligned.
 
     Examples
     --------

@@ -107,7 +107,7 @@ class EffectTable:
     kind : str
         One of the registered kinds of `compensator.model.effects`.
     table : mapping
-        Its other keys, as they stand in the file.
+        Its other keys, as in the file.
     """
 
     kind: str

@@ -1,6 +1,6 @@
 """Makes finished recordings compact, and removes the oldest ones where a limit is set.
 
-All of this runs on a thread of its own that lets samples go first.
+All of this runs on a thread of its own that yields to samples.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ class Finisher:
                 path.unlink()
                 removed.append((path.name, sizes.pop(path)))
         except OSError as error:
-            if str(error) != self._unremoved:  # a disk that takes nothing is asked every minute
+            if str(error) != self._unremoved:  # a disk that accepts nothing is tried every minute
                 text = f"what is beyond the limit of what is kept could not be removed: {error}"
                 self._remark(text, RecordingData(code=RecordingCode.NOT_REMOVED))
             self._unremoved = str(error)
@@ -193,7 +193,7 @@ def _began_ns(path: Path, machine: str) -> int:
 def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) -> str:
     """Replace a machine's live recording by a compact copy.
 
-    A torn end is finished: its whole records get their place in a `/chain` message, and a seal says `recovered`.
+    A torn end is finished: its complete records get their place in a `/chain` message, and a seal says `recovered`.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) 
     Returns
     -------
     str
-        What was recovered, in words; empty where the file was whole.
+        What was recovered, in words; empty where the file was complete.
 
     Raises
     ------
@@ -218,7 +218,7 @@ def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) 
     if not isinstance(copy, _ChainedCopy) or copy.recovered is None:
         return "its torn end was cut off" if copy is not None and copy.torn else ""
     end = "its torn end was cut off" if copy.torn else "it had no end"
-    return f"{end}; {copy.recovered} whole record(s) behind the last complete group were kept"
+    return f"{end}; {copy.recovered} complete record(s) after the last complete group were kept"
 
 
 class _ChainedCopy(Copy):
@@ -230,7 +230,7 @@ class _ChainedCopy(Copy):
         self._chain: chain.ChainWriter | None = None
         self._last: Message | None = None
         self._sealed = False
-        #: Records that had no place in the chain yet; None where the file was whole.
+        #: Records that had no place in the chain yet; None where the file was complete.
         self.recovered: int | None = None
 
     def add(self, message: Message) -> None:
@@ -252,7 +252,7 @@ class _ChainedCopy(Copy):
     def finish(self) -> None:
         """Finish a torn end, and write the end of the file."""
         if self._chain is None or self._last is None:
-            raise DataError("nothing whole in it, expected at least one record")
+            raise DataError("nothing complete in it, expected at least one record")
         if not self._sealed:
             self.recovered = len(self._chain.links)
             if self.recovered:
@@ -264,7 +264,7 @@ class _ChainedCopy(Copy):
         super().finish()
 
     def _append(self, topic: str, data: bytes) -> None:
-        """Add a message behind the last one."""
+        """Add a message after the last one."""
         assert self._last is not None
         channel = next(number for number, name in self.topics.items() if name == topic)
         sequence, time_ns = self._last.sequence + 1, self._last.log_time_ns

@@ -54,7 +54,7 @@ def new_names(folder: Path, begin: str, time_ns: int, newest: Path | None = None
     time_ns : int
         Now, ns since 1970 UTC.
     newest : pathlib.Path, optional
-        The file before it: the new name sorts behind, even if the clock was set back between them.
+        The file before it: the new name sorts after it, even if the clock was set back between them.
     """
     stamp, number = datetime.fromtimestamp(time_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ"), 0
     if newest is not None:
@@ -137,7 +137,7 @@ class Opening:
         self.topics: dict[int, str] = {}
 
     def write(self, contents: Contents) -> None:
-        """Write what was not written yet; behind the first call these are further channels.
+        """Write what was not written yet; after the first call these are further channels.
 
         Raises
         ------

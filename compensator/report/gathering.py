@@ -54,13 +54,13 @@ def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] 
         If one of them is no recording, there are no samples, or they are of several machines.
     """
     ordered = in_order(paths)
-    whole = sum(path.stat().st_size for path in ordered)
+    total = sum(path.stat().st_size for path in ordered)
     reader, done = _Reader(), 0
     for path in ordered:
         with Container(path) as container:
             for i in reader.file(path.name, container):
                 if progress is not None and i % 1000 == 0:
-                    progress(done + container.position, whole)
+                    progress(done + container.position, total)
         done += path.stat().st_size
     return reader.result()
 

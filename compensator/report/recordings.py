@@ -195,7 +195,7 @@ def _curves(
 
 
 def _offset(history: History) -> Figure:
-    stood = [
+    held = [
         Span("offset held", *piece)
         for state in (State.HOLD, State.FAULT)
         if state in history.states
@@ -206,7 +206,7 @@ def _offset(history: History) -> Figure:
     if history.whole.left.samples:
         curves = {"measured": "measured", "remaining (measured + offset)": "left"} | curves
         words += f" Remaining error: {history.whole.left.rms:.2f} µm rms."
-    return _curves(history, "Offset and remaining error", "Y, µm", curves, words, 3.4, tuple(stood[:_SHADED]))
+    return _curves(history, "Offset and remaining error", "Y, µm", curves, words, 3.4, tuple(held[:_SHADED]))
 
 
 def _band(history: History) -> Figure:

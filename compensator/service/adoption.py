@@ -1,6 +1,6 @@
 """Prepares another model while the service runs: checks it, warms it up on the recordings, stores it.
 
-All of this runs on a thread of its own and lets samples go first; the swap itself lies between two samples and is the
+All of this runs on a thread of its own that yields to samples; the swap itself lies between two samples and is the
 daemon's.
 """
 
@@ -25,7 +25,7 @@ from compensator.service.warm_up import WARM_UP, WarmUp, warm_up
 
 #: Longest payload of a command that brings a model, bytes.
 LONGEST_MODEL = 1_000_000
-#: After so many samples of a warm-up the thread sleeps for a moment, so that it never holds a sample up.
+#: Number of samples of a warm-up after which the thread sleeps for a moment, so that it never delays a sample.
 LET_OTHERS = 10
 MOMENT_S = 0.001
 
@@ -159,7 +159,7 @@ class Adoption:
         running : ThermalModel
             The model in use.
         zero : dict or None
-            The zero that stands, None before the first.
+            The zero in force, None before the first.
         now_ns : int
             Now, ns since 1970 UTC.
 

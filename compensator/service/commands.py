@@ -19,9 +19,9 @@ from compensator.service.takeover import Takeover, refusal, sent_by
 
 #: Longest payload of a command without a model, bytes.
 LONGEST_COMMAND = 10_000
-#: So many commands wait for the next sample at most.
+#: Largest number of commands that wait for the next sample.
 WAITING_COMMANDS = 100
-#: So many refused commands are noted between two samples; a flood must not displace other events.
+#: Largest number of refused commands noted between two samples; a flood must not displace other events.
 NOTED_REFUSALS = 10
 
 
@@ -60,7 +60,7 @@ class Commands:
         try:
             arguments = self._checked(name, payload, sender)
             if loop is None or self._waiting.full():
-                raise ServiceError("the service cannot take a command now")
+                raise ServiceError("the service cannot accept a command now")
             if name in (CommandName.ADOPT, CommandName.BACK):
                 wanted = Wanted.of(name, arguments)
                 reply: Future[dict[str, Any]] = Future()

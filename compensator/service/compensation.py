@@ -41,7 +41,7 @@ MEAN_SAMPLES = 5
 
 #: Longest pause that is passed over, in samples: a longer one would delay the sample after it.
 MOST_BRIDGED = 1500
-#: A state that started unknown counts as known after so many of the slowest time constants (5 % are left then).
+#: After how many slowest time constants an unknown initial state counts as known (5 % are left then).
 KNOWN_AFTER = 3.0
 
 

@@ -61,7 +61,7 @@ async def run_service(
     clock : Clock, optional
         The machine's own by default.
     samples : int, optional
-        Stop after so many.
+        Number of samples to stop after.
     on_ready : callable, optional
         Called with the daemon once everything is open.
     on_sample : callable, optional
@@ -94,7 +94,7 @@ async def run_service(
         try:
             for warning in setup.warnings():
                 log.warning("%s: warning: %s", loaded.path, warning.marked)
-        except ConfigError as error:  # recording continues, whether anybody can receive the offset or not
+        except ConfigError as error:  # recording continues, whether the offset can be received or not
             log.error("%s; the router will refuse the service", error)
         checkpoint = OffsetCheckpoint(folder, machine)
         early = checkpoint.read(config.limits.offset_max_um)

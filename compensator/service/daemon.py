@@ -28,10 +28,10 @@ from drivers.reading import Device
 
 log = logging.getLogger("compensator")
 
-#: So long the loop blocks for the disk: a fraction of the poll interval, so that no poll is late, at most so many s.
+#: How long the loop blocks for the disk: a fraction of the poll interval, so that no poll is late, and a limit in s.
 DISK_PART, DISK_S = 0.4, 2.0
-#: So long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
-#: at most so many s. An offset of that age does no harm, its rate is published with it; one not on record might.
+#: How long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
+#: and a limit in s. An offset of that age does no harm, its rate is published with it; one not on record might.
 PATIENCE_PART, PATIENCE_S = 0.25, 15.0
 
 
@@ -140,7 +140,7 @@ class Daemon:
         Parameters
         ----------
         samples : int, optional
-            Stop after so many.
+            Number of samples to stop after.
         on_sample : callable, optional
             Called with the outcome after each sample was published.
         on_poll : callable, optional
@@ -286,9 +286,7 @@ class Daemon:
         minutes = missing * period_s / 60.0
         text = f"{missing} sample(s) are missing between the last recording and now; "
         if label_ns <= last_ns:
-            text = (
-                "the wall clock stands before the end of the last recording: how long the service was away is unknown"
-            )
+            text = "the wall clock is before the end of the last recording: how long the service was away is unknown"
             self._compensation.pause_of_unknown_length()
         else:
             self._compensation.pause(missing)

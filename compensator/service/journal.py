@@ -27,15 +27,15 @@ from compensator.service.offset_checkpoint import OffsetCheckpoint
 
 log = logging.getLogger("compensator")
 
-#: So many samples wait for the disk at most (four hours at one a minute), so that a lost disk costs no memory; then the
-#: oldest are dropped.
+#: Largest number of samples that wait for the disk (four hours at one a minute), so that a lost disk costs no memory;
+#: then the oldest are dropped.
 WAITING_SAMPLES = 240
-#: So many events wait with them; the newest are kept.
+#: Largest number of events that wait with them; the newest are kept.
 WAITING_EVENTS = 1000
 #: Texts of the events when the disk refuses the recording, accepts it too late, and accepts it again.
-DISK_FAILED = "the disk does not take the recording"
-DISK_LATE = "the disk takes the recording too late"
-DISK_BACK = "the disk takes the recording again"
+DISK_FAILED = "the disk does not accept the recording"
+DISK_LATE = "the disk accepts the recording too late"
+DISK_BACK = "the disk accepts the recording again"
 #: How often the log warns that the service waits for the disk at its end, s.
 CLOSING_S = 10.0
 

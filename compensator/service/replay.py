@@ -104,7 +104,7 @@ def step_of(records: Sequence[Record], contents: Contents, file: str) -> Step:
 
 
 def steps_in(container: Container) -> Iterator[Step]:
-    """Yield the groups of a recording as far as it can be read; what is whole in a torn group comes last.
+    """Yield the groups of a recording as far as it can be read; what is complete in a torn group comes last.
 
     Raises
     ------
@@ -292,7 +292,7 @@ class FreeRun:
                 self.compensation.pause_of_unknown_length()
                 return
             if pause is not None:
-                # Noted with the first sample of that start; what a full disk never took comes on top.
+                # Noted with the first sample of that start; what a full disk never accepted is added.
                 self.compensation.pause((pause.missing or 0) + sample.seq - event.seq)
                 return
         self.compensation.pause(sample.seq - self.seq - 1)

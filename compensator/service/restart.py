@@ -1,8 +1,8 @@
 """The start of the service: finds its last recording and brings the state to where that ended.
 
-A clean stop, a kill and a power cut are the same here: whatever is whole on disk is used. The samples of the last file
-run from the state that it opens with, and give the state after the last of them, bit for bit. Where the configuration
-or the model has changed since, the recordings warm the new one up instead.
+A clean stop, a kill and a power cut are the same here: whatever is complete on disk is used. The samples of the last
+file run from the state that it opens with, and give the state after the last of them, bit for bit. Where the
+configuration or the model has changed since, the recordings warm the new one up instead.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from compensator.service.warm_up import warm_up
 
 @dataclass(slots=True)
 class Resumed:
-    """A compensation that goes on where the last recording ends.
+    """A compensation that continues where the last recording ends.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None 
     if early is not None and early.seq > compensation.last[0]:
         compensation.go_on_from(early.y_offset_um, model_changed=compensation.is_under_way)
         resumed.note(
-            f"goes on from the offset {early.y_offset_um:.3f} µm of sample {early.seq}, "
+            f"continues from the offset {early.y_offset_um:.3f} µm of sample {early.seq}, "
             "which was published while the disk failed",
             early_seq=early.seq,
             offset_um=early.y_offset_um,
@@ -194,7 +194,7 @@ def _go_on(resumed: Resumed, last: _LastFile, compensation: Compensation, differ
     seq, _ = compensation.last
     resumed.compensation = compensation
     resumed.note(
-        f"goes on from {last.path.name}: {last.samples} sample(s) run again, the last one {seq}",
+        f"continues from {last.path.name}: {last.samples} sample(s) run again, the last one {seq}",
         file=last.path.name,
         samples=last.samples,
         last_seq=seq,

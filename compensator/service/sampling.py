@@ -141,7 +141,7 @@ class ChannelCollector:
 
 
 def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
-    """Leave single wild readings out; a slope over the minute is not wild."""
+    """Leave single outliers out; a slope over the minute is none."""
     if len(readings) < 5:
         return readings, 0
     values = np.array([reading.value for reading in readings])
@@ -156,7 +156,7 @@ def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
 
 
 def _near(values: Vector) -> bool:
-    """Return whether one deviating reading among equal ones is a step of the converter rather than wild."""
+    """Return whether one deviating reading among equal ones is a step of the converter and no outlier."""
     return bool(np.ptp(values) <= 1e-3 * max(1.0, abs(float(np.median(values)))))
 
 

@@ -137,7 +137,7 @@ class Takeover:
         )
 
     def _answer_refusal(self, task: asyncio.Task[None]) -> None:
-        """Answer with the reason where a model could not be prepared; the running one goes on."""
+        """Answer with the reason where a model could not be prepared; the running one stays."""
         adopting, error = self._adopting, None if task.cancelled() else task.exception()
         if adopting is None or error is None:
             return

@@ -229,7 +229,7 @@ def _compact_all(paths: list[Path]) -> None:
             log.info("%s: could not be compacted and stays as it is: %s", path.name, error)
             continue
         if copy is not None:
-            end = "" if copy.contents.ended else "; it had no end, every whole message was kept"
+            end = "" if copy.contents.ended else "; it had no end, every complete message was kept"
             log.info("%s: %d messages, compact%s", path.name, copy.messages, end)
 
 

@@ -100,7 +100,7 @@ def test_what_is_behind_the_last_signature_of_a_live_file_is_said(tmp_path: Path
     private, public = write_key(tmp_path, "machine", 7)
     service = Service(tmp_path / "rec", signer=Signer(private)).run(70)
     found = audit([path_in(tmp_path / "rec")], public_key=public)
-    assert found.clean and f"{9 * 3} record(s) behind the last signature" in " ".join(found.remarks)
+    assert found.clean and f"{9 * 3} record(s) after the last signature" in " ".join(found.remarks)
     service.kill()
 
 
