@@ -122,7 +122,7 @@ class _Reader:
         history = self.history
         if not history.whole.samples or not history.states:
             names = ", ".join(file.name for file in history.files[:3])
-            raise DataError(f"{names}: no samples; expected recordings of a machine's service")
+            raise DataError(f"{names}: no samples in it; expected recordings of a machine's service")
         history.episodes.sort(key=lambda episode: episode.number)
         return history
 
