@@ -1,4 +1,4 @@
-"""Files that are there wholly or not at all."""
+"""Atomic writes: under its name a file is complete or missing."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Whether the index of an MCAP file leads to every record of it, and to nothing else.
 
-The hash chain covers what the records say. Readers that seek (Foxglove, the JavaScript library) see only what the
-index leads them to: an entry that is gone or leads elsewhere hides records that are still there. So what stands in the
-data section is noted while it is read, and the index is held against it: the message indexes after each chunk, and in
-the summary the chunks, attachments and metadata, the statistics, the repeated schemas and channels, and the offsets.
+The hash chain covers the content of the records. Readers that seek (Foxglove, the JavaScript library) see only what the
+index leads to: an entry that is missing or leads elsewhere hides records that are there. So the data section is noted
+while it is read, and the index is compared with it: the message indexes after each chunk, and in the summary the
+chunks, attachments and metadata, the statistics, the repeated schemas and channels, and the offsets.
 """
 
 from __future__ import annotations

@@ -270,7 +270,7 @@ class FreeRun:
                     f"{step.file}: samples of {sample.period_s:g} s, expected those of the model, {period_s:g} s"
                 )
             if self._before_torn_um is not None:
-                compensation.go_on_from(self._before_torn_um, model_changed=compensation.is_under_way)
+                compensation.continue_from(self._before_torn_um, model_changed=compensation.is_under_way)
             if self.seq >= 0:
                 self._pass_pause(step, sample)
             self._before_torn_um = compensation.offset_um if "offset" not in step.records else None

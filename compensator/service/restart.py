@@ -19,7 +19,7 @@ from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.offset_checkpoint import EarlyOffset
+from compensator.service.offset_checkpoint import CheckpointedOffset
 from compensator.service.replay import Step, apply, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
 from compensator.service.warm_up import warm_up
@@ -71,7 +71,7 @@ class _LastFile:
         return published
 
 
-def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None = None) -> Resumed:
+def resume(loaded: LoadedConfig, model: ThermalModel, checkpointed: CheckpointedOffset | None = None) -> Resumed:
     """Bring a compensation to where the last recording ends.
 
     Parameters
@@ -80,7 +80,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None 
         The present configuration.
     model : ThermalModel
         The present model.
-    early : EarlyOffset, optional
+    checkpointed : CheckpointedOffset, optional
         The last offset that was published while the disk failed.
 
     Returns
@@ -90,13 +90,13 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None 
     """
     resumed = _from_disk(loaded, model)
     compensation = resumed.compensation
-    if early is not None and early.seq > compensation.last[0]:
-        compensation.go_on_from(early.y_offset_um, model_changed=compensation.is_under_way)
+    if checkpointed is not None and checkpointed.seq > compensation.last[0]:
+        compensation.continue_from(checkpointed.y_offset_um, model_changed=compensation.is_under_way)
         resumed.note(
-            f"continues from the offset {early.y_offset_um:.3f} µm of sample {early.seq}, "
+            f"continues from the offset {checkpointed.y_offset_um:.3f} µm of sample {checkpointed.seq}, "
             "which was published while the disk failed",
-            early_seq=early.seq,
-            offset_um=early.y_offset_um,
+            early_seq=checkpointed.seq,
+            offset_um=checkpointed.y_offset_um,
         )
     return resumed
 
@@ -190,7 +190,7 @@ def _go_on(resumed: Resumed, last: _LastFile, compensation: Compensation, differ
         )
     if last.samples:
         # Not from the offset of a torn last sample, which was not published.
-        compensation.go_on_from(last.offset_um, model_changed=compensation.is_under_way)
+        compensation.continue_from(last.offset_um, model_changed=compensation.is_under_way)
     seq, _ = compensation.last
     resumed.compensation = compensation
     resumed.note(
@@ -210,7 +210,7 @@ def _warm(
     try:
         warm = warm_up(folder, config, model)
     except DataError as error:
-        resumed.compensation.go_on_from(last.offset_um, model_changed=model_changed)
+        resumed.compensation.continue_from(last.offset_um, model_changed=model_changed)
         if last.operator_hold:
             resumed.compensation.hold()
         resumed.note(
@@ -218,7 +218,7 @@ def _warm(
         )
         return
     resumed.compensation = warm.compensation
-    resumed.compensation.go_on_from(last.offset_um, model_changed=model_changed)
+    resumed.compensation.continue_from(last.offset_um, model_changed=model_changed)
     if last.operator_hold:
         resumed.compensation.hold()
     resumed.note(
