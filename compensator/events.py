@@ -198,7 +198,7 @@ def command_of(event: Event) -> str:
 
 
 def is_recorded(note: Note, event: Event) -> bool:
-    """Tell whether a recorded event carries what a note carries.
+    """Return whether a recorded event carries what a note carries.
 
     Version 0.1.0 recorded zeros and implausibilities without data: there the texts are compared, so these two kinds
     of note keep the wording of that version.

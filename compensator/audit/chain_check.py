@@ -197,7 +197,7 @@ class ChainCheck:
             self.head, self._next = (values[-1] if values else before), sequence + 1
 
     def _clear_suspect(self, before: bytes) -> bool:
-        """Tell whether the last record of the group before is intact and its value in the chain was altered."""
+        """Return whether the last record of the group before is intact and its value in the chain was altered."""
         suspect, self._suspect = self._suspect, None
         findings = self._result.findings
         if suspect is None or suspect[1] != before or suspect[0] >= len(findings):
@@ -209,7 +209,7 @@ class ChainCheck:
         return True
 
     def _place(self, records: list[Record], first: int, message: Record) -> bool:
-        """Tell whether whole groups are missing before this one, or whether it is in the wrong place."""
+        """Return whether whole groups are missing before this one, or whether it is in the wrong place."""
         sequence, time_ns = message.sequence, message.log_time_ns
         present = {record.sequence for record in records}
         if first > self._next and not present & set(range(self._next, first)):

@@ -123,9 +123,9 @@ def compare(
     progress : callable, optional
         Called with the number of bytes worked off, and of all.
     row : callable, optional
-        Takes the rows of the table of both offsets, see `COLUMNS`.
+        Called with the rows of the table of both offsets, see `COLUMNS`.
     point : callable, optional
-        Takes time (ns), and measured deformation and offset with the recorded and with the other model, µm.
+        Called with time (ns), and measured deformation and offset with the recorded and with the other model, µm.
 
     Raises
     ------

@@ -90,7 +90,7 @@ def verdict(found: Audit) -> str:
 
 
 def _partly(found: Audit) -> bool:
-    """Tell whether there was something that could not be checked."""
+    """Return whether there was something that could not be checked."""
     return not found.samples or any(not file.last or file.not_replayed for file in found.files)
 
 

@@ -178,7 +178,7 @@ class _Audit:
             result.end = RecordingEnd.TORN if rest or error.rest or error.offset < result.size else RecordingEnd.OPEN
 
     def _was_compact(self, torn: Torn) -> bool:
-        """Tell whether the file had been finished: only then metadata and attachments come before the channels."""
+        """Return whether the file had been finished: only then metadata and attachments come before the channels."""
         contents = self._contents
         if contents.channels:
             return contents.chunked
@@ -187,7 +187,7 @@ class _Audit:
 
 
 def _covers_others(rest: bytes) -> bool:
-    """Tell a length that was changed from a torn end: there, the one message after it is not complete."""
+    """Distinguish a changed length from a torn end: there, the one message after it is not complete."""
     if rest.count(b'{"schema":') > 1 or len(rest) >= 2**20:
         return True
     try:

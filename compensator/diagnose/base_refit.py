@@ -35,7 +35,7 @@ FAR_OFF = 0.1
 
 
 def is_far_off(model: ThermalModel, evidence: Evidence) -> bool:
-    """Tell whether the calibration itself says that the model misses much of the deformation."""
+    """Return whether the calibration itself says that the model misses much of the deformation."""
     return model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um
 
 

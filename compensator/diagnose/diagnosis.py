@@ -74,7 +74,7 @@ def diagnose(
 
 
 def _doubtful(searched: Diagnosis, evidence: Evidence) -> bool:
-    """Tell whether the search did not help although much is left."""
+    """Return whether the search did not help although much is left."""
     if rms_of(searched.held_out_after) > rms_of(searched.held_out_before):
         return True
     return searched.verdict == "unexplained" and rms_of(searched.held_out_before) > FAR_OFF * evidence.spread_um

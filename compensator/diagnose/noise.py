@@ -54,28 +54,28 @@ class NoiseTest:
         return self.count * (OWN_TIMES * self.own_error_um) ** 2
 
     def is_expected(self, cost: float) -> bool:
-        """Tell whether a residual, before any search, may come by itself on another day."""
+        """Return whether a residual, before any search, may come by itself on another day."""
         return cost < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
 
     def is_noise(self, cost: float) -> bool:
-        """Tell whether a search has nothing left to find in a sum of squares."""
+        """Return whether a search has nothing left to find in a sum of squares."""
         return cost < SEARCH_TIMES * (self.count * self.noise_um**2 + self.allowance)
 
     def is_bare_noise(self, cost: float) -> bool:
-        """Tell the same with the own error as it is stated, without a margin."""
+        """Return the same with the own error as it is stated, without a margin."""
         return cost < SEARCH_TIMES * self.count * (self.noise_um**2 + self.own_error_um**2)
 
     def is_explained(self, cost: float) -> bool:
-        """Tell whether the verdict may say that what is left is noise."""
+        """Return whether the verdict may say that what is left is noise."""
         return cost < VERDICT_TIMES**2 * (self.count * self.noise_um**2 + self.allowance)
 
     def is_explained_held_out(self, rms_um: float) -> bool:
-        """Tell the same of a held-out error of a refitted base, whose own error is not known beforehand."""
+        """Return the same of a held-out error of a refitted base, whose own error is not known beforehand."""
         return rms_um < VERDICT_TIMES * self.noise_um
 
     @staticmethod
     def is_white(variance_inflation: float) -> bool:
-        """Tell whether a residual has no structure in time."""
+        """Return whether a residual has no structure in time."""
         return variance_inflation < WHITE_BELOW
 
 

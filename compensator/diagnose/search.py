@@ -148,7 +148,7 @@ class Search:
         return self.evidence.noise.is_white(self.evidence.variance_inflation(fit.residual))
 
     def _is_one_effect(self, fits: Sequence[Fit], before: Fit) -> bool:
-        """Tell whether, where forms are approximate, a single effect explains so much that its form leaves the rest."""
+        """Return whether one effect explains so much that its form, where forms are approximate, leaves the rest."""
         return self.approximate and any(
             len(_foreground(fit)) <= 1 and fit.cost < FORM_LEAVES * before.cost for fit in fits
         )
@@ -195,7 +195,7 @@ class Search:
         return dataclasses.replace(fitted, terms=(*named, dataclasses.replace(last, companion=True)))
 
     def _explain_most(self, some: Sequence[Start], fit: Fit, before: Fit) -> bool:
-        """Tell whether some effects alone explain most of what all explain."""
+        """Return whether some effects alone explain most of what all explain."""
         return before.cost - fit_terms(self.evidence, some).cost > MOSTLY * (before.cost - fit.cost)
 
     def _with_unobserved(self, path: Sequence[Fit], observed: Fit) -> list[Fit]:
@@ -217,7 +217,7 @@ class Search:
         return [fit for fit in improved if fit.cost + own < UNOBSERVED_LEAVES * (observed.cost + own)]
 
     def _is_worth(self, hypothesis: Hypothesis, without: Fit, fit: Fit) -> bool:
-        """Tell whether an effect explains enough, the base model's own error counted as still there."""
+        """Return whether an effect explains enough, the base model's own error counted as still there."""
         allowance, effect = self.evidence.noise.allowance, hypothesis.effect
         share = effect.worth_beside if self.approximate and _foreground(without) else effect.worth
         return fit.cost + allowance < (1.0 - share) * (without.cost + allowance)

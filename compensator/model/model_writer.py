@@ -143,7 +143,7 @@ def _path(where: str, path: Path, purpose: str, extra: Mapping[str, Any]) -> Ite
 
 
 def _gain(where: str, path: Path) -> str:
-    """Say the gain at rest, Σb / Σa, with its standard error from the covariance of b and a_1 …."""
+    """Write the gain at rest, Σb / Σa, with its standard error from the covariance of b and a_1 …."""
     b, a = path.sampled.b, path.sampled.a
     total = math.fsum(a)
     gain = math.inf if total == 0.0 else (path.continuous or path.sampled).dc_gain
@@ -160,7 +160,7 @@ def _gain(where: str, path: Path) -> str:
 
 
 def _dynamics(path: Path) -> str:
-    """Say the time constants and zeros, in s where the file has s: a pole faster than 2/T is negative in z."""
+    """Write the time constants and zeros, in s where the file has s: a pole faster than 2/T is negative in z."""
     function = path.continuous or path.sampled
     taus = ", ".join(f"{tau:.4g}" for tau in function.time_constants_min() if tau != 0.0)
     if path.continuous is not None:

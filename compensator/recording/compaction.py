@@ -31,7 +31,7 @@ from compensator.recording.container import (
 )
 from compensator.recording.live_file import Opening, sync_folder
 
-#: Number of messages after which a patient copy lets other threads go first, and for how long, s.
+#: Number of messages after which a patient copy yields to other threads, and for how long, s.
 TURN, MOMENT_S = 64, 0.0005
 _PART = ".mcap.part"
 
@@ -135,7 +135,7 @@ def rewrite(
 
 
 def _is_live(path: Path, chained: bool) -> bool:
-    """Tell whether a file is not compact yet; with `chained`, only if it opens with its hash chain."""
+    """Return whether a file is not compact yet; with `chained`, only if it opens with its hash chain."""
     with Container(path) as container:
         try:
             for message in container.messages():

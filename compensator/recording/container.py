@@ -463,7 +463,7 @@ class Container:
         return Torn(self.path, offset, rest)
 
     def _only_zeros(self) -> bool:
-        """Tell whether nothing but zeros follows: what a power cut leaves of a file that had grown."""
+        """Return whether nothing but zeros follows: what a power cut leaves of a file that had grown."""
         while True:
             if self._buffer[self._at :].strip(b"\0"):
                 return False

@@ -74,7 +74,7 @@ class Finisher:
         self._remarks: list[tuple[str, dict[str, Any]]] = []
 
     def enqueue(self, path: Path, now_ns: int) -> None:
-        """Have a file made compact in the background.
+        """Enqueue a file to be made compact in the background.
 
         Parameters
         ----------

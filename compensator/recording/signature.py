@@ -65,7 +65,7 @@ class Verifier:
         self.public_key: str = key.public_bytes_raw().hex()
 
     def holds(self, seal: Seal) -> bool:
-        """Tell whether the seal was signed with the private half of this key."""
+        """Return whether the seal was signed with the private half of this key."""
         from cryptography.exceptions import InvalidSignature
 
         try:

@@ -112,7 +112,7 @@ class Entry:
         return datetime.fromtimestamp(self.time_utc_ns / NS, UTC).strftime("%Y%m%d")
 
     def inherit(self, dropped: Entry) -> None:
-        """Take over what must not be lost with a sample that is dropped."""
+        """Keep what must not be lost with a sample that is dropped."""
         self.events = [*dropped.events, *self.events][-WAITING_EVENTS:]
         self.model = self.model if self.model is not None else dropped.model
         self.new_file = True
@@ -217,7 +217,7 @@ class Journal:
         estimate: bytes = b"",
         offset: Offset | None = None,
     ) -> Entry:
-        """Have a sample and the waiting events written after everything that waits.
+        """Enqueue a sample and the pending events to be written after everything that waits.
 
         Parameters
         ----------

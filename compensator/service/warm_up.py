@@ -182,7 +182,7 @@ def _last_estimate(files: list[Path]) -> EstimateMessage | None:
 
 
 def _opens_with_zero(path: Path, last: EstimateMessage) -> bool:
-    """Tell whether a recording opens with the zero in force at the end."""
+    """Return whether a recording opens with the zero in force at the end."""
     state = _state_of(path)
     if state is None:
         return False
