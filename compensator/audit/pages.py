@@ -19,7 +19,7 @@ from compensator.report.history import Spread
 from compensator.report.page import (
     Block,
     Cell,
-    Code,
+    CodeLink,
     Details,
     Figure,
     Line,
@@ -205,7 +205,7 @@ def _findings(found: Audit) -> Block:
     more = found.findings_count - len(found.findings)
     note = f"And {more} more: of each file the first are named." if more else ""
     head = ["file", "kind", "what", "where"]
-    rows: list[list[Cell]] = [[one.file, Code(one.kind), one.text, one.place] for one in found.findings]
+    rows: list[list[Cell]] = [[one.file, CodeLink(one.kind), one.text, one.place] for one in found.findings]
     return _folded("Findings", head, rows, note)
 
 
@@ -213,7 +213,7 @@ def _files(files: Sequence[RecordingAudit]) -> Block:
     rows: list[list[Cell]] = [
         [
             file.file,
-            Code(file.end),
+            CodeLink(file.end),
             str(file.samples),
             str(file.records),
             str(file.findings_count),

@@ -15,7 +15,7 @@ from compensator.report.notation import plain, signed
 from compensator.report.page import (
     Block,
     Cell,
-    Code,
+    CodeLink,
     Details,
     Figure,
     Page,
@@ -297,7 +297,7 @@ def _states(history: History) -> Table:
         if state in history.states:
             seconds, times = history.whole.seconds[state], history.states[state].count
             meaning, action = explain(state) or ("The service did not run.", "See the events before and after.")
-            cell: Cell = state if state == NO_RECORDING else Code(state)
+            cell: Cell = state if state == NO_RECORDING else CodeLink(state)
             rows.append([cell, _minutes(seconds), _share(history, state), str(times), meaning, action])
     return Table(title="Time in each state", rows=rows, head=["state", "min", "share", "times", "meaning", "action"])
 
@@ -307,16 +307,16 @@ def _reasons(history: History) -> Table:
     for reason, stretch in sorted(history.reasons.items(), key=lambda item: -history.reason_seconds[item[0]]):
         meaning, action = explain(reason) or ("", "")
         seconds, last = history.reason_seconds[reason], stretch.pieces[-1][1]
-        rows.append([Code(reason), _minutes(seconds), str(stretch.count), _utc(last), meaning, action])
+        rows.append([CodeLink(reason), _minutes(seconds), str(stretch.count), _utc(last), meaning, action])
     return Table(title="Reasons", rows=rows, head=["reason", "min", "times", "last, UTC", "meaning", "action"])
 
 
 def _episodes(history: History) -> Block:
     def row(episode: Episode) -> list[Cell]:
-        reasons: list[str | Code] = []
+        reasons: list[str | CodeLink] = []
         for reason in episode.reasons:
-            reasons += [", ", Code(reason)] if reasons else [Code(reason)]
-        state: Cell = Code(episode.state) if episode.state else NO_RECORDING
+            reasons += [", ", CodeLink(reason)] if reasons else [CodeLink(reason)]
+        state: Cell = CodeLink(episode.state) if episode.state else NO_RECORDING
         return [_utc(episode.first_s), _minutes(episode.seconds), state, tuple(reasons)]
 
     note = f"The longest {EPISODES} of {history.episodes_count}." if history.episodes_count > EPISODES else ""
@@ -391,9 +391,9 @@ def _missed(history: History) -> Block:
 
 
 def _codes(counts: Mapping[str, int]) -> Cell:
-    parts: list[str | Code] = []
+    parts: list[str | CodeLink] = []
     for code, number in sorted(counts.items(), key=lambda item: -item[1]):
-        parts += [", ", Code(code), f" {number}"] if parts else [Code(code), f" {number}"]
+        parts += [", ", CodeLink(code), f" {number}"] if parts else [CodeLink(code), f" {number}"]
     return tuple(parts) or ""
 
 
@@ -410,7 +410,7 @@ def _files(history: History) -> Details:
             str(file.samples),
             _utc(file.first_s),
             _utc(file.last_s),
-            Code(file.end) if isinstance(file.end, RecordingEnd) else file.end,
+            CodeLink(file.end) if isinstance(file.end, RecordingEnd) else file.end,
         ]
         for file in history.files
     ]
