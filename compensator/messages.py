@@ -37,7 +37,7 @@ class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):
     quality : str
         `good`, or the code of what makes it unusable.
     device_quality : str
-        What the device alone reported, before the guards.
+        What the device alone said, before the guards.
     errors : dict of str to int
         Codes of bad readings and device errors in this sample, with their number.
     """
@@ -262,7 +262,7 @@ class Chain(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Seal(msgspec.Struct, frozen=True, kw_only=True):
-    """States that a recording was complete up to here, `/seal`; the last record of a finished file.
+    """Says that a recording was whole up to here, `/seal`; the last record of a finished file.
 
     Parameters
     ----------
