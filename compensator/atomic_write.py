@@ -1,4 +1,4 @@
-"""Files that are there wholly or not at all."""
+"""Atomic writes: under its name a file is complete or missing."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import TextIO
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[TextIO]:
-    r"""Give a file to write text to; it takes its place once it is whole, and is gone where something fails.
+def atomic_write(path: Path) -> Iterator[TextIO]:
+    r"""Open a file for text; it replaces the old one once it is complete, and is removed where something fails.
 
     Parameters
     ----------
     path : pathlib.Path
-        Where it is to go; its folder is made. What stood there before stays until then. A link keeps leading where it
-        leads, and what is no file (`/dev/null`, a pipe) is written to as it is.
+        Where it is to go; its folder is made. What was there before stays until then. A link stays a link, and what is
+        no file (`/dev/null`, a pipe) is written to directly.
 
     Yields
     ------
@@ -28,7 +28,7 @@ def whole_file(path: Path) -> Iterator[TextIO]:
     Examples
     --------
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     with whole_file(Path(folder) / "a.csv") as file:
+    ...     with atomic_write(Path(folder) / "a.csv") as file:
     ...         _ = file.write("t_s,y_um\n")
     ...     os.listdir(folder)
     ['a.csv']

@@ -48,10 +48,10 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock that stands still during work and jumps ahead on `sleep`.
+    """A clock that does not move during work and jumps ahead on `sleep`.
 
     Only one task may sleep on it, the sampling loop. What it awaits with `settle` runs in real time, within its own
-    limits, while virtual time stands still.
+    limits, while virtual time does not move.
 
     Parameters
     ----------

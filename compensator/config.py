@@ -20,8 +20,6 @@ Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
 #: Roles that the model and the residual need; every other channel is auxiliary.
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
-#: Unit suffix of a channel name for each unit that a device gives.
-UNIT_SUFFIX = {"degc": "_degc", "um": "_um", "v": "_v", "rpm": "_rpm", "w": "_w"}
 
 _LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):")
 #: Transports on which participants authenticate by certificates.
@@ -133,7 +131,8 @@ class Rest(_Table, frozen=True, kw_only=True):
 class Plausibility(_Table, frozen=True, kw_only=True):
     """`[plausibility]`: T_Q, AT and measured Y against each other; a check without its limit is off.
 
-    `t_q_below_at_after_min`: T_Q below AT by more than `guards.t_q_below_at_max_k` for so long means exchanged sensors.
+    `t_q_below_at_after_min`: T_Q below AT by more than `guards.t_q_below_at_max_k` for this long means
+    exchanged sensors.
     `false_alarm_days`: mean time between two false alarms of the residual. `residual_std_um`: standard deviation of the
     residual of the healthy machine, by default the model's own; `residual_correlation_min`: its correlation time.
     `residual_hold_um`: during an alarm, a residual beyond this holds the offset.

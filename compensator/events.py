@@ -1,7 +1,7 @@
 """Events: their kinds, the data of each, and how programs read them.
 
 `Event.text` is one line for people, whose words may change. Programs read `kind` and `data` alone. Version
-0.1.0 recorded some events with a text only; what is needed to read those stands at the end of this module.
+0.1.0 recorded some events with a text only; what is needed to read those is at the end of this module.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from compensator.messages import Event
 
 
 class EventKind(StrEnum):
-    """Kinds of events, as they stand in `Event.kind`."""
+    """Kinds of events, as in `Event.kind`."""
 
     START = "start"
     STOP = "stop"
@@ -43,6 +43,16 @@ class EventKind(StrEnum):
     ERROR = "error"
 
 
+class CommandName(StrEnum):
+    """Commands to the service, as in the key and in the event."""
+
+    ZERO = "zero"
+    HOLD = "hold"
+    RESUME = "resume"
+    ADOPT = "adopt"
+    BACK = "back"
+
+
 class Note(NamedTuple):
     """An event before it gets its number and time.
 
@@ -65,7 +75,7 @@ class _Data(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Data of one kind of event."""
 
     def table(self) -> dict[str, Any]:
-        """Return it as it stands in `Event.data`."""
+        """Return it as in `Event.data`."""
         table: dict[str, Any] = msgspec.to_builtins(self)
         return table
 
@@ -85,7 +95,7 @@ class PauseData(_Data, frozen=True, kw_only=True):
     Parameters
     ----------
     missing : int or None
-        Number of samples that were not taken; None where it is unknown.
+        Number of samples that were not measured; None where it is unknown.
     minutes : float or None
         The same, min.
     bridged : bool
@@ -125,7 +135,7 @@ class RecordingData(_Data, frozen=True, kw_only=True):
     reason : str, optional
         Reason with which that offset was published.
     lost : int, optional
-        Samples that were given up before the disk took the recording again.
+        Samples that were given up before the disk accepted the recording again.
     file : str, optional
         The recording.
     removed : list of str
@@ -188,7 +198,7 @@ def command_of(event: Event) -> str:
 
 
 def is_recorded(note: Note, event: Event) -> bool:
-    """Tell whether a recorded event carries what a note carries.
+    """Return whether a recorded event carries what a note carries.
 
     Version 0.1.0 recorded zeros and implausibilities without data: there the texts are compared, so these two kinds
     of note keep the wording of that version.

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from compensator.reasons import State
+from compensator.reasons import SampleQuality, State
 
 NAN = float("nan")
 
@@ -51,6 +51,11 @@ class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):
     quality: str
     device_quality: str
     errors: dict[str, int] = {}
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the value can be used."""
+        return self.quality == SampleQuality.GOOD
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True):
@@ -319,7 +324,7 @@ def schemas() -> dict[str, dict[str, Any]]:
     for name, message in MESSAGES.items():
         definitions = msgspec.json.schema(message)["$defs"]
         definition = definitions.pop(message.__name__)
-        if "state" in definition["properties"]:  # its codes stand where they are used, not behind a reference
+        if "state" in definition["properties"]:  # its codes are listed in place, without a reference
             definition["properties"]["state"] = {"enum": definitions.pop(State.__name__)["enum"]}
         made[name] = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",

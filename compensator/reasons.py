@@ -192,11 +192,9 @@ DOMAINS: tuple[type[Code], ...] = (
     *(DataRemark, WatchWarning, AuditRemark, RecordingEnd, AuditFinding),
 )
 
-_CODES: Mapping[str, Code] = MappingProxyType({str(code): code for domain in DOMAINS for code in domain})
-
 #: code → (what it means, what to do)
 WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {name: (code.meaning, code.action) for name, code in _CODES.items()}
+    {str(code): (code.meaning, code.action) for domain in DOMAINS for code in domain}
 )
 
 
@@ -205,7 +203,7 @@ class Remark(str):
 
     Parameters
     ----------
-    code : Code or str
+    code : Code
         Its code; `compensator explain` explains it.
     figures : str
         What was noticed here; what to do is appended.
@@ -222,11 +220,10 @@ class Remark(str):
     __slots__ = ("code",)
     code: Code
 
-    def __new__(cls, code: Code | str, figures: str) -> Remark:
-        """Put the sentences together."""
-        known = code if isinstance(code, Code) else _CODES[code]
-        remark = super().__new__(cls, f"{figures} {known.action}")
-        remark.code = known
+    def __new__(cls, code: Code, figures: str) -> Remark:
+        """Append what to do to what was noticed."""
+        remark = super().__new__(cls, f"{figures} {code.action}")
+        remark.code = code
         return remark
 
     def __reduce__(self) -> tuple[Callable[[Code, str], Remark], tuple[Code, str]]:

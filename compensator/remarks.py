@@ -140,7 +140,7 @@ class ServiceWarning(Code):
     )
     OPEN_LISTEN = (
         "open_listen",
-        "Anybody who reaches an endpoint of zenoh.listen can publish offsets and send commands in any name.",
+        "Whoever reaches an endpoint of zenoh.listen can publish offsets and send commands in any name.",
         "Listen on loopback only; for others use a router with TLS and an access list (deploy/zenoh).",
     )
     UNSECURED_CONNECT = (
@@ -155,7 +155,7 @@ class ServiceWarning(Code):
     )
     NO_ACCESS_LIST = (
         "no_access_list",
-        "The router has no access list: anybody who connects may publish and command everything.",
+        "The router has no access list: whoever connects may publish and command everything.",
         "Add the access list of deploy/zenoh/access_list.py to its configuration.",
     )
     CERTIFICATE_ENDS = (
@@ -277,7 +277,7 @@ class WatchWarning(Code):
     )
     OLD_MESSAGES = (
         "old_messages",
-        "Messages arrive with an old time: one of the two clocks is wrong, or somebody replays them.",
+        "Messages arrive with an old time: one of the two clocks is wrong, or they are replayed.",
         "Check the time service (NTP) of both computers, then who publishes below the prefix.",
     )
     MALFORMED_MESSAGES = (
@@ -293,7 +293,7 @@ class WatchWarning(Code):
     REPEATED_NUMBERS = (
         "repeated_numbers",
         "Messages arrived with a number that was used before.",
-        "Find out whether somebody replays messages, or a second service publishes below the prefix.",
+        "Find out whether messages are replayed, or a second service publishes below the prefix.",
     )
 
 
@@ -353,7 +353,7 @@ class RecordingEnd(Code):
     FINISHED = "finished", "The recording is complete: sealed, with checksums and index.", "Nothing."
     RECOVERED = (
         "recovered",
-        "The service was killed; the next start kept every whole record and sealed the file.",
+        "The service was killed; the next start kept every complete record and sealed the file.",
         "Nothing; find out why the machine or the service stopped.",
     )
     OPEN = (

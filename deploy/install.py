@@ -62,7 +62,7 @@ class Installation:
     prefix : str
         Folder of the versions, as a path on the machine.
     destdir : str
-        Folder that stands for `/`; with it nothing of the running system is touched.
+        Folder used instead of `/`; with it nothing of the running system is touched.
     """
 
     def __init__(self, prefix: str, destdir: str) -> None:
@@ -444,7 +444,7 @@ def run(command: Sequence[str]) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--prefix", default=PREFIX, help=f"folder of the program (default {PREFIX})")
-    parser.add_argument("--destdir", default="", help="folder that stands for /; the running system is not touched")
+    parser.add_argument("--destdir", default="", help="folder used instead of /; the running system is not touched")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     one = commands.add_parser("install", help="install or upgrade")
     one.set_defaults(command=install)

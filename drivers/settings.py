@@ -27,7 +27,7 @@ class Where:
     source : str
         Name of the file that holds the tables.
     table : str
-        The table in words, as in `devices[1] "spindle-couples"`.
+        The table in words, as in `devices[1] "spindle-thermocouples"`.
     """
 
     source: str

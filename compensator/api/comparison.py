@@ -165,11 +165,11 @@ def compare(
             residuals = {name: run["residual_um"] for name, run in runs.items()}
             y = next(iter(runs.values()))["y_um"]
             known = np.all([np.isfinite(values) for values in (y, *residuals.values())], axis=0)
-            compared = known & (record.t_s >= from_h * 3600.0)
-            residuals |= {NOTHING: y, PERSISTENCE: y - _last_before(y, known, compared)}
-            parts["y"].append(np.where(compared, y, np.nan))
+            scored = known & (record.t_s >= from_h * 3600.0)
+            residuals |= {NOTHING: y, PERSISTENCE: y - _last_before(y, known, scored)}
+            parts["y"].append(np.where(scored, y, np.nan))
             for name, values in residuals.items():
-                parts[name].append(np.where(compared, values, np.nan))
+                parts[name].append(np.where(scored, values, np.nan))
             times.append(record.t_s / 3600.0 + begin_h)
         begin_h += one.hours
     joined = {name: np.concatenate(values) for name, values in parts.items()}
@@ -185,8 +185,8 @@ def compare(
     )
 
 
-def _last_before(y: Vector, known: Mask, compared: Mask) -> float:
-    """Return the last value measured before the samples compared, the first of all where there is none."""
-    before = y[known & (np.arange(y.size) < (int(np.argmax(compared)) if compared.any() else y.size))]
+def _last_before(y: Vector, known: Mask, scored: Mask) -> float:
+    """Return the last value measured before the samples scored, the first of all where there is none."""
+    before = y[known & (np.arange(y.size) < (int(np.argmax(scored)) if scored.any() else y.size))]
     first = y[known][:1]
     return float(before[-1] if before.size else first[0] if first.size else np.nan)

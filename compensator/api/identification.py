@@ -52,7 +52,7 @@ def identify(
     data : path, DataFrame, mapping of str to array_like, Measurement, or list of those
         Runs that the model is fitted to; see `compensator.read`.
     validate, etve : as `data`, optional
-        Runs that only judge the model; a test without heat source (methods II and III).
+        Runs that only validate the model; a test without heat source (methods II and III).
     columns : mapping of str to str, optional
         Column name for each role that has another name.
     name : str
@@ -153,7 +153,7 @@ def _gain_and_time(tdtf: Sequence[float]) -> tuple[float, float]:
 
 
 def _check_validation(sources: Mapping[str, Sequence[Measurement]]) -> None:
-    """Refuse to judge a model by what it was made of, wherever that was copied to."""
+    """Refuse to validate a model on the data it was fitted to, wherever that was copied to."""
     fitted = {origin.sha256 for role in ("fit", "etve") for measured in sources[role] for origin in measured.origins}
     for measured in sources["validation"]:
         for origin in measured.origins:

@@ -13,7 +13,7 @@ import numpy as np
 
 from compensator.api.files import ModelLike, model_of
 from compensator.arrays import Vector
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.blas import one_thread
 from compensator.data.measurement import measurements
 from compensator.data.record import Record, require
@@ -22,7 +22,7 @@ from compensator.display import html_table
 from compensator.model.simulation import COLUMNS, Scores, csv_rows, scores
 from compensator.model.simulation import simulate as run_free
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Remark
+from compensator.reasons import Reason, Remark, SampleQuality
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -81,7 +81,7 @@ class SimulationResult(Mapping[str, Vector]):
         OSError
             If it cannot be written there.
         """
-        with whole_file(Path(path)) as file:
+        with atomic_write(Path(path)) as file:
             csv.writer(file, lineterminator="\n").writerows(csv_rows(self.columns))
         return Path(path)
 
@@ -188,10 +188,10 @@ def doubts(source: str, model: ThermalModel, record: Record) -> list[Remark]:
         known = values[~np.isnan(values)]
         check_scale(source, name, values)
         if name == "t_q_degc" and known.size >= DEAD_SAMPLES and np.ptp(known) == 0.0:
-            found.append(Remark("stuck", f"{source}: {name} = {known[0]:g} in every row."))
+            found.append(Remark(SampleQuality.STUCK, f"{source}: {name} = {known[0]:g} in every row."))
         low, high = model.validity.get(name, (-np.inf, np.inf))
         outside = int(np.sum((known < low) | (known > high)))
         if outside:
             words = f"{source}: {name} lies outside {low:g} to {high:g} °C in {outside} of {known.size} samples."
-            found.append(Remark("outside_validity", words))
+            found.append(Remark(Reason.OUTSIDE_VALIDITY, words))
     return found

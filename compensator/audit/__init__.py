@@ -1,1 +1,1 @@
-"""Proves a recording: whole, unchanged, and what the engine makes of its raw samples again, to the bit."""
+"""Audits recordings: complete, unchanged, and reproduced to the bit by the engine from the raw samples."""

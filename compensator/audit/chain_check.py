@@ -20,6 +20,7 @@ from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Contents, Flaw
 from compensator.recording.reading import Record
 from compensator.recording.signature import Verifier
+from compensator.remarks import RecordingEnd
 
 _sha256 = hashlib.sha256
 _DECODER = msgspec.json.Decoder(Chain)
@@ -27,7 +28,7 @@ _UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, ValueError)
 
 
 class _Prefixes(dict[str, bytes]):
-    """What stands before the body of a record of each topic; an unknown one comes from a channel that was altered."""
+    """What precedes the body of a record of each topic; an unknown one comes from a channel that was altered."""
 
     def __missing__(self, topic: str) -> bytes:
         self[topic] = topic.encode() + b"\0"
@@ -55,7 +56,7 @@ class ChainCheck:
         #: Value at the last record, and before a seal of a torn end that was finished afterwards.
         self.head = b""
         self._before_last = b""
-        #: Value that the chain of this file claims to go on from.
+        #: Value that the chain of this file claims to continue from.
         self.previous = chain.NOTHING
         self._next = 0
         self._run = contents.metadata.get("run", {})
@@ -71,7 +72,7 @@ class ChainCheck:
         records : list of Record
             The records, in the order of the file.
         message : Record
-            The message behind them.
+            The message after them.
         """
         _, sequence, time_ns, body = message
         if not self.head:
@@ -105,7 +106,7 @@ class ChainCheck:
         self._explain(records, value, message)
 
     def add_rest(self, records: list[Record]) -> None:
-        """Count the records behind the last `/chain` message: the file ends within a group."""
+        """Count the records after the last `/chain` message: the file ends within a group."""
         result = self._result
         for record in records:
             self.head = chain.link(self.head, record.topic, record.body)
@@ -123,7 +124,7 @@ class ChainCheck:
         for name, flaw in self._contents.flaws:
             result.find(Fault.PART_CRC if flaw is Flaw.WRONG_CRC else Fault.PART_LATE, topic=name, what=flaw.value)
         result.previous = self.previous.hex()
-        result.last = (self._before_last if result.seal == "recovered" else self.head).hex()
+        result.last = (self._before_last if result.seal == RecordingEnd.RECOVERED else self.head).hex()
 
     # ------------------------------------------------------------------ opening
 
@@ -175,7 +176,7 @@ class ChainCheck:
     # ------------------------------------------------------------------ what happened
 
     def _explain(self, records: list[Record], computed: bytes, message: Record) -> None:
-        """Name what makes a group differ from its `/chain` message, and go on behind it."""
+        """Name what makes a group differ from its `/chain` message, and continue after it."""
         result, sequence = self._result, message.sequence
         try:
             stated = _DECODER.decode(message.data)
@@ -196,7 +197,7 @@ class ChainCheck:
             self.head, self._next = (values[-1] if values else before), sequence + 1
 
     def _clear_suspect(self, before: bytes) -> bool:
-        """Tell whether the last record of the group before is intact and its value in the chain was altered."""
+        """Return whether the last record of the group before is intact and its value in the chain was altered."""
         suspect, self._suspect = self._suspect, None
         findings = self._result.findings
         if suspect is None or suspect[1] != before or suspect[0] >= len(findings):
@@ -208,7 +209,7 @@ class ChainCheck:
         return True
 
     def _place(self, records: list[Record], first: int, message: Record) -> bool:
-        """Tell whether whole groups are missing before this one, or whether it stands in the wrong place."""
+        """Return whether whole groups are missing before this one, or whether it is in the wrong place."""
         sequence, time_ns = message.sequence, message.log_time_ns
         present = {record.sequence for record in records}
         if first > self._next and not present & set(range(self._next, first)):
@@ -253,7 +254,7 @@ class ChainCheck:
             seen.add(record.sequence)
 
     def _find_missing(self, records: list[Record], listed: list[ChainLink], message: Record) -> None:
-        """Name records that are listed and missing, or stand in another order."""
+        """Name records that are listed and missing, or are in another order."""
         present = [record.sequence for record in records]
         for entry in listed:
             if entry.sequence not in present:

@@ -17,6 +17,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Remark
 from compensator.recording.container import Container, Contents
 from compensator.recording.reading import in_order
+from compensator.remarks import AuditRemark
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import FreeRun, Step, setup_of, steps_in
@@ -66,7 +67,7 @@ class Comparison:
     remarks: list[Remark]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
+        """Return it as in the result of `--json`."""
         return {
             "recorded_model": self.recorded,
             "other_model": self.other,
@@ -122,9 +123,9 @@ def compare(
     progress : callable, optional
         Called with the number of bytes worked off, and of all.
     row : callable, optional
-        Takes the rows of the table of both offsets, see `COLUMNS`.
+        Called with the rows of the table of both offsets, see `COLUMNS`.
     point : callable, optional
-        Takes time (ns), and measured deformation and offset with the recorded and with the other model, µm.
+        Called with time (ns), and measured deformation and offset with the recorded and with the other model, µm.
 
     Raises
     ------
@@ -132,7 +133,7 @@ def compare(
         If one of them is no recording, they belong to several machines, or the model needs a channel that is not there.
     """
     ordered = in_order(paths)
-    whole = sum(path.stat().st_size for path in ordered)
+    total = sum(path.stat().st_size for path in ordered)
     run = _Run(model, row, point)
     done = 0
     for path in ordered:
@@ -140,7 +141,7 @@ def compare(
             for count, step in enumerate(steps_in(container)):
                 run.add(step, container.contents)
                 if progress is not None and count % 1000 == 0:
-                    progress(done + container.position, whole)
+                    progress(done + container.position, total)
         done += path.stat().st_size
     return run.result(ordered)
 
@@ -199,7 +200,7 @@ class _Run:
             f"{step.file}: begins on a running machine, of which the other model knows no more than the zero; "
             f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
         )
-        self._result.remarks.append(Remark("begins_running", figures))
+        self._result.remarks.append(Remark(AuditRemark.BEGINS_RUNNING, figures))
 
     def _compare(self, estimate: EstimateMessage, offset: Offset, outcome: Outcome) -> None:
         result, sample = self._result, outcome.sample

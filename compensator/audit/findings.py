@@ -1,62 +1,16 @@
-"""What an audit can find: codes, their words, and findings as text and as JSON."""
+"""What an audit can find: every fault with its code and sentence; findings as text and as JSON."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from enum import Enum, StrEnum
+from enum import Enum
 from typing import Any
 
-from compensator.reasons import explain
+from compensator.remarks import AuditFinding
 
-#: So many findings of one file are kept; the others are counted.
+#: Number of findings of one file that are kept; the others are counted.
 KEPT = 50
-
-
-class _Explained(StrEnum):
-    @property
-    def words(self) -> tuple[str, str]:
-        """What it means and what to do, from the table of words."""
-        return explain(self) or ("", "")
-
-
-class Kind(_Explained):
-    """Kinds of findings; `compensator explain` has their words."""
-
-    ALTERED = "altered"
-    REMOVED = "removed"
-    INSERTED = "inserted"
-    REORDERED = "reordered"
-    #: The end is missing, and not because the service was killed.
-    TRUNCATED = "truncated"
-    #: Values of the chain that do not belong together.
-    BROKEN = "broken"
-    #: Not MCAP from some byte on.
-    DAMAGED = "damaged"
-    MISSING_FILE = "missing_file"
-    UNSIGNED = "unsigned"
-    FALSE_SIGNATURE = "false_signature"
-    #: The state that a file opens with is not that in which the one before ended.
-    STATE = "state"
-    #: Intact, but not what its schema says.
-    UNREADABLE = "unreadable"
-    #: The index leads not to all that is in the file, or elsewhere.
-    INDEX = "index"
-
-
-class End(_Explained):
-    """How a file ends."""
-
-    FINISHED = "finished"
-    #: Torn, and finished at the next start.
-    RECOVERED = "recovered"
-    #: Without its end, all groups whole: still being written, the service was killed, or the end was cut off.
-    OPEN = "open"
-    #: The same within a group.
-    TORN = "torn"
-    #: A finished file without its end.
-    TRUNCATED = "truncated"
-    DAMAGED = "damaged"
 
 
 class Fault(Enum):
@@ -64,62 +18,62 @@ class Fault(Enum):
 
     # The chain of one file.
     NO_CHAIN = (
-        Kind.REMOVED,
+        AuditFinding.REMOVED,
         "the recorder writes it, but it is missing: nothing shows that the file is as it was written",
     )
-    OPENING_UNREADABLE = Kind.ALTERED, "the first message of the chain cannot be read"
-    OPENING_MISSING = Kind.REMOVED, "the first message of the chain is missing"
-    PART_MISSING = Kind.REMOVED, "the recording began with it, but it is missing"
-    PART_ADDED = Kind.INSERTED, "the recording did not begin with it"
-    PART_CHANGED = Kind.ALTERED, "not what the recording began with"
-    PARTS_REORDERED = Kind.REORDERED, "attachments or metadata stand in another order"
-    NO_HASH = Kind.ALTERED, "a hash that is not one"
-    OPENING_CHANGED = Kind.ALTERED, "differs from what follows from the file"
-    OTHER_PREVIOUS = Kind.ALTERED, "names another last value of the previous file than the metadata"
-    PART_LATE = Kind.INSERTED, "{what}"
-    PART_CRC = Kind.ALTERED, "{what}"
-    UNREADABLE_MESSAGE = Kind.ALTERED, "cannot be read"
-    MESSAGE_CHANGED = Kind.ALTERED, "differs from what follows from the records"
-    MESSAGE_MISSING = Kind.REMOVED, "the message of the chain is missing"
-    VALUE_CHANGED = Kind.ALTERED, "its value of {name} is not that of the record"
+    OPENING_UNREADABLE = AuditFinding.ALTERED, "the first message of the chain cannot be read"
+    OPENING_MISSING = AuditFinding.REMOVED, "the first message of the chain is missing"
+    PART_MISSING = AuditFinding.REMOVED, "the recording began with it, but it is missing"
+    PART_ADDED = AuditFinding.INSERTED, "the recording did not begin with it"
+    PART_CHANGED = AuditFinding.ALTERED, "not what the recording began with"
+    PARTS_REORDERED = AuditFinding.REORDERED, "attachments or metadata are in another order"
+    NO_HASH = AuditFinding.ALTERED, "a hash that is not one"
+    OPENING_CHANGED = AuditFinding.ALTERED, "differs from what follows from the file"
+    OTHER_PREVIOUS = AuditFinding.ALTERED, "names another last value of the previous file than the metadata"
+    PART_LATE = AuditFinding.INSERTED, "{what}"
+    PART_CRC = AuditFinding.ALTERED, "{what}"
+    UNREADABLE_MESSAGE = AuditFinding.ALTERED, "cannot be read"
+    MESSAGE_CHANGED = AuditFinding.ALTERED, "differs from what follows from the records"
+    MESSAGE_MISSING = AuditFinding.REMOVED, "the message of the chain is missing"
+    VALUE_CHANGED = AuditFinding.ALTERED, "its value of {name} is not that of the record"
     VALUES_BROKEN = (
-        Kind.BROKEN,
+        AuditFinding.BROKEN,
         "the values before and after this message do not belong together: one side was rewritten",
     )
-    RECORDS_MISSING = Kind.REMOVED, "{numbers} missing before it"
-    RECORDS_MOVED = Kind.REORDERED, "{numbers} standing behind later ones"
-    RECORDS_AGAIN = Kind.INSERTED, "{numbers} standing there again"
-    NOT_LISTED = Kind.INSERTED, "the chain does not list it"
-    LISTED_MISSING = Kind.REMOVED, "the chain lists it, but it is missing"
-    EXCHANGED = Kind.REORDERED, "stands in the place of record {record}"
-    MOVED = Kind.REORDERED, "stands in another place than before"
-    RECORD_CHANGED = Kind.ALTERED, "does not match its value in the chain"
-    BEHIND_CHAIN = Kind.INSERTED, "{count} record(s) behind the last message of the chain"
-    NO_SEAL = Kind.REMOVED, "the file has its end, but not the seal before it"
-    SEAL_CHANGED = Kind.ALTERED, "does not seal the records before it"
-    FALSE_SIGNATURE = Kind.FALSE_SIGNATURE, "not signed by the key given"
+    RECORDS_MISSING = AuditFinding.REMOVED, "{numbers} missing before it"
+    RECORDS_MOVED = AuditFinding.REORDERED, "{numbers} after later ones"
+    RECORDS_AGAIN = AuditFinding.INSERTED, "{numbers} repeated"
+    NOT_LISTED = AuditFinding.INSERTED, "the chain does not list it"
+    LISTED_MISSING = AuditFinding.REMOVED, "the chain lists it, but it is missing"
+    EXCHANGED = AuditFinding.REORDERED, "is in the place of record {record}"
+    MOVED = AuditFinding.REORDERED, "is in another place than before"
+    RECORD_CHANGED = AuditFinding.ALTERED, "does not match its value in the chain"
+    BEHIND_CHAIN = AuditFinding.INSERTED, "{count} record(s) after the last message of the chain"
+    NO_SEAL = AuditFinding.REMOVED, "the file has its end, but not the seal before it"
+    SEAL_CHANGED = AuditFinding.ALTERED, "does not seal the records before it"
+    FALSE_SIGNATURE = AuditFinding.FALSE_SIGNATURE, "not signed by the key given"
     # The file as such.
-    UNREADABLE = Kind.UNREADABLE, "{what}"
-    NOT_REPLAYED = Kind.UNREADABLE, "its samples cannot be replayed: {what}"
-    DAMAGED = Kind.DAMAGED, "byte {offset}: {what}"
+    UNREADABLE = AuditFinding.UNREADABLE, "{what}"
+    NOT_REPLAYED = AuditFinding.UNREADABLE, "its samples cannot be replayed: {what}"
+    DAMAGED = AuditFinding.DAMAGED, "byte {offset}: {what}"
     LENGTH_CHANGED = (
-        Kind.DAMAGED,
-        "byte {offset}: a record whose length leads beyond the end, but what stands there is whole",
+        AuditFinding.DAMAGED,
+        "byte {offset}: a record whose length leads beyond the end, but its content is complete",
     )
-    CUT_OFF = Kind.TRUNCATED, "a finished file that ends at byte {offset}; its end is missing"
-    INDEX = Kind.INDEX, "{what}"
+    CUT_OFF = AuditFinding.TRUNCATED, "a finished file that ends at byte {offset}; its end is missing"
+    INDEX = AuditFinding.INDEX, "{what}"
     # Several files.
-    RENAMED = Kind.REORDERED, "it has the name of another file: it was begun as {original}"
-    END_UNSIGNED = Kind.UNSIGNED, "its end is not signed"
-    NOTHING_SIGNED = Kind.UNSIGNED, "has no hash chain, so nothing is signed"
-    MORE_WAS_THERE = Kind.TRUNCATED, "{next} goes on from records that are missing here: its end was cut off"
-    FILE_MISSING = Kind.MISSING_FILE, "{previous}, from which it goes on, is {lost}; it stood behind {before}"
-    FILES_REORDERED = Kind.REORDERED, "goes on from {previous}, but {before} stands between"
-    FILES_BROKEN = Kind.BROKEN, "does not go on from the last value of {previous}: one of them was rewritten"
-    NUMBERS_AGAIN = Kind.BROKEN, "sample numbers from {seq} on are also in {previous}"
-    OTHER_STATE = Kind.STATE, "opens with another state than {previous} ends with"
+    RENAMED = AuditFinding.REORDERED, "it has the name of another file: it was begun as {original}"
+    END_UNSIGNED = AuditFinding.UNSIGNED, "its end is not signed"
+    NOTHING_SIGNED = AuditFinding.UNSIGNED, "has no hash chain, so nothing is signed"
+    MORE_WAS_THERE = AuditFinding.TRUNCATED, "{next} continues from records that are missing here: its end was cut off"
+    FILE_MISSING = AuditFinding.MISSING_FILE, "{previous}, from which it continues, is {lost}; it followed {before}"
+    FILES_REORDERED = AuditFinding.REORDERED, "continues from {previous}, but {before} is between them"
+    FILES_BROKEN = AuditFinding.BROKEN, "does not continue from the last value of {previous}: one of them was rewritten"
+    NUMBERS_AGAIN = AuditFinding.BROKEN, "sample numbers from {seq} on are also in {previous}"
+    OTHER_STATE = AuditFinding.STATE, "opens with another state than {previous} ends with"
 
-    def __init__(self, kind: Kind, sentence: str) -> None:
+    def __init__(self, kind: AuditFinding, sentence: str) -> None:
         self.kind, self.sentence = kind, sentence
 
 
@@ -129,7 +83,7 @@ class Finding:
 
     Parameters
     ----------
-    kind : Kind
+    kind : AuditFinding
         Its code.
     file : str
         Name of the file.
@@ -143,7 +97,7 @@ class Finding:
         Its time, ns since 1970 UTC.
     """
 
-    kind: Kind
+    kind: AuditFinding
     file: str
     text: str
     topic: str = ""
@@ -163,7 +117,7 @@ class Finding:
         return ": ".join(filter(None, (self.file, self.kind, self.place, self.text)))
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
+        """Return it as in the result of `--json`."""
         return {
             "kind": self.kind,
             "file": self.file,
@@ -214,7 +168,7 @@ class Difference:
         return [head, *rows]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
+        """Return it as in the result of `--json`."""
         fields = [{"field": f.name, "recorded": f.recorded, "recomputed": f.recomputed} for f in self.fields]
         return {
             "file": self.file,

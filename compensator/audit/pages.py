@@ -9,16 +9,17 @@ import numpy as np
 
 from compensator import __version__
 from compensator.audit.comparison import Comparison, worst_utc
-from compensator.audit.findings import Difference, End, Kind, utc
+from compensator.audit.findings import Difference, utc
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit
 from compensator.recording.chain import NOTHING
+from compensator.remarks import AuditFinding, RecordingEnd
 from compensator.report.envelope import Envelope, line_of
 from compensator.report.history import Spread
 from compensator.report.page import (
     Block,
     Cell,
-    Code,
+    CodeLink,
     Details,
     Figure,
     Line,
@@ -32,15 +33,15 @@ from compensator.report.page import (
 )
 
 _TIME = "time, UTC"
-#: So many files and findings stand on the page at once; more are there to open.
+#: Number of files and findings shown at once; more are folded.
 _ROWS = 20
 #: Remarks that are shown; a year of files may have one each.
 _REMARKS = 40
 #: Values that are brought to a curve together.
 _TOGETHER = 5000
-_ENDS_WHOLE = (End.FINISHED, End.RECOVERED)
+_ENDS_WHOLE = (RecordingEnd.FINISHED, RecordingEnd.RECOVERED)
 #: Kinds of findings that are about several files.
-_OF_FILES = (Kind.MISSING_FILE, Kind.BROKEN, Kind.STATE, Kind.REORDERED)
+_OF_FILES = (AuditFinding.MISSING_FILE, AuditFinding.BROKEN, AuditFinding.STATE, AuditFinding.REORDERED)
 
 
 # ---------------------------------------------------------------------------- audit
@@ -74,12 +75,12 @@ def verdict(found: Audit) -> str:
     """Return one sentence: proven or not, and of how much."""
     files = f"{len(found.files)} recording(s)"
     if not found.clean:
-        said = []
+        wrong = []
         if found.findings_count:
-            said.append(f"{found.findings_count} finding(s)")
+            wrong.append(f"{found.findings_count} finding(s)")
         if found.differing:
-            said.append(f"{found.differing} sample(s) that differ in the replay")
-        return f"Not proven: {' and '.join(said)} in {files} with {found.samples} samples."
+            wrong.append(f"{found.differing} sample(s) that differ in the replay")
+        return f"Not proven: {' and '.join(wrong)} in {files} with {found.samples} samples."
     if _partly(found):
         return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
     words = (
@@ -89,7 +90,7 @@ def verdict(found: Audit) -> str:
 
 
 def _partly(found: Audit) -> bool:
-    """Tell whether there was something that could not be checked."""
+    """Return whether there was something that could not be checked."""
     return not found.samples or any(not file.last or file.not_replayed for file in found.files)
 
 
@@ -142,9 +143,11 @@ def _proven(found: Audit) -> Table:
     ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]
     whole = bool(chained) and len(chained) == len(found.files)
     worked_out = bool(found.samples) and not any(file.not_replayed for file in found.files)
-    not_signed = sum(finding.kind in (Kind.UNSIGNED, Kind.FALSE_SIGNATURE) for finding in found.findings)
-    cut = sum(finding.kind == Kind.TRUNCATED for finding in found.findings)
-    index = sum(finding.kind == Kind.INDEX for finding in found.findings)
+    not_signed = sum(
+        finding.kind in (AuditFinding.UNSIGNED, AuditFinding.FALSE_SIGNATURE) for finding in found.findings
+    )
+    cut = sum(finding.kind == AuditFinding.TRUNCATED for finding in found.findings)
+    index = sum(finding.kind == AuditFinding.INDEX for finding in found.findings)
     inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
         [
@@ -175,7 +178,7 @@ def _proven(found: Audit) -> Table:
             else "only a signature can exclude that: --public-key, and [recording] signing_key on the machine",
         ],
         [
-            "Nothing was cut off behind the last record",
+            "Nothing was cut off after the last record",
             no if cut or ends else yes if whole else open_,
             f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end",
         ],
@@ -202,7 +205,7 @@ def _findings(found: Audit) -> Block:
     more = found.findings_count - len(found.findings)
     note = f"And {more} more: of each file the first are named." if more else ""
     head = ["file", "kind", "what", "where"]
-    rows: list[list[Cell]] = [[one.file, Code(one.kind), one.text, one.place] for one in found.findings]
+    rows: list[list[Cell]] = [[one.file, CodeLink(one.kind), one.text, one.place] for one in found.findings]
     return _folded("Findings", head, rows, note)
 
 
@@ -210,7 +213,7 @@ def _files(files: Sequence[RecordingAudit]) -> Block:
     rows: list[list[Cell]] = [
         [
             file.file,
-            Code(file.end),
+            CodeLink(file.end),
             str(file.samples),
             str(file.records),
             str(file.findings_count),
@@ -220,7 +223,7 @@ def _files(files: Sequence[RecordingAudit]) -> Block:
         for file in files
     ]
     head = ["file", "end", "samples", "records", "findings", "differ", "signed"]
-    return _folded("File by file", head, rows, "The values of the hash chain stand below, to open.")
+    return _folded("File by file", head, rows, "The values of the hash chain are below, folded.")
 
 
 def _hashes(found: Audit) -> Details:
@@ -234,7 +237,7 @@ def _hashes(found: Audit) -> Details:
         for file in found.files
     ]
     keys = sorted({key for file in found.files for key in file.keys})
-    blocks: list[Block] = [Table(head=["file", "chain goes on from", "chain ends with", "model, SHA-256"], rows=rows)]
+    blocks: list[Block] = [Table(head=["file", "chain continues from", "chain ends with", "model, SHA-256"], rows=rows)]
     if keys:
         blocks.append(Table(head=["public keys in the seals"], rows=[[key] for key in keys]))
     blocks.append(Words(title="Made by", lines=[f"compensator {__version__} replay"]))

@@ -9,13 +9,14 @@ from pathlib import Path
 import msgspec
 
 from compensator.audit.chain_check import ChainCheck
-from compensator.audit.findings import End, Fault
+from compensator.audit.findings import Fault
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
 from compensator.errors import CompensatorError, DataError
 from compensator.recording.container import Container, Damaged, Torn
 from compensator.recording.reading import Record, groups_of
 from compensator.recording.signature import Verifier
+from compensator.remarks import AuditFinding, RecordingEnd
 
 #: Groups between two calls of `progress`.
 _STEP = 500
@@ -56,7 +57,7 @@ class _Audit:
         self._verifier, self._progress = verifier, progress
         self._chain: ChainCheck | None = None
         self._replay: ReplayCheck | None = None
-        #: Records behind the last whole group.
+        #: Records after the last complete group.
         self._rest: list[Record] = []
         self._position = 0
 
@@ -88,7 +89,7 @@ class _Audit:
     # ------------------------------------------------------------------ reading
 
     def _read(self) -> None:
-        """Check group by group; what stands behind the last whole group stays in `_rest`."""
+        """Check group by group; what follows the last complete group stays in `_rest`."""
         for number, (records, message, whole) in enumerate(groups_of(self._container)):
             if not whole:
                 self._rest = records
@@ -157,27 +158,27 @@ class _Audit:
         if self._replay is None and self._contents.messages:
             result.find(Fault.NOT_REPLAYED, what=self._without_name(result.not_replayed))
         if error is None:
-            result.end = End.RECOVERED if result.seal == "recovered" else End.FINISHED
+            result.end = RecordingEnd.RECOVERED if result.seal == RecordingEnd.RECOVERED else RecordingEnd.FINISHED
             if chain.head and rest:
                 result.find(Fault.BEHIND_CHAIN, rest[0], count=len(rest))
             elif chain.head and not result.seal:
                 result.find(Fault.NO_SEAL, topic="seal")
         elif not isinstance(error, Torn):
-            result.end = End.DAMAGED
+            result.end = AuditFinding.DAMAGED
             result.find(Fault.DAMAGED, offset=error.offset, what=error.text)
         elif self._was_compact(error):
-            result.end = End.TRUNCATED
+            result.end = AuditFinding.TRUNCATED
             result.find(Fault.CUT_OFF, offset=error.offset)
         elif _covers_others(error.rest):
-            result.end = End.DAMAGED
+            result.end = AuditFinding.DAMAGED
             result.find(Fault.LENGTH_CHANGED, offset=error.offset)
         elif result.seal:
-            result.end = End.FINISHED
+            result.end = RecordingEnd.FINISHED
         else:
-            result.end = End.TORN if rest or error.rest or error.offset < result.size else End.OPEN
+            result.end = RecordingEnd.TORN if rest or error.rest or error.offset < result.size else RecordingEnd.OPEN
 
     def _was_compact(self, torn: Torn) -> bool:
-        """Tell whether the file had been finished: only then metadata and attachments stand before the channels."""
+        """Return whether the file had been finished: only then metadata and attachments come before the channels."""
         contents = self._contents
         if contents.channels:
             return contents.chunked
@@ -186,7 +187,7 @@ class _Audit:
 
 
 def _covers_others(rest: bytes) -> bool:
-    """Tell a length that was changed from a torn end: there, the one message behind it is not whole."""
+    """Distinguish a changed length from a torn end: there, the one message after it is not complete."""
     if rest.count(b'{"schema":') > 1 or len(rest) >= 2**20:
         return True
     try:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from compensator.audit.findings import KEPT, Difference, End, Fault, Finding, Kind
+from compensator.audit.findings import KEPT, Difference, Fault, Finding
 from compensator.recording.reading import Record
+from compensator.remarks import AuditFinding, RecordingEnd
 
 
 @dataclass(slots=True, kw_only=True)
@@ -22,15 +23,15 @@ class RecordingAudit:
     original, machine, began, previous_file : str
         From its metadata: the name that it was begun with, the machine, why it began, the previous file.
     previous, last : str
-        Value of the hash chain that it goes on from, and the one it hands on; empty where it has no chain.
-    end : End
-        How it ends.
+        Value of the hash chain that it continues from, and its last one; empty where it has no chain.
+    end : RecordingEnd or AuditFinding
+        How it ends: with or without an end of its own, or as what cut it off or damaged it.
     findings, findings_count : list of Finding, int
         What is wrong with the file, the first of it, and how much there is.
     records : int
         Records in the chain.
     signed, unsigned_behind : int
-        Signed seals, and records behind the last of them.
+        Signed seals, and records after the last of them.
     keys : set of str
         Public keys in the seals.
     seal, sealed_signed : str, bool
@@ -63,7 +64,7 @@ class RecordingAudit:
     previous_file: str = ""
     previous: str = ""
     last: str = ""
-    end: End = End.FINISHED
+    end: RecordingEnd | AuditFinding = RecordingEnd.FINISHED
     findings: list[Finding] = field(default_factory=list)
     findings_count: int = 0
     records: int = 0
@@ -134,13 +135,13 @@ class RecordingAudit:
 
     def pair_moved(self) -> None:
         """Turn a record that is missing in one place and too many in another into one that was moved."""
-        missing = {(f.topic, f.sequence) for f in self.findings if f.kind == Kind.REMOVED and f.topic}
+        missing = {(f.topic, f.sequence) for f in self.findings if f.kind == AuditFinding.REMOVED and f.topic}
         moved = set()
         for i, finding in enumerate(self.findings):
             place = (finding.topic, finding.sequence)
-            if finding.kind == Kind.INSERTED and place in missing:
+            if finding.kind == AuditFinding.INSERTED and place in missing:
                 self.findings[i] = replace(finding, kind=Fault.MOVED.kind, text=Fault.MOVED.sentence)
                 moved.add(place)
-        kept = [f for f in self.findings if f.kind != Kind.REMOVED or (f.topic, f.sequence) not in moved]
+        kept = [f for f in self.findings if f.kind != AuditFinding.REMOVED or (f.topic, f.sequence) not in moved]
         self.findings_count -= len(self.findings) - len(kept)
         self.findings = kept

@@ -1,4 +1,4 @@
-"""Audits the recordings of a machine together: none is missing or exchanged, each goes on where the last one ended."""
+"""Audits the recordings of a machine together: none is missing or exchanged, each continues the one before."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from compensator.audit.findings import Difference, End, Fault, Finding, utc
+from compensator.audit.findings import Difference, Fault, Finding, utc
 from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
 from compensator.reasons import Remark
 from compensator.recording.chain import NOTHING
 from compensator.recording.signature import Verifier
+from compensator.remarks import AuditFinding, AuditRemark, RecordingEnd
 
 _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
 
@@ -62,7 +63,7 @@ class Audit:
         return not self.findings_count and not self.differing
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as it stands in the result of `--json`."""
+        """Return it as in the result of `--json`."""
         files = [
             {
                 "file": f.file,
@@ -125,14 +126,14 @@ def audit(
     verifier = Verifier(public_key) if public_key else None
     paths = list(dict.fromkeys(paths))
     sizes = {path: path.stat().st_size if path.exists() else 0 for path in paths}
-    whole = sum(sizes.values())
+    total = sum(sizes.values())
     done = 0
 
     def add(size: int) -> None:
         nonlocal done
         done += size
         if progress is not None:
-            progress(done, whole)
+            progress(done, total)
 
     if executor is not None:
         audits = _side_by_side(executor, paths, public_key, lambda path: add(sizes[path]))
@@ -197,7 +198,7 @@ class _Series:
         self._removed = {name for file in files for name in file.removed}
         self._newest = {file.machine: file.file for file in files}
         self._signed = signed
-        #: Findings of whole files; they stand before those within a file.
+        #: Findings of whole files; they come before those within a file.
         self.own = {file.file: RecordingAudit(file=file.file) for file in files}
         self.remarks: list[Remark] = []
 
@@ -210,40 +211,46 @@ class _Series:
         if file.original != name and _NAME.match(name):
             self._find(Fault.RENAMED, file, original=file.original)
         if file.not_replayed:
-            remark(Remark("not_worked_out", f"{name}: not all samples were replayed: {file.not_replayed}."))
-        if not file.last and file.end in (End.OPEN, End.TORN):
-            remark(Remark("torn", f"{name}: torn before anything was recorded."))
+            remark(Remark(AuditRemark.NOT_WORKED_OUT, f"{name}: not all samples were replayed: {file.not_replayed}."))
+        if not file.last and file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
+            remark(Remark(RecordingEnd.TORN, f"{name}: torn before anything was recorded."))
             return
-        if file.end == End.RECOVERED:
-            remark(Remark("recovered", f"{name}: the service was killed; every whole record was kept."))
-        elif file.end in (End.OPEN, End.TORN):
+        if file.end == RecordingEnd.RECOVERED:
+            remark(Remark(RecordingEnd.RECOVERED, f"{name}: the service was killed; every complete record was kept."))
+        elif file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
             figures = f"{name}: has no end, still being written, or the service was killed"
             if self._newest[file.machine] == name:
                 figures += "; whether more was there shows the next file, which names the last value of this one"
-            if file.end == End.TORN:
-                remark(Remark("torn", f"{figures}. It ends within a group of records."))
+            if file.end == RecordingEnd.TORN:
+                remark(Remark(RecordingEnd.TORN, f"{figures}. It ends within a group of records."))
             else:
-                remark(Remark("open", f"{figures}. It ends behind a whole group of records."))
+                remark(Remark(RecordingEnd.OPEN, f"{figures}. It ends after a complete group of records."))
         if file.skipped:
-            remark(Remark("samples_missing", f"{name}: {file.skipped} sample(s) between others were not recorded."))
+            remark(
+                Remark(
+                    AuditRemark.SAMPLES_MISSING, f"{name}: {file.skipped} sample(s) between others were not recorded."
+                )
+            )
         if file.early:
             figures = f"{file.early} offset(s) were published before they were on disk, which was slow or failed"
-            remark(Remark("published_early", f"{name}: {figures}."))
+            remark(Remark(AuditRemark.PUBLISHED_EARLY, f"{name}: {figures}."))
         self._check_signatures(file)
 
     def _check_signatures(self, file: RecordingAudit) -> None:
         name, remark = file.file, self.remarks.append
         if self._signed:
-            if file.end in (End.FINISHED, End.RECOVERED) and file.last and not file.sealed_signed:
+            if file.end in (RecordingEnd.FINISHED, RecordingEnd.RECOVERED) and file.last and not file.sealed_signed:
                 self._find(Fault.END_UNSIGNED, file)
             elif not file.last:
                 self._find(Fault.NOTHING_SIGNED, file)
             elif file.unsigned_behind:
-                figures = f"{name}: {file.unsigned_behind} record(s) behind the last signature."
-                remark(Remark("unsigned_behind", figures))
+                figures = f"{name}: {file.unsigned_behind} record(s) after the last signature."
+                remark(Remark(AuditRemark.UNSIGNED_BEHIND, figures))
         elif file.signed:
             keys = ", ".join(key[:16] for key in sorted(file.keys))
-            remark(Remark("signature_not_checked", f"{name}: signed by {keys}…, not checked (no --public-key)."))
+            remark(
+                Remark(AuditRemark.SIGNATURE_NOT_CHECKED, f"{name}: signed by {keys}…, not checked (no --public-key).")
+            )
 
     def check_link(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
         """Check what links a file to the one before it."""
@@ -252,14 +259,14 @@ class _Series:
         if before is None:
             self._check_first(after)
         elif not before.last:
-            began = before.end in (End.OPEN, End.TORN) and after.previous_file == before.file
+            began = before.end in (RecordingEnd.OPEN, RecordingEnd.TORN) and after.previous_file == before.file
             if began and after.previous != NOTHING.hex():
                 self._find(Fault.MORE_WAS_THERE, before, next=after.file)
         elif after.previous == before.last:
             self._check_state(before, after)
         elif not after.previous_file:
             figures = f"{after.file}: begins a new chain; it states that no recording was there before it."
-            self.remarks.append(Remark("begins_new_chain", figures))
+            self.remarks.append(Remark(AuditRemark.BEGINS_NEW_CHAIN, figures))
         else:
             self._explain_break(before, after)
 
@@ -270,16 +277,18 @@ class _Series:
             self._find(Fault.FILE_MISSING, after, previous=after.previous_file, lost=lost, before=before.file)
         elif named.original != before.original:
             self._find(Fault.FILES_REORDERED, after, previous=named.file, before=before.file)
-        elif before.end in (End.OPEN, End.TORN, End.TRUNCATED):
+        elif before.end in (RecordingEnd.OPEN, RecordingEnd.TORN, AuditFinding.TRUNCATED):
             self._find(Fault.MORE_WAS_THERE, before, next=after.file)
-        elif before.end != End.DAMAGED:
+        elif before.end != AuditFinding.DAMAGED:
             self._find(Fault.FILES_BROKEN, after, previous=before.file)
 
     def _check_first(self, file: RecordingAudit) -> None:
         if file.previous != NOTHING.hex() or file.previous_file:
             removed = file.previous_file in self._removed
             lost = "which the limit of what is kept removed" if removed else "not given here"
-            self.remarks.append(Remark("before_not_given", f"{file.file}: begins after {file.previous_file}, {lost}."))
+            self.remarks.append(
+                Remark(AuditRemark.BEFORE_NOT_GIVEN, f"{file.file}: begins after {file.previous_file}, {lost}.")
+            )
 
     def _check_state(self, before: RecordingAudit, after: RecordingAudit) -> None:
         """Check that in one run a file opens with the state in which the one before ended."""

@@ -19,6 +19,7 @@ from compensator.errors import ConfigError
 from compensator.reasons import Remark
 from compensator.receiver import Applied, Receiver
 from compensator.receiver.subscriber import monotonic_s
+from compensator.remarks import BridgeTrouble
 
 log = logging.getLogger("compensator")
 
@@ -81,7 +82,7 @@ class Bridge:
                     await self._serve(client, stop)
             except _GONE as error:
                 figures = f"{self._settings.endpoint}: {type(error).__name__} {error}".rstrip(". ")
-                self.register.lost(Remark("plc_not_reached", f"{figures}.").marked)
+                self.register.lost(Remark(BridgeTrouble.PLC_NOT_REACHED, f"{figures}.").marked)
             await self._wait_disconnected(stop)
 
     async def _client(self) -> Client:

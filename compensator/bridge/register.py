@@ -11,6 +11,7 @@ import struct
 
 from compensator.reasons import Remark
 from compensator.receiver import Follower
+from compensator.remarks import BridgeTrouble
 
 
 class Register:
@@ -80,7 +81,7 @@ class Register:
             self._found = (value, now_s)
         found_um, left_um = value / self._per_um, self._written / self._per_um
         figures = f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: it has another writer."
-        self.trouble = Remark("plc_written_over", figures).marked
+        self.trouble = Remark(BridgeTrouble.PLC_WRITTEN_OVER, figures).marked
         if now_s - self._found[1] < self._resume_after_s:
             return False
         return self._continue_from(value)
@@ -93,7 +94,7 @@ class Register:
         largest = self._follower.limits.offset_max_um
         if not (math.isfinite(offset_um) and abs(offset_um) <= largest):
             figures = f"the PLC holds {offset_um:g} µm, beyond {largest:g} µm; nothing is written."
-            self.trouble = Remark("plc_beyond_limit", figures).marked
+            self.trouble = Remark(BridgeTrouble.PLC_BEYOND_LIMIT, figures).marked
             return False
         self._follower.rebase(offset_um)
         self._known, self._written, self._found = True, value, None

@@ -9,6 +9,7 @@ from typing import Any
 from compensator.clock import SystemClock
 from compensator.commands import Answer
 from compensator.errors import ServiceError
+from compensator.events import CommandName
 from compensator.model.model_file import read_model_bytes
 from compensator.service.adoption import check_model
 from compensator.service.command_client import NotReached, ask, operator_of_file
@@ -29,7 +30,7 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     data = read_model_bytes(arguments.model)
     model = check_model(setup.config, data, source=arguments.model)
     wanted = {"sha256": model.sha256, "model": data.decode(), "force": arguments.force}
-    reply = _ask("adopt", wanted, setup, arguments)
+    reply = _ask(CommandName.ADOPT, wanted, setup, arguments)
     if reply is None:
         if model.sha256 == setup.model.sha256:
             raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is the service's model already")
@@ -46,7 +47,7 @@ def back(arguments: argparse.Namespace) -> Answer:
         If the configured model is in use, or the service refuses.
     """
     setup = load(arguments.config)
-    reply = _ask("back", {"force": arguments.force}, setup, arguments)
+    reply = _ask(CommandName.BACK, {"force": arguments.force}, setup, arguments)
     if reply is not None:
         return _answered(reply, "", "")
     before = setup.store.before()

@@ -1,4 +1,4 @@
-"""Arguments of the commands, in a module of their own so that asking for help loads no numerics."""
+"""Arguments of the commands, in a module of their own so that `--help` loads no numerics."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace) -> Answer | None:
     Raises
     ------
     ConfigError
-        If the file cannot be used, or says no sign that was found on the machine.
+        If the file cannot be used, or gives no sign that was determined on the machine.
     UsageError
         If asyncua is not installed.
     """
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> Answer | None:
         asyncio.run(_serve(settings, opcua))
     except ReceiverError as error:
         raise ConfigError(f"{arguments.config}: {error}") from error
-    log.info("compensator bridge: stopped; what the PLC holds stands")
+    log.info("compensator bridge: stopped; the PLC keeps its value")
     return None
 
 
@@ -48,7 +48,7 @@ async def _serve(settings: Settings, opcua: OpcUa) -> None:
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    # asyncua tells every lost connection with a traceback; the bridge says it in one line.
+    # asyncua logs a traceback for every lost connection; the bridge logs one line.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
     with Receiver(settings, step_max_s=2.0 * opcua.cycle_s) as receiver:
         await Bridge(opcua, receiver).run(stop)

@@ -16,7 +16,7 @@ from compensator.data.measurement import measurements
 from compensator.data.table import roles_of
 from compensator.diagnose.outcome import FOLDS
 
-#: So few values are searched in this process; starting others takes as long.
+#: Values up to which a search runs in this process; starting others takes as long.
 ALONE = 30_000
 
 

@@ -11,22 +11,23 @@ import msgspec
 from compensator.commands import Answer
 from compensator.config import Zenoh, load_config
 from compensator.errors import ServiceError, UsageError
+from compensator.events import CommandName
 from compensator.service.command_client import ask, operator_of_file
 
 
 def zero(arguments: argparse.Namespace) -> Answer:
     """Run the command; see `_order`."""
-    return _order("zero", {"mode": arguments.mode}, arguments)
+    return _order(CommandName.ZERO, {"mode": arguments.mode}, arguments)
 
 
 def hold(arguments: argparse.Namespace) -> Answer:
     """Run the command; see `_order`."""
-    return _order("hold", {}, arguments)
+    return _order(CommandName.HOLD, {}, arguments)
 
 
 def resume(arguments: argparse.Namespace) -> Answer:
     """Run the command; see `_order`."""
-    return _order("resume", {}, arguments)
+    return _order(CommandName.RESUME, {}, arguments)
 
 
 def _order(name: str, payload: dict[str, Any], arguments: argparse.Namespace) -> Answer:

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
 from compensator.commands import Answer
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 #: Exit code where an audit found a difference.
 FOUND = 3
-#: Less than so many bytes are audited in this process; starting others takes as long.
+#: Bytes up to which an audit runs in this process; starting others takes as long.
 ALONE = 8_000_000
 
 
@@ -70,7 +70,7 @@ def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) 
         from compensator.audit.pages import Curves
 
         curves = Curves()
-    with progress_bar("comparing") as progress, whole_file(out) if out else nullcontext() as file:
+    with progress_bar("comparing") as progress, atomic_write(out) if out else nullcontext() as file:
         row = None
         if file is not None:
             row = csv.writer(file, lineterminator="\n").writerow
@@ -93,7 +93,7 @@ def _with_page(answer: Answer, path: Path, page: Page) -> Answer:
 
 
 def _files(given: list[Path]) -> list[Path]:
-    """Return the recordings given; a folder stands for those in it."""
+    """Return the recordings given; a folder means all in it."""
     paths: list[Path] = []
     for path in given:
         if path.is_dir():

@@ -86,7 +86,7 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
     if not enabled:
         if access.get("rules") or access.get("policies"):
             raise ConfigError(f"{path}: access_control/enabled: expected true with rules; without it none applies")
-        figures = "No access list: anybody who connects may publish and command everything."
+        figures = "No access list: whoever connects may publish and command everything."
         log.warning("%s: warning: %s", path, Remark(ServiceWarning.NO_ACCESS_LIST, figures).marked)
         return
     if access.get("default_permission") != "deny":

@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from compensator.events import EventKind
 from compensator.messages import Event, Offset
 from compensator.reasons import State
 from compensator.service import systemd
@@ -60,7 +61,7 @@ class Reporter:
 
     def _log(self, event: Event) -> None:
         fields: dict[str, Any] = {"MACHINE": event.machine, "SEQ": event.seq, "KIND": event.kind}
-        if event.kind == "state":
+        if event.kind == EventKind.STATE:
             self._state = event.data["state"]
             fields["REASONS"] = " ".join(event.data["reasons"])
         fields["STATE"] = self._state
@@ -79,9 +80,9 @@ def level(event: Event) -> int:
     event : Event
         What happened.
     """
-    if event.kind == "state":
+    if event.kind == EventKind.STATE:
         return _LEVELS.get(event.data["state"], logging.WARNING)
-    if event.kind == "error":
+    if event.kind == EventKind.ERROR:
         return logging.ERROR
     return logging.WARNING if event.data.get("ok") is False else logging.INFO
 

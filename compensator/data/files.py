@@ -157,10 +157,7 @@ def _read_recording(path: Path) -> Table:
         assert isinstance(sample, Sample)
         times.append(sample.time_utc_ns)
         samples.append(
-            {
-                name: number(channel.mean) if channel.quality == "good" else math.nan
-                for name, channel in sample.channels.items()
-            }
+            {name: number(channel.mean) if channel.is_good else math.nan for name, channel in sample.channels.items()}
         )
     if not samples:
         raise DataError(f"{path}: no samples in it")

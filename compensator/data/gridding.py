@@ -11,6 +11,7 @@ from compensator.data.record import SHORT_GAP_SAMPLES, Data, Record
 from compensator.data.table import Table
 from compensator.errors import DataError
 from compensator.reasons import Remark
+from compensator.remarks import DataRemark
 
 #: Larger numbers are no measurements, and their powers overflow.
 LARGEST = 1e30
@@ -40,7 +41,9 @@ def to_grid(table: Table, period_s: float) -> Data:
     backwards = np.diff(t_s) < 0
     if backwards.any():
         row, count = table.rows[int(np.argmax(backwards)) + 1], int(np.sum(backwards))
-        remarks.append(Remark("rows_sorted", f"{table.name}: row {row}: {count} row(s) out of order; sorted by time."))
+        remarks.append(
+            Remark(DataRemark.ROWS_SORTED, f"{table.name}: row {row}: {count} row(s) out of order; sorted by time.")
+        )
     t_s = t_s[order] - t_s.min()
     slot = (
         np.round(t_s / period_s).astype(int)
@@ -56,9 +59,9 @@ def to_grid(table: Table, period_s: float) -> Data:
     for first, last in _gaps(present):
         gap = f"{table.name}: gap of {last - first} sample(s) from t_s = {first * period_s:g}"
         if last - first <= SHORT_GAP_SAMPLES:
-            remarks.append(Remark("gap_bridged", f"{gap}; bridged."))
+            remarks.append(Remark(DataRemark.GAP_BRIDGED, f"{gap}; bridged."))
         else:
-            remarks.append(Remark("gap_splits", f"{gap}; the record is split there."))
+            remarks.append(Remark(DataRemark.GAP_SPLITS, f"{gap}; the record is split there."))
             records.append((start, first))
             start = last
     records.append((start, n))

@@ -268,7 +268,7 @@ def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[li
 
 
 def _without_runs(name: str, data: Data, period_s: float) -> str:
-    """Say why data holds nothing to work with."""
+    """Return why data holds nothing to work with."""
     size = sum(record.t_s.size for record in data.records)
     for column in ("t_q_degc", "at_degc", "heat_w"):
         missing = sum(int(np.isnan(r.columns[column]).sum()) for r in data.records if column in r.columns)

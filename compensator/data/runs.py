@@ -10,6 +10,7 @@ import numpy as np
 from compensator.arrays import Mask, Vector
 from compensator.data.record import SHORT_GAP_SAMPLES, Record
 from compensator.reasons import Remark
+from compensator.remarks import DataRemark
 
 #: A single reading this many noise deviations away from both neighbours is an outlier.
 WILD_DEVIATIONS = 12.0
@@ -75,9 +76,9 @@ def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Remark, ...]
     """
     columns, remarks = {}, []
     for column, values in record.columns.items():
-        cleaned, wild = without_wild(values) if column != "heat_w" else (values, 0)
-        if wild and column in ("t_q_degc", "at_degc", "y_um"):
-            remarks.append(Remark("wild_readings", f"{name}: {column}: {wild} outlier(s) left out."))
+        cleaned, outliers = without_outliers(values) if column != "heat_w" else (values, 0)
+        if outliers and column in ("t_q_degc", "at_degc", "y_um"):
+            remarks.append(Remark(DataRemark.WILD_READINGS, f"{name}: {column}: {outliers} outlier(s) left out."))
         columns[column] = cleaned
     inputs = ["t_q_degc", "at_degc", *(["heat_w"] if "heat_w" in columns else [])]
     missing = np.any([np.isnan(columns[c]) for c in inputs], axis=0)
@@ -139,7 +140,7 @@ def _bridged(values: Vector) -> Vector:
     return np.interp(np.arange(values.size), known, values[known])
 
 
-def without_wild(values: Vector) -> tuple[Vector, int]:
+def without_outliers(values: Vector) -> tuple[Vector, int]:
     """Replace outliers, single readings far from both neighbours, by NaN.
 
     A step stays: its samples are near one of their neighbours.
@@ -148,7 +149,7 @@ def without_wild(values: Vector) -> tuple[Vector, int]:
     --------
     >>> values = np.tile([1.0, 1.1], 30)
     >>> values[7] = 9.0
-    >>> without_wild(values)[1]
+    >>> without_outliers(values)[1]
     1
     """
     known = np.flatnonzero(~np.isnan(values))
@@ -161,12 +162,12 @@ def without_wild(values: Vector) -> tuple[Vector, int]:
     across = np.abs(v[2:] - v[:-2])
     apart = (np.abs(before) > limit) & (np.abs(after) > limit) & (before * after > 0)
     apart &= across < 0.3 * np.minimum(np.abs(before), np.abs(after))
-    wild = known[1:-1][apart]
-    if wild.size == 0 or wild.size > 0.02 * v.size:
+    outliers = known[1:-1][apart]
+    if outliers.size == 0 or outliers.size > 0.02 * v.size:
         return values, 0
     cleaned = values.copy()
-    cleaned[wild] = np.nan
-    return cleaned, int(wild.size)
+    cleaned[outliers] = np.nan
+    return cleaned, int(outliers.size)
 
 
 def noise_std(values: Vector) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.errors import DataError, UsageError
 from compensator.reasons import Remark
+from compensator.remarks import DataRemark
 
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 
@@ -85,7 +86,7 @@ class Table:
         if "heat_measured_w" in kept:
             kept["heat_w"] = kept.pop("heat_measured_w")
         words = f"{self.name}: an exported recording; the service's estimates and offsets are left out, with heat_w."
-        return replace(self, columns=kept), (Remark("estimates_left_out", words),)
+        return replace(self, columns=kept), (Remark(DataRemark.ESTIMATES_LEFT_OUT, words),)
 
 
 def table_of(name: str, cells: Mapping[str, Any], *, rows: Sequence[int] | None = None, has: str = "it has") -> Table:

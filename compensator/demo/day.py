@@ -26,7 +26,9 @@ from compensator.clock import NS, VirtualClock
 from compensator.config import Zenoh, load_config
 from compensator.demo.machine import MACHINES, configuration, hardware
 from compensator.errors import ServiceError
+from compensator.events import CommandName
 from compensator.messages import Offset
+from compensator.reasons import Reason
 from compensator.service.command_client import ask
 from compensator.service.compensation import Outcome
 from compensator.service.composition import run_service
@@ -147,13 +149,13 @@ def run_day(
 def _ask_to_adopt(config: Path, model: Path) -> dict[str, Any] | None:
     """Send the command adopt, as `compensator adopt` does."""
     wanted = json.dumps({"model": model.read_text(encoding="utf-8")}).encode()
-    return ask(load_config(config).config.zenoh, "adopt", wanted, timeout_s=60.0)
+    return ask(load_config(config).config.zenoh, CommandName.ADOPT, wanted, timeout_s=60.0)
 
 
 def _adopted_at(outcomes: Sequence[Outcome]) -> int:
     first = outcomes[0].offset.model_sha256
     for i, outcome in enumerate(outcomes):
-        if outcome.offset.model_sha256 != first and "model_changed" not in outcome.offset.reasons:
+        if outcome.offset.model_sha256 != first and Reason.MODEL_CHANGED not in outcome.offset.reasons:
             return i
     raise ServiceError("the service did not adopt the model before the end of the simulated day")
 

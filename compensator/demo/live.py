@@ -1,6 +1,6 @@
 """A simulated machine for trials: a recorded day, then the real service in real time.
 
-Devices behind their protocols, the service on loopback and growing recordings behave as at a real machine. Typed
+Devices with their protocols, the service on loopback and growing recordings behave as at a real machine. Typed
 commands break its sensors.
 """
 

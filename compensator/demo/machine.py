@@ -147,14 +147,14 @@ data_port = {lines["data"]}
 command_port = {lines["command"]}
 
 [[device]]
-name = "spindle-couples"
+name = "spindle-thermocouples"
 line = "rs485"
 model = "icpdas-m7018r"
 address = 1
 format = "hex"
 inputs = [{{ input = 0, couple = "K" }}]
 [[device]]
-name = "cabinet-couples"
+name = "cabinet-thermocouples"
 line = "cabinet"
 model = "icpdas-et7018z"
 address = 1
@@ -170,7 +170,7 @@ inputs = [
   {{ input = 1, unit = "degc", function = 4, address = 1, type = "int16", scale = 0.01 }},
 ]
 [[device]]
-name = "base-couples"
+name = "base-thermocouples"
 line = "base-line"
 model = "dcon"
 address = 2
@@ -183,14 +183,14 @@ inputs = [{{ input = 0 }}]
 
 [[channel]]
 name = "t_q_degc"
-device = "spindle-couples"
+device = "spindle-thermocouples"
 input = 0
 range = [0.0, 80.0]
 rate_max_per_min = 5.0
 stuck_after_min = 120.0
 [[channel]]
 name = "at_degc"
-device = "cabinet-couples"
+device = "cabinet-thermocouples"
 input = 0
 range = [5.0, 45.0]
 rate_max_per_min = 2.0
@@ -204,7 +204,7 @@ rate_max_per_min = 30.0
 stuck_after_min = 60.0
 [[channel]]
 name = "base_degc"
-device = "base-couples"
+device = "base-thermocouples"
 input = 0
 [[channel]]
 name = "spindle_rpm"

@@ -28,13 +28,14 @@ from compensator.diagnose.refit import Refit, refit
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.progress import ExecutorMap, Progress
 from compensator.reasons import Remark
+from compensator.remarks import ModelWarning
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
 
 
 def is_far_off(model: ThermalModel, evidence: Evidence) -> bool:
-    """Tell whether the calibration itself says that the model misses much of the deformation."""
+    """Return whether the calibration itself says that the model misses much of the deformation."""
     return model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um
 
 
@@ -149,4 +150,4 @@ def _refitted(model: ThermalModel, whole: Refit, helps: bool) -> tuple[Remark, .
         "The first model was calibrated while this acted and misses much of its own data, so its paths were refitted "
         f"together with it; gains changed: {gains}."
     )
-    return (Remark("fitted_anew", text),)
+    return (Remark(ModelWarning.FITTED_ANEW, text),)

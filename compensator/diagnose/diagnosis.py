@@ -33,6 +33,7 @@ from compensator.diagnose.search import Search, Selection
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
 from compensator.reasons import Remark
+from compensator.remarks import ModelWarning
 
 #: A base refit replaces a search's answer where it leaves no more than this share.
 REFIT_LEAVES = 0.5
@@ -73,7 +74,7 @@ def diagnose(
 
 
 def _doubtful(searched: Diagnosis, evidence: Evidence) -> bool:
-    """Tell whether the search did not help although much is left."""
+    """Return whether the search did not help although much is left."""
     if rms_of(searched.held_out_after) > rms_of(searched.held_out_before):
         return True
     return searched.verdict == "unexplained" and rms_of(searched.held_out_before) > FAR_OFF * evidence.spread_um
@@ -115,7 +116,7 @@ def _held_out(
 ) -> tuple[Vector, Vector]:
     """Return the residual before and after on every sample, each block by a search that did not see it.
 
-    Only the zero of each run is taken as unknown, or its initial state too: whichever leaves less before.
+    Only the zero of each run counts as unknown, or its initial state too: whichever leaves less before.
     """
     raw, nothing = evidence.residual, np.zeros(evidence.used.size)
     observed = [term.hypothesis.effect.observed for term in found.fit.terms]
@@ -171,8 +172,8 @@ def _effects(evidence: Evidence, found: Selection) -> tuple[Effect, ...]:
 def _stated(model: ThermalModel, after_um: float, noise_um: float, kept_out: Sequence[Vector]) -> float:
     """Return the standard deviation that an extended model states, µm: what it leaves where nothing was fitted.
 
-    Without it, a service would go on to publish that of the calibration, on a machine without the effect. What was
-    found and cannot be deployed (`kept_out`) goes on acting.
+    Without it, a service would still publish that of the calibration, on a machine without the effect. What was
+    found and cannot be deployed (`kept_out`) still acts.
     """
     left = max(after_um**2 - noise_um**2, 0.0) + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
     return max(model.y_std_um, float(np.sqrt(left)))
@@ -182,7 +183,7 @@ def _companions(everything: Sequence[Effect]) -> tuple[Remark, ...]:
     """Return a warning for each effect that is deployed without being named."""
     return tuple(
         Remark(
-            "rounded_off",
+            ModelWarning.ROUNDED_OFF,
             "What the effect leaves is absorbed by a filter bank on heat and ambient "
             f"({float(np.std(e.signal)):.2g} µm rms), an effect of kind {e.place[0]} in model.toml.",
         )

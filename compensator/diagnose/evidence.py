@@ -118,7 +118,7 @@ class Evidence:
         Parameters
         ----------
         raw, effects : numpy.ndarray, shape (n,)
-            Residual of the base model, and what is taken off it, µm.
+            Residual of the base model, and what is subtracted from it, µm.
         at_rest : bool
             Whether only the zero of each run is unknown, and not its initial state.
         """

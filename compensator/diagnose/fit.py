@@ -64,7 +64,7 @@ class Fit:
     terms : tuple of Term
         Effects with their values.
     residual : numpy.ndarray, shape (n,)
-        What is left, nuisances taken out; 0 where samples are not used.
+        What is left, nuisances projected out; 0 where samples are not used.
     cost : float
         Its sum of squares, µm².
     """
@@ -95,7 +95,7 @@ def summed(evidence: Evidence, terms: Sequence[Term]) -> Vector:
 
 
 def columns_of(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> tuple[Matrix, Vector | None]:
-    """Return columns and fixed part on the samples used, nuisances taken out."""
+    """Return columns and fixed part on the samples used, nuisances projected out."""
     columns = np.concatenate([hypothesis.columns(record, values) for record in evidence.signals])
     columns[~evidence.used] = 0.0
     if hypothesis.amplitudes:

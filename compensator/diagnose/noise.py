@@ -13,7 +13,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from compensator.arrays import Vector
-from compensator.data.runs import Run, noise_std
+from compensator.data.runs import Run, noise_of
 from compensator.model.thermal_model import ThermalModel
 
 #: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
@@ -54,33 +54,33 @@ class NoiseTest:
         return self.count * (OWN_TIMES * self.own_error_um) ** 2
 
     def is_expected(self, cost: float) -> bool:
-        """Tell whether a residual, before any search, may come by itself on another day."""
+        """Return whether a residual, before any search, may come by itself on another day."""
         return cost < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
 
     def is_noise(self, cost: float) -> bool:
-        """Tell whether a search has nothing left to find in a sum of squares."""
+        """Return whether a search has nothing left to find in a sum of squares."""
         return cost < SEARCH_TIMES * (self.count * self.noise_um**2 + self.allowance)
 
     def is_bare_noise(self, cost: float) -> bool:
-        """Tell the same with the own error as it is stated, without a margin."""
+        """Return the same with the own error as it is stated, without a margin."""
         return cost < SEARCH_TIMES * self.count * (self.noise_um**2 + self.own_error_um**2)
 
     def is_explained(self, cost: float) -> bool:
-        """Tell whether the verdict may say that what is left is noise."""
+        """Return whether the verdict may say that what is left is noise."""
         return cost < VERDICT_TIMES**2 * (self.count * self.noise_um**2 + self.allowance)
 
     def is_explained_held_out(self, rms_um: float) -> bool:
-        """Tell the same of a held-out error of a refitted base, whose own error is not known beforehand."""
+        """Return the same of a held-out error of a refitted base, whose own error is not known beforehand."""
         return rms_um < VERDICT_TIMES * self.noise_um
 
     @staticmethod
     def is_white(variance_inflation: float) -> bool:
-        """Tell whether a residual has no structure in time."""
+        """Return whether a residual has no structure in time."""
         return variance_inflation < WHITE_BELOW
 
 
 def own_error(model: ThermalModel, noise_um: float, spread_um: float) -> float:
-    """Return the base model's own error from its calibration, the noise taken off, µm rms.
+    """Return the base model's own error from its calibration, less the noise, µm rms.
 
     A calibration that misses by more than a share of the spread of the deformation lacks something.
     """
@@ -93,7 +93,7 @@ def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:
 
     White noise of the probe, and that of both thermocouples through the model.
     """
-    noise = {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc", "y_um")}
+    noise = noise_of(runs)
     impulse = np.zeros(3000)
     impulse[0] = 1.0
     by_t_q = model.dtf.sampled.response(drive_of(model, impulse))

@@ -14,6 +14,7 @@ from compensator.diagnose.fit import Term
 from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import EffectTable, ThermalModel
 from compensator.reasons import Remark
+from compensator.remarks import ModelWarning
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 
@@ -102,7 +103,7 @@ class Diagnosis:
     evidence : Evidence
         Residual and signals.
     residual_before, residual_after : numpy.ndarray, shape (n,)
-        Of the fit to everything, nuisances taken out, µm; NaN where y is missing.
+        Of the fit to everything, nuisances projected out, µm; NaN where y is missing.
     held_out_before, held_out_after : numpy.ndarray, shape (n,)
         The same, each block by a search that did not see it.
     tried : tuple of (str, float)
@@ -199,16 +200,16 @@ def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tup
             f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so the "
             "model was left as it is."
         )
-        warnings.append(Remark("made_worse", text))
+        warnings.append(Remark(ModelWarning.MADE_WORSE, text))
     for effect in effects:
         kind, named = effect.place[0], effect.named
         loose = [name for name, std in effect.std.items() if std > abs(named[name]) > 0.0]
         if loose:
             text = f"{kind}: the standard error of {', '.join(loose)} is larger than the value."
-            warnings.append(Remark("hardly_determined", text))
+            warnings.append(Remark(ModelWarning.HARDLY_DETERMINED, text))
         if effect.rivals:
             names = ", ".join(rival.label for rival in effect.rivals)
-            warnings.append(Remark("nearly_as_good", f"{kind}: {names} would explain it nearly as well."))
+            warnings.append(Remark(ModelWarning.NEARLY_AS_GOOD, f"{kind}: {names} would explain it nearly as well."))
     return tuple(warnings)
 
 

@@ -1,7 +1,7 @@
 """Search for the effects that a model lacks: added one after another, refitted together, compared by a criterion.
 
 An effect is worth its parameters where the residual's sum of squares falls by more than chance would make it fall
-with so many hypotheses tried:
+with the number of hypotheses tried:
 
     J = N/c · log(Σ e² + A) + Σ_effects [ p log(N/c) + 2 log M ]
 
@@ -148,7 +148,7 @@ class Search:
         return self.evidence.noise.is_white(self.evidence.variance_inflation(fit.residual))
 
     def _is_one_effect(self, fits: Sequence[Fit], before: Fit) -> bool:
-        """Tell whether, where forms are approximate, a single effect explains so much that its form leaves the rest."""
+        """Return whether one effect explains so much that its form, where forms are approximate, leaves the rest."""
         return self.approximate and any(
             len(_foreground(fit)) <= 1 and fit.cost < FORM_LEAVES * before.cost for fit in fits
         )
@@ -174,28 +174,28 @@ class Search:
         return self._forward([fit_terms(self.evidence, starts)])
 
     def _settle_background(self, fit: Fit, before: Fit) -> Fit:
-        """Decide whether a background effect stands for itself, by which name, or is a companion of others.
+        """Decide whether a background effect is an effect of its own, by which name, or is a companion of others.
 
-        Where other effects explain most without it, it only absorbs what they leave. Where it stands alone and effects
+        Where other effects explain most without it, it only absorbs what they leave. Where it is alone and effects
         of a simpler name explain most of it, it gets their name.
         """
-        behind = next((term for term in fit.terms if term.hypothesis.effect.background), None)
-        if behind is None:
+        background = next((term for term in fit.terms if term.hypothesis.effect.background), None)
+        if background is None:
             return fit
         others = [term.start for term in _foreground(fit)]
         if not others:
             simpler: list[Start] = [(h, ()) for h in self.scan.hypotheses if h.effect.names_background]
             if not self._explain_most(simpler, fit, before):
                 return fit
-            others = [start for start in simpler if start[0].place[1] == behind.hypothesis.place[1]]
+            others = [start for start in simpler if start[0].place[1] == background.hypothesis.place[1]]
         elif not self._explain_most(others, fit, before):
             return fit
-        fitted = fit_terms(self.evidence, [*others, (behind.hypothesis, ())])
+        fitted = fit_terms(self.evidence, [*others, (background.hypothesis, ())])
         *named, last = fitted.terms
         return dataclasses.replace(fitted, terms=(*named, dataclasses.replace(last, companion=True)))
 
     def _explain_most(self, some: Sequence[Start], fit: Fit, before: Fit) -> bool:
-        """Tell whether some effects alone explain most of what all explain."""
+        """Return whether some effects alone explain most of what all explain."""
         return before.cost - fit_terms(self.evidence, some).cost > MOSTLY * (before.cost - fit.cost)
 
     def _with_unobserved(self, path: Sequence[Fit], observed: Fit) -> list[Fit]:
@@ -217,7 +217,7 @@ class Search:
         return [fit for fit in improved if fit.cost + own < UNOBSERVED_LEAVES * (observed.cost + own)]
 
     def _is_worth(self, hypothesis: Hypothesis, without: Fit, fit: Fit) -> bool:
-        """Tell whether an effect explains enough, the base model's own error counted as still there."""
+        """Return whether an effect explains enough, the base model's own error counted as still there."""
         allowance, effect = self.evidence.noise.allowance, hypothesis.effect
         share = effect.worth_beside if self.approximate and _foreground(without) else effect.worth
         return fit.cost + allowance < (1.0 - share) * (without.cost + allowance)
@@ -241,7 +241,7 @@ class Search:
         return sorted(found, key=lambda item: item.score)
 
     def _improved(self, fit: Fit) -> Fit:
-        """Exchange effects one at a time as long as that helps: what was found first may have stood for two."""
+        """Exchange effects one at a time as long as that helps: what was found first may have absorbed two."""
         if len(fit.terms) < 2:
             return fit
         for _ in range(2):
@@ -280,7 +280,7 @@ class Search:
         return fit
 
     def _is_plausible(self, term: Term) -> bool:
-        """Refuse an effect whose columns cancel: two lags that stand for a derivative or a ramp are not physical."""
+        """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
         if len(term.amplitudes) < 2 or term.hypothesis.effect.ridge:
             return True
         table = columns_of(self.evidence, *term.start)[0] * np.array(term.amplitudes)
@@ -301,5 +301,5 @@ class Search:
 
 
 def _foreground(fit: Fit) -> list[Term]:
-    """Return the effects that stand for themselves."""
+    """Return the effects that are no background."""
     return [term for term in fit.terms if not term.hypothesis.effect.background]

@@ -10,6 +10,7 @@ from compensator.diagnose.fit import Term
 from compensator.diagnose.outcome import Diagnosis, Effect
 from compensator.identify.summary import with_std
 from compensator.model.simulation import Scores
+from compensator.remarks import ModelWarning
 
 _VERDICTS = {
     "adequate": "The model is adequate: the residual is noise.",
@@ -66,7 +67,7 @@ def _scores(scores: Scores) -> dict[str, float | None]:
 def verdict(diagnosis: Diagnosis) -> str:
     """Return the diagnosis in one or two sentences."""
     words = _VERDICTS[diagnosis.verdict]
-    if any(warning.code == "made_worse" for warning in diagnosis.warnings):
+    if any(warning.code == ModelWarning.MADE_WORSE for warning in diagnosis.warnings):
         words = _DOES_NOT_HOLD
     before, after, noise = diagnosis.before.rms_um, diagnosis.after.rms_um, diagnosis.noise_floor_um
     if not diagnosis.effects:

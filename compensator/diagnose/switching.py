@@ -1,4 +1,4 @@
-"""A source that no channel shows: the times at which it was switched, and the lag behind which it acts."""
+"""A source that no channel shows: the times at which it was switched, and the lag through which it acts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ POINTS = 240
 
 
 def switchings(evidence: Evidence, residual: Vector) -> Start | None:
-    """Find steps behind a common lag that a residual may be made of, one after another.
+    """Find steps through a common lag that a residual may be made of, one after another.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def _stride(size: int) -> int:
 
 
 def _steps(evidence: Evidence, where: list[Time], lag: float) -> Matrix:
-    """Return one column for each time: a step behind the lag, of norm 1, nuisances taken out."""
+    """Return one column for each time: a step through the lag, of norm 1, nuisances projected out."""
     sizes = [record.size for record in evidence.signals]
     begin = np.cumsum([0, *sizes[:-1]])
     period = evidence.context.period_min
@@ -101,7 +101,7 @@ def _steps(evidence: Evidence, where: list[Time], lag: float) -> Matrix:
 
 
 def _pursue(evidence: Evidence, table: Matrix, residual: Vector) -> tuple[float, list[int]]:
-    """Choose the best step, refit, and go on while each is worth its parameters (orthogonal matching pursuit)."""
+    """Choose the best step, refit, and continue while each is worth its parameters (orthogonal matching pursuit)."""
     chosen: list[int] = []
     best: list[int] = []
     left, score = residual, _score(evidence, residual, 0)

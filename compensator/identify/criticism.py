@@ -14,6 +14,7 @@ from compensator.data.runs import Run
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
 from compensator.reasons import Remark
+from compensator.remarks import ModelWarning
 
 #: Lags of the correlations, samples.
 LAGS = 60
@@ -254,7 +255,7 @@ class _Warnings:
         for part in self.calibration.parts:
             if part.role == "held out" and part.model.rms_um > part.nothing.rms_um:
                 return Remark(
-                    "worse_than_nothing",
+                    ModelWarning.WORSE_THAN_NOTHING,
                     f"On {part.name} (held out) the model is worse than no compensation: {part.model.rms_um:.1f} "
                     f"against {part.nothing.rms_um:.1f} µm rms.",
                 )
@@ -268,12 +269,12 @@ class _Warnings:
         gain = f"the TDTF's gain is {path.gain:.2f} ± {path.gain_std:.2f} µm/K"
         if swing < 2.0:
             return Remark(
-                "quiet_ambient",
+                ModelWarning.QUIET_AMBIENT,
                 f"The ambient changed by only {swing:.1f} K; {gain}: do not rely on it for larger changes.",
             )
         if path.gain_std > 0.3 * abs(path.gain):
             return Remark(
-                "undetermined_ambient",
+                ModelWarning.UNDETERMINED_AMBIENT,
                 f"The TDTF is poorly determined although the ambient changed by {swing:.1f} K: {gain}.",
             )
         return None
@@ -283,7 +284,7 @@ class _Warnings:
         longest = max(self.hours)
         if longest * 60.0 < 3.0 * slowest:
             return Remark(
-                "short_record",
+                ModelWarning.SHORT_RECORD,
                 f"The longest record has {longest:.1f} h, the slowest time constant is {slowest / 60.0:.1f} h: the "
                 "steady state is extrapolated.",
             )
@@ -294,7 +295,7 @@ class _Warnings:
         if main.taus_min[-1] < 0.95 * main.longest_min:
             return None
         return Remark(
-            "drifting_mode",
+            ModelWarning.DRIFTING_MODE,
             f"The slowest mode is slower than the record ({main.longest_min / 60.0:.0f} h) and was limited to it: "
             "a drift is left that the inputs do not explain, and free run beyond the record is extrapolation.",
         )
@@ -308,7 +309,7 @@ class _Warnings:
         if together < 0.8:
             return None
         return Remark(
-            "common_cause",
+            ModelWarning.COMMON_CAUSE,
             f"Drive and ambient changed together (correlation {together:.2f}): how much of the deformation belongs to "
             "the DTF and how much to the TDTF is ambiguous.",
         )
@@ -316,7 +317,7 @@ class _Warnings:
     def undetermined_gain(self) -> list[Remark]:
         return [
             Remark(
-                "undetermined_gain",
+                ModelWarning.UNDETERMINED_GAIN,
                 f"The gain of the {name} at rest is {path.gain:.3g} ± {path.gain_std:.2g} {_shown(path.unit)}: "
                 "poorly determined.",
             )
@@ -332,7 +333,7 @@ class _Warnings:
                 worst = max(outside, key=abs)
                 words.append(
                     Remark(
-                        "zero_outside",
+                        ModelWarning.ZERO_OUTSIDE,
                         f"The {name} has a zero outside the unit circle (z = {worst.real:.3g}): its response starts "
                         "in the wrong direction. It is never inverted, so stability is not affected.",
                     )
@@ -345,7 +346,7 @@ class _Warnings:
             if path.gain * path.step[np.argmax(np.abs(path.step))] < 0:
                 words.append(
                     Remark(
-                        "turning_response",
+                        ModelWarning.TURNING_RESPONSE,
                         f"The step response of the {name} reverses: it peaks at {_peak(path):.3g} and settles at "
                         f"{path.gain:.3g} {_shown(path.unit)}.",
                     )
@@ -359,7 +360,7 @@ class _Warnings:
             if twins and name != "TDTF":
                 words.append(
                     Remark(
-                        "twin_modes",
+                        ModelWarning.TWIN_MODES,
                         f"Two time constants of the {name} coincide at {twins[0]:.3g} min: their standard errors "
                         "mean nothing, and one mode fewer may be enough.",
                     )
@@ -377,7 +378,7 @@ class _Warnings:
         if watts < 0.2 * span:
             return None
         return Remark(
-            "inverse_noise",
+            ModelWarning.INVERSE_NOISE,
             f"The noise of the thermocouples makes {watts:.0f} W of noise in a heat of {span:.0f} W.",
         )
 
@@ -391,7 +392,7 @@ class _Warnings:
             return None
         tail = f" and is correlated with {largest}" if known[largest] > 1.0 else ""
         return Remark(
-            "coloured_residual",
+            ModelWarning.COLOURED_RESIDUAL,
             f"The residual ({main.sigma:.2f} µm rms, sensor noise {noise:.2f}) is not white{tail}: the model lacks "
             "something. The standard errors allow for it.",
         )
@@ -400,7 +401,7 @@ class _Warnings:
         low, high = self.calibration.model.validity["at_degc"]
         t_low, t_high = self.calibration.model.validity["t_q_degc"]
         return Remark(
-            "validity_range",
+            ModelWarning.VALIDITY_RANGE,
             f"Valid for AT from {low:.0f} to {high:.0f} °C and T_Q from {t_low:.0f} to {t_high:.0f} °C (the range of "
             "the data and a third more); outside it the service holds the offset.",
         )

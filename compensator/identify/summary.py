@@ -133,28 +133,43 @@ def with_std(value: float, std: float) -> str:
 
 def _table(calibration: Calibration) -> list[str]:
     rows = [["data", "part", "h", "fit %", "rms µm", "p-p µm", "no comp. µm", "persistence µm"]]
-    period_h = calibration.model.period_s / 3600.0
-    rows += [
-        [
-            part.name,
-            part.role,
-            f"{part.y_um.size * period_h:.1f}",
-            f"{part.model.fit_pct:.2f}",
-            f"{part.model.rms_um:.2f}",
-            f"{part.model.peak_to_peak_um:.2f}",
-            f"{part.nothing.rms_um:.2f}",
-            f"{part.persistence.rms_um:.2f}",
-        ]
-        for part in calibration.parts
-    ]
-    rows.append(["folds", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""])
-    arx = calibration.arx_rms_um
-    rows.append(["ARX, to compare", "fitted", "", "", f"{arx:.2f}" if math.isfinite(arx) else "unstable", "", "", ""])
+    rows += error_rows(calibration, folds="folds", arx="ARX, to compare")
     return aligned(rows, left=2)
 
 
+def error_rows(calibration: Calibration, *, folds: str, arx: str) -> list[list[str]]:
+    """Return the errors in free run, a row for each part of the data, one for the folds and one for the ARX fit.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Result of the identification.
+    folds, arx : str
+        Names of the last two rows.
+    """
+    period_h = calibration.model.period_s / 3600.0
+    arx_rms = f"{calibration.arx_rms_um:.2f}" if math.isfinite(calibration.arx_rms_um) else "unstable"
+    return [
+        *(
+            [
+                part.name,
+                part.role,
+                f"{part.y_um.size * period_h:.1f}",
+                f"{part.model.fit_pct:.2f}",
+                f"{part.model.rms_um:.2f}",
+                f"{part.model.peak_to_peak_um:.2f}",
+                f"{part.nothing.rms_um:.2f}",
+                f"{part.persistence.rms_um:.2f}",
+            ]
+            for part in calibration.parts
+        ),
+        [folds, "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""],
+        [arx, "fitted", "", "", arx_rms, "", "", ""],
+    ]
+
+
 def aligned(rows: Sequence[Sequence[str]], *, left: int) -> list[str]:
-    """Return the lines of a table of text; the first columns stand at the left.
+    """Return the lines of a table of text; the first columns are left-aligned.
 
     Examples
     --------

@@ -96,7 +96,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class EngineState:
-    """Everything the engine must remember to go on with the same bits.
+    """Everything the engine must remember to continue with the same bits.
 
     Parameters
     ----------
@@ -339,7 +339,7 @@ class Engine:
         ]
 
     def skip(self, samples: int, *, held: bool = False) -> Estimate:
-        """Skip samples that were not taken, as missing ones; the next complete sample repeats them.
+        """Skip samples that were not measured, as missing ones; the next complete sample repeats them.
 
         Parameters
         ----------

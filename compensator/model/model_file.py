@@ -1,6 +1,6 @@
 """The model file: TOML that an engineer can read and edit.
 
-The reader takes the file apart table by table and refuses what it does not know, naming file, table, key,
+The reader reads the file table by table and refuses what it does not know, naming file, table, key,
 value and what was expected. The writer adds comments to the numbers.
 """
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.errors import ModelError
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
@@ -51,7 +51,7 @@ def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
     text = dump_model(model)
     # Before the old file is replaced: the reader knows bounds that the model does not.
     parse_model(text.encode("utf-8"), source=str(path))
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(text)
     return load_model(path.absolute())  # a bare "quill" is the name of a built-in model
 
@@ -143,7 +143,7 @@ def _path(where: str, path: Path, purpose: str, extra: Mapping[str, Any]) -> Ite
 
 
 def _gain(where: str, path: Path) -> str:
-    """Say the gain at rest, Σb / Σa, with its standard error from the covariance of b and a_1 …."""
+    """Write the gain at rest, Σb / Σa, with its standard error from the covariance of b and a_1 …."""
     b, a = path.sampled.b, path.sampled.a
     total = math.fsum(a)
     gain = math.inf if total == 0.0 else (path.continuous or path.sampled).dc_gain
@@ -160,7 +160,7 @@ def _gain(where: str, path: Path) -> str:
 
 
 def _dynamics(path: Path) -> str:
-    """Say the time constants and zeros, in s where the file has s: a pole faster than 2/T is negative in z."""
+    """Write the time constants and zeros, in s where the file has s: a pole faster than 2/T is negative in z."""
     function = path.continuous or path.sampled
     taus = ", ".join(f"{tau:.4g}" for tau in function.time_constants_min() if tau != 0.0)
     if path.continuous is not None:

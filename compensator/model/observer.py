@@ -327,7 +327,7 @@ class Observer:
     # ------------------------------------------------------------------ state
 
     def snapshot(self) -> ObserverState:
-        """Return what must be kept to go on from here with the same bits."""
+        """Return what must be kept to continue from here with the same bits."""
         return ObserverState(
             x=tuple(self._x[: self.size]),
             p=tuple(self._P[self._upper].tolist()),

@@ -25,7 +25,6 @@ from compensator.model.transfer_function import SampledTransferFunction, Transfe
 
 Kind = Literal["heat", "direct"]
 Method = Literal["kalman", "inverse"]
-PathName = Literal["TTF", "DTF", "TDTF"]
 
 #: Unit of every path, by the kind of model.
 PATH_UNITS: Mapping[Kind, Mapping[str, str]] = {
@@ -108,7 +107,7 @@ class EffectTable:
     kind : str
         One of the registered kinds of `compensator.model.effects`.
     table : mapping
-        Its other keys, as they stand in the file.
+        Its other keys, as in the file.
     """
 
     kind: str

@@ -52,7 +52,7 @@ def _power(p: Sequence[float], exponent: int) -> list[float]:
 def _substituted(
     coefficients: Sequence[float], order: int, top: Sequence[float], bottom: Sequence[float]
 ) -> list[float]:
-    """Put top/bottom for the variable of an ascending polynomial, times bottom^order."""
+    """Substitute top/bottom for the variable of an ascending polynomial, times bottom^order."""
     result = [0.0] * (order + 1)
     for power, coefficient in enumerate(coefficients):
         term = _product(_power(top, power), _power(bottom, order - power))
@@ -113,7 +113,7 @@ class SampledTransferFunction:
         return sorted(float(half * (1.0 + p) / (1.0 - p)) if 0.0 < p < 1.0 else 0.0 for p in sizes)
 
     def is_stable(self) -> bool:
-        """Tell whether every pole lies inside the unit circle."""
+        """Return whether every pole lies inside the unit circle."""
         return bool(np.all(np.abs(self.poles()) < 1.0))
 
     def observer_form(self) -> tuple[tuple[float, ...], tuple[float, ...], float]:

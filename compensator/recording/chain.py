@@ -8,7 +8,7 @@ numbers little-endian (4, 8 and 8 bytes). The chain of a file begins with
 
     value = SHA-256("compensator chain 1\n" ‖ last value of the file before ‖ name ‖ 0x00 ‖ SHA-256(part) ‖ …)
 
-over what the file opens with: metadata, attachments, channels with their schemas. A `/chain` message behind each group
+over what the file opens with: metadata, attachments, channels with their schemas. A `/chain` message after each group
 of records lists the value of each. It takes part in the numbering of the records, not in the hash: all that it says
 follows from the records. Nothing depends on how the file is laid out, so a file that is rewritten compact keeps its
 chain.
@@ -26,8 +26,6 @@ from compensator.recording.container import Attachment, Channel, Contents
 
 #: Value before the first file of a machine.
 NOTHING = bytes(32)
-#: Topics that a `/chain` message lists; it does not list itself.
-LISTED = ("sample", "estimate", "offset", "event", "seal")
 
 _DOMAIN = b"compensator chain 1\n"
 _BODY = struct.Struct("<IQQ")
@@ -49,7 +47,7 @@ def link(before: bytes, topic: str, body: bytes) -> bytes:
     topic : str
         Channel, without the slash.
     body : bytes
-        Sequence, log time, publish time, payload, as they stand in the file.
+        Sequence, log time, publish time, payload, as in the file.
     """
     return _sha256(b"%b%b\0%b" % (before, topic.encode(), body)).digest()
 

@@ -2,7 +2,7 @@
 
 A live file is written so that a kill loses nothing, which costs size and an index. Once it is finished it is copied
 message by message; the copy is read back with the library's own seeking reader, compared, and only then takes the live
-file's place. A kill at any time leaves one whole file under the name.
+file's place. A kill at any time leaves one complete file under the name.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from compensator.recording.container import (
 )
 from compensator.recording.live_file import Opening, sync_folder
 
-#: Number of messages after which a patient copy lets other threads go first, and for how long, s.
+#: Number of messages after which a patient copy yields to other threads, and for how long, s.
 TURN, MOMENT_S = 64, 0.0005
 _PART = ".mcap.part"
 
@@ -82,7 +82,7 @@ def rewrite(
 ) -> Copy | None:
     """Replace a finished or abandoned live recording by a compact copy.
 
-    Every whole message of a torn file is kept.
+    Every complete message of a torn file is kept.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def rewrite(
 
 
 def _is_live(path: Path, chained: bool) -> bool:
-    """Tell whether a file is not compact yet; with `chained`, only if it opens with its hash chain."""
+    """Return whether a file is not compact yet; with `chained`, only if it opens with its hash chain."""
     with Container(path) as container:
         try:
             for message in container.messages():
@@ -155,7 +155,7 @@ def _copied(path: Path, writer: Writer, copy_of: Callable[[Contents, Writer], Co
                 if patient and number % TURN == 0:
                     time.sleep(MOMENT_S)
         except Torn as torn:
-            # Nothing can be read behind a torn end; a damaged file is refused, so that an audit finds it as it was.
+            # Nothing can be read after a torn end; a damaged file is refused, so that an audit finds it as it was.
             copy.torn = torn.offset < path.stat().st_size
         copy.finish()
     return copy

@@ -1,4 +1,4 @@
-"""Reads an MCAP file from front to back: live or finished, chunked or not, whole, torn or damaged.
+"""Reads an MCAP file from front to back: live or finished, chunked or not, complete, torn or damaged.
 
 The `mcap` library writes our files, and checks them when they are finished. An audit of a year reads millions of
 records, trusts none of them and must distinguish a torn end from damage, so it reads the framing itself: one record
@@ -70,7 +70,7 @@ _SHORTEST = {FOOTER: 20, MESSAGE: 22, CHUNK: 40, DATA_END: 4, STATISTICS: 46}
 
 
 class Message(NamedTuple):
-    """One message as it stands in the file.
+    """One message as in the file.
 
     Parameters
     ----------
@@ -121,8 +121,8 @@ class Flaw(StrEnum):
     """What is wrong with an attachment or a metadata table, in words."""
 
     WRONG_CRC = "its CRC is wrong"
-    TWICE = "stands twice"
-    LATE = "stands behind messages"
+    TWICE = "occurs twice"
+    LATE = "follows messages"
 
 
 @dataclass(slots=True)
@@ -228,7 +228,7 @@ class Container:
         DataError
             If it is not an MCAP file.
         Torn
-            Where the file ends inside a record; every whole message was yielded before.
+            Where the file ends inside a record; every complete message was yielded before.
         Damaged
             Where a record cannot be one.
         """
@@ -417,7 +417,7 @@ class Container:
             if MAGIC.startswith(rest):
                 raise self._torn(self._base + self._at)
             more = self._size - self._base - self._at - len(MAGIC)
-            raise Damaged(self.path, self._base + self._at, f"{more} bytes behind the end of the file")
+            raise Damaged(self.path, self._base + self._at, f"{more} bytes after the end of the file")
         self.contents.ended = True
 
     # ------------------------------------------------------------------ bytes
@@ -463,7 +463,7 @@ class Container:
         return Torn(self.path, offset, rest)
 
     def _only_zeros(self) -> bool:
-        """Tell whether nothing but zeros follows: what a power cut leaves of a file that had grown."""
+        """Return whether nothing but zeros follows: what a power cut leaves of a file that had grown."""
         while True:
             if self._buffer[self._at :].strip(b"\0"):
                 return False

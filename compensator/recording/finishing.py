@@ -1,6 +1,6 @@
 """Makes finished recordings compact, and removes the oldest ones where a limit is set.
 
-All of this runs on a thread of its own that lets samples go first.
+All of this runs on a thread of its own that yields to samples.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from compensator.recording.compaction import Copy, rewrite
 from compensator.recording.container import Contents, Message
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
+from compensator.remarks import RecordingEnd
 
 log = logging.getLogger("compensator")
 
@@ -73,7 +74,7 @@ class Finisher:
         self._remarks: list[tuple[str, dict[str, Any]]] = []
 
     def enqueue(self, path: Path, now_ns: int) -> None:
-        """Have a file made compact in the background.
+        """Enqueue a file to be made compact in the background.
 
         Parameters
         ----------
@@ -171,7 +172,7 @@ class Finisher:
                 path.unlink()
                 removed.append((path.name, sizes.pop(path)))
         except OSError as error:
-            if str(error) != self._unremoved:  # a disk that takes nothing is asked every minute
+            if str(error) != self._unremoved:  # a disk that accepts nothing is tried every minute
                 text = f"what is beyond the limit of what is kept could not be removed: {error}"
                 self._remark(text, RecordingData(code=RecordingCode.NOT_REMOVED))
             self._unremoved = str(error)
@@ -192,7 +193,7 @@ def _began_ns(path: Path, machine: str) -> int:
 def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) -> str:
     """Replace a machine's live recording by a compact copy.
 
-    A torn end is finished: its whole records get their place in a `/chain` message, and a seal says `recovered`.
+    A torn end is finished: its complete records get their place in a `/chain` message, and a seal says `recovered`.
 
     Parameters
     ----------
@@ -206,7 +207,7 @@ def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) 
     Returns
     -------
     str
-        What was recovered, in words; empty where the file was whole.
+        What was recovered, in words; empty where the file was complete.
 
     Raises
     ------
@@ -217,7 +218,7 @@ def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) 
     if not isinstance(copy, _ChainedCopy) or copy.recovered is None:
         return "its torn end was cut off" if copy is not None and copy.torn else ""
     end = "its torn end was cut off" if copy.torn else "it had no end"
-    return f"{end}; {copy.recovered} whole record(s) behind the last complete group were kept"
+    return f"{end}; {copy.recovered} complete record(s) after the last complete group were kept"
 
 
 class _ChainedCopy(Copy):
@@ -229,7 +230,7 @@ class _ChainedCopy(Copy):
         self._chain: chain.ChainWriter | None = None
         self._last: Message | None = None
         self._sealed = False
-        #: Records that had no place in the chain yet; None where the file was whole.
+        #: Records that had no place in the chain yet; None where the file was complete.
         self.recovered: int | None = None
 
     def add(self, message: Message) -> None:
@@ -251,19 +252,19 @@ class _ChainedCopy(Copy):
     def finish(self) -> None:
         """Finish a torn end, and write the end of the file."""
         if self._chain is None or self._last is None:
-            raise DataError("nothing whole in it, expected at least one record")
+            raise DataError("nothing complete in it, expected at least one record")
         if not self._sealed:
             self.recovered = len(self._chain.links)
             if self.recovered:
                 self._append("chain", self._chain.message(self._last.log_time_ns))
             time_ns, sequence = self._last.log_time_ns, self._last.sequence
-            seal = chain.seal(self._chain.machine, time_ns, "recovered", sequence, self._chain.head)
+            seal = chain.seal(self._chain.machine, time_ns, RecordingEnd.RECOVERED, sequence, self._chain.head)
             self._append("seal", encode(self._signer.sign(seal) if self._signer else seal))
             self._append("chain", self._chain.message(time_ns))
         super().finish()
 
     def _append(self, topic: str, data: bytes) -> None:
-        """Add a message behind the last one."""
+        """Add a message after the last one."""
         assert self._last is not None
         channel = next(number for number, name in self.topics.items() if name == topic)
         sequence, time_ns = self._last.sequence + 1, self._last.log_time_ns

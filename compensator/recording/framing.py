@@ -25,7 +25,7 @@ class Torn(Damaged):
     Parameters
     ----------
     rest : bytes
-        The beginning of the record that is not whole, at most 1 MiB of it.
+        The beginning of the record that is not complete, at most 1 MiB of it.
     """
 
     def __init__(self, path: Path, offset: int, rest: bytes = b"") -> None:
@@ -75,7 +75,7 @@ class Fields:
         while inner._at < len(inner._body):
             key = inner.text()
             if key in found:
-                raise Damaged(self._path, self._offset, f"key {key!r} stands twice")
+                raise Damaged(self._path, self._offset, f"key {key!r} occurs twice")
             found[key] = inner.text()
         return found
 
@@ -86,7 +86,7 @@ class Fields:
             raise Damaged(self._path, self._offset, f"a table of {len(data)} bytes, expected a multiple of 10")
         found: dict[int, int] = dict(struct.iter_unpack("<HQ", data))
         if 10 * len(found) != len(data):
-            raise Damaged(self._path, self._offset, "a channel that stands twice in a table")
+            raise Damaged(self._path, self._offset, "a channel that occurs twice in a table")
         return found
 
     def rest(self) -> bytes:

@@ -1,9 +1,9 @@
 """Whether the index of an MCAP file leads to every record of it, and to nothing else.
 
-The hash chain covers what the records say. Readers that seek (Foxglove, the JavaScript library) see only what the
-index leads them to: an entry that is gone or leads elsewhere hides records that are still there. So what stands in the
-data section is noted while it is read, and the index is held against it: the message indexes behind each chunk, and in
-the summary the chunks, attachments and metadata, the statistics, the repeated schemas and channels, and the offsets.
+The hash chain covers the content of the records. Readers that seek (Foxglove, the JavaScript library) see only what the
+index leads to: an entry that is missing or leads elsewhere hides records that are there. So the data section is noted
+while it is read, and the index is compared with it: the message indexes after each chunk, and in the summary the
+chunks, attachments and metadata, the statistics, the repeated schemas and channels, and the offsets.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from compensator.recording.framing import (
     Fields,
 )
 
-#: So many faults are kept; the rest is counted.
+#: Number of faults that are kept; the rest is counted.
 KEPT = 50
 _NAMES = {
     SCHEMA: "schema",
@@ -51,7 +51,7 @@ class Index:
         #: Schemas and channels by number, and those that the summary repeats.
         self._described: dict[int, dict[int, bytes]] = {SCHEMA: {}, CHANNEL: {}}
         self._repeated: dict[int, set[int]] = {SCHEMA: set(), CHANNEL: set()}
-        #: Messages of the chunk that was read last for which no message index came yet; where the next one must stand.
+        #: Messages of the chunk that was read last for which no message index came yet; where the next one must be.
         self._places: dict[int, list[int]] = {}
         self._chunk: _Entry = {}
         self._next = 0
@@ -59,7 +59,7 @@ class Index:
         self._messages: dict[int, int] = {}
         self._loose = 0
         self._first_ns, self._last_ns = 2**64, 0
-        #: Groups of the summary as they stand there, and as the summary offsets state.
+        #: Groups of the summary as they are there, and as the summary offsets state.
         self._groups: list[list[int]] = []
         self._stated: list[tuple[int, int, int]] = []
         self._offsets_at = 0
@@ -80,7 +80,7 @@ class Index:
         head : Fields
             Its own fields.
         offset, length : int
-            Where it stands, bytes.
+            Where it is, bytes.
         places : dict of int to list of int
             By channel: log time (ns) and place in the chunk (bytes) of one message after the other.
         """
@@ -118,7 +118,7 @@ class Index:
         Parameters
         ----------
         offset, length : int
-            Where it stands, bytes.
+            Where it is, bytes.
         channel : int
             Number of the channel.
         entries : bytes
@@ -126,7 +126,7 @@ class Index:
         """
         where = f"message index of channel {channel} at byte {offset}"
         if offset != self._next:
-            self._fault(where, "does not stand behind a chunk")
+            self._fault(where, "does not follow a chunk")
             return
         self._next += length
         self._chunk["length of the message indexes"] += length
@@ -157,7 +157,7 @@ class Index:
         self._places = {}
 
     def add_loose(self, messages: dict[int, int], first_ns: int, last_ns: int) -> None:
-        """Note the messages that stand in no chunk.
+        """Note the messages that are in no chunk.
 
         Parameters
         ----------
@@ -174,7 +174,7 @@ class Index:
     def add_description(self, kind: int, number: int, body: bytes) -> None:
         """Note a schema or channel."""
         if self._described[kind].setdefault(number, body) != body:
-            self._fault(f"{_NAMES[kind]} {number}", "stands there twice, and not the same")
+            self._fault(f"{_NAMES[kind]} {number}", "occurs twice, with different content")
 
     def add_attachment(
         self, offset: int, length: int, log_ns: int, create_ns: int, size: int, name: str, media_type: str
@@ -203,7 +203,7 @@ class Index:
         kind : int
             Its kind.
         offset, length : int
-            Where it stands, bytes.
+            Where it is, bytes.
         fields : Fields
             Its fields.
         """
@@ -213,7 +213,7 @@ class Index:
             fields.done()
             return
         if self._offsets_at:
-            self._fault(_NAMES[kind], f"stands at byte {offset}, behind the summary offsets")
+            self._fault(_NAMES[kind], f"is at byte {offset}, after the summary offsets")
         if self._groups and self._groups[-1][0] == kind:
             self._groups[-1][2] += length
         else:
@@ -222,7 +222,7 @@ class Index:
             self._entry(kind, *_entry_of(kind, fields))
         elif kind == STATISTICS:
             if self._statistics is not None:
-                self._fault("statistics", "stand there twice")
+                self._fault("statistics", "occur twice")
             self._statistics = _statistics_of(fields)
         else:
             self._repeat(kind, fields)
@@ -231,9 +231,9 @@ class Index:
         where = f"{_NAMES[kind]} of the {_THINGS[kind]} at byte {offset}"
         due = self._due[kind].get(offset)
         if due is None:
-            self._fault(where, f"no {_THINGS[kind]} stands there")
+            self._fault(where, f"no {_THINGS[kind]} is there")
         elif offset in self._found[kind]:
-            self._fault(where, "stands there twice")
+            self._fault(where, "occurs twice")
         else:
             self._found[kind].add(offset)
             self._compare(where, entry, due)
@@ -241,13 +241,13 @@ class Index:
     def _compare(self, where: str, entry: _Entry, due: _Entry) -> None:
         for name, value in due.items():
             if entry[name] != value:
-                self._fault(where, f"{name}: {entry[name]!r} stands there, {value!r} is right")
+                self._fault(where, f"{name}: {entry[name]!r} is there, {value!r} is right")
 
     def _repeat(self, kind: int, fields: Fields) -> None:
         body = fields.rest()
         number = int.from_bytes(body[:2], "little")
         if self._described[kind].get(number) != body or number in self._repeated[kind]:
-            self._fault(f"{_NAMES[kind]} {number}", "is repeated in the summary otherwise than it stands in the file")
+            self._fault(f"{_NAMES[kind]} {number}", "is repeated in the summary otherwise than in the file")
         self._repeated[kind].add(number)
 
     def finish(self, summary_start: int, footer_at: int, footer: Fields) -> None:
@@ -256,14 +256,14 @@ class Index:
         Parameters
         ----------
         summary_start, footer_at : int
-            Where the summary and the footer stand, bytes.
+            Where the summary and the footer are, bytes.
         footer : Fields
             Its fields.
         """
         self._close_chunk()
         chunks = len(self._due[CHUNK_INDEX])
         if chunks and self._loose:
-            self._fault("chunk index", f"{self._loose} message(s) stand in no chunk, so it leads to none of them")
+            self._fault("chunk index", f"{self._loose} message(s) are in no chunk, so it leads to none of them")
         if footer_at == summary_start:
             self._fault("summary", "is missing, so readers that seek find nothing")
             return
@@ -315,7 +315,7 @@ class Index:
         for group in self._stated:
             if group[2] and group not in groups:
                 name = _NAMES.get(group[0], group[0])
-                self._fault(f"summary offset of kind {name}", f"none of them stand at byte {group[1]}")
+                self._fault(f"summary offset of kind {name}", f"none of them is at byte {group[1]}")
 
 
 def _entry_of(kind: int, fields: Fields) -> tuple[int, _Entry]:

@@ -1,4 +1,4 @@
-"""Reading recordings: every whole message of an MCAP file, finished or torn, in the order of the file."""
+"""Reading recordings: every complete message of an MCAP file, finished or torn, in the order of the file."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def decode_with(decoder: msgspec.json.Decoder[_T], record: Record, file: str) ->
     record : Record
         The message.
     file : str
-        Where it stands, for the error.
+        Where it is, for the error.
 
     Raises
     ------
@@ -224,8 +224,8 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
 def last_value(path: Path) -> bytes:
     """Return the value with which the chain of the next file begins, empty where a file has no chain.
 
-    It is that of the last whole record, but not of a seal that was added afterwards, when a torn end was finished: the
-    next file was begun without it.
+    It is that of the last complete record, but not of a seal that was added afterwards, when a torn end was finished:
+    the next file was begun without it.
 
     Raises
     ------
@@ -249,7 +249,7 @@ def last_value(path: Path) -> bytes:
 def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:
     """Return a sequence number that the machine has never published.
 
-    Numbers go on after the last one on disk. A recording may have been removed, or a disk may not have taken the
+    Numbers continue after the last one on disk. A recording may have been removed, or a disk may not have accepted the
     last ones, so the number is also at least that of the periods since 2020: a service cannot have published
     more samples than there were periods.
 

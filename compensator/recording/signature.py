@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -12,6 +12,12 @@ from compensator.messages import Seal
 from compensator.recording.chain import signed_bytes
 
 _MISSING = "signatures need the package cryptography: pip install quill-compensator[sign]"
+#: Why a file is no key, by the half that was expected.
+_UNREADABLE = {
+    "private": "recording.signing_key: no PEM private key without a password",
+    "public": "no PEM public key, expected the machine's (openssl pkey -pubout)",
+    "exchanged": "is a private key, which stays on its machine; expected the public one (openssl pkey -pubout)",
+}
 
 
 class Signer:
@@ -29,20 +35,9 @@ class Signer:
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-            from cryptography.hazmat.primitives.serialization import load_pem_private_key
-        except ImportError as error:
-            raise ConfigError(_MISSING) from error
-        data = _read(path, ConfigError)
-        try:
-            key = load_pem_private_key(data, password=None)
-        except (ValueError, TypeError) as error:
-            raise ConfigError(f"{path}: recording.signing_key: no PEM private key without a password") from error
-        if not isinstance(key, Ed25519PrivateKey):
-            raise ConfigError(f"{path}: recording.signing_key: {type(key).__name__}, expected an Ed25519 key")
+        key = _read_key(path, "private", ConfigError)
         self._key = key
-        self.public_key = key.public_key().public_bytes_raw().hex()
+        self.public_key: str = key.public_key().public_bytes_raw().hex()
 
     def sign(self, seal: Seal) -> Seal:
         """Return the seal with its signature."""
@@ -65,26 +60,12 @@ class Verifier:
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-            from cryptography.hazmat.primitives.serialization import load_pem_public_key
-        except ImportError as error:
-            raise UsageError(_MISSING) from error
-        data = _read(path, UsageError)
-        try:
-            key = load_pem_public_key(data)
-        except (ValueError, TypeError) as error:
-            if b"PRIVATE KEY" in data:
-                words = "is a private key, which stays on its machine; expected the public one (openssl pkey -pubout)"
-                raise UsageError(f"{path}: {words}") from error
-            raise UsageError(f"{path}: no PEM public key, expected the machine's (openssl pkey -pubout)") from error
-        if not isinstance(key, Ed25519PublicKey):
-            raise UsageError(f"{path}: {type(key).__name__}, expected an Ed25519 public key")
-        self._key: Any = key
-        self.public_key = key.public_bytes_raw().hex()
+        key = _read_key(path, "public", UsageError)
+        self._key = key
+        self.public_key: str = key.public_bytes_raw().hex()
 
     def holds(self, seal: Seal) -> bool:
-        """Tell whether the seal was signed with the private half of this key."""
+        """Return whether the seal was signed with the private half of this key."""
         from cryptography.exceptions import InvalidSignature
 
         try:
@@ -94,8 +75,26 @@ class Verifier:
         return seal.public_key == self.public_key
 
 
-def _read(path: Path, error_kind: type[ConfigError] | type[UsageError]) -> bytes:
+def _read_key(path: Path, half: Literal["private", "public"], error_kind: type[ConfigError] | type[UsageError]) -> Any:
+    """Return one half of a pair of keys from its PEM file."""
     try:
-        return path.read_bytes()
+        from cryptography.hazmat.primitives import serialization
+        from cryptography.hazmat.primitives.asymmetric import ed25519
+    except ImportError as error:
+        raise error_kind(_MISSING) from error
+    try:
+        data = path.read_bytes()
     except OSError as error:
         raise error_kind(f"{path}: {error.strerror or error}; expected a key") from error
+    kind: type[Any] = getattr(ed25519, f"Ed25519{half.title()}Key")
+    try:
+        if half == "private":
+            key: Any = serialization.load_pem_private_key(data, password=None)
+        else:
+            key = serialization.load_pem_public_key(data)
+    except (ValueError, TypeError) as error:
+        words = _UNREADABLE["exchanged" if half == "public" and b"PRIVATE KEY" in data else half]
+        raise error_kind(f"{path}: {words}") from error
+    if not isinstance(key, kind):
+        raise error_kind(f"{path}: {type(key).__name__}, expected an Ed25519 {half} key")
+    return key

@@ -17,8 +17,10 @@ import numpy as np
 
 from compensator.errors import DataError
 from compensator.messages import MESSAGES, EstimateMessage, Event, Offset, Sample, number
+from compensator.reasons import State
 from compensator.recording.container import PAYLOAD, Container, Contents, Damaged, Torn
 from compensator.recording.reading import in_order
+from compensator.remarks import RecordingEnd
 from compensator.report.envelope import Envelope, Stretches
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, File, History, Missed, Period
 
@@ -52,13 +54,13 @@ def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] 
         If one of them is no recording, there are no samples, or they are of several machines.
     """
     ordered = in_order(paths)
-    whole = sum(path.stat().st_size for path in ordered)
+    total = sum(path.stat().st_size for path in ordered)
     reader, done = _Reader(), 0
     for path in ordered:
         with Container(path) as container:
             for i in reader.file(path.name, container):
                 if progress is not None and i % 1000 == 0:
-                    progress(done + container.position, whole)
+                    progress(done + container.position, total)
         done += path.stat().st_size
     return reader.result()
 
@@ -106,9 +108,9 @@ class _Reader:
                         file.add(message.time_utc_ns * _NS)
                     self._add[topic](message)
                 yield i
-            file.end = "finished" if container.contents.ended else "no end"
+            file.end = RecordingEnd.FINISHED if container.contents.ended else RecordingEnd.OPEN
         except Torn:
-            file.end = "no end"
+            file.end = RecordingEnd.OPEN
         except Damaged as damage:
             file.end = f"damaged from byte {damage.offset} on"
 
@@ -120,7 +122,7 @@ class _Reader:
         history = self.history
         if not history.whole.samples or not history.states:
             names = ", ".join(file.name for file in history.files[:3])
-            raise DataError(f"{names}: no samples; expected recordings of a machine's service")
+            raise DataError(f"{names}: no samples in it; expected recordings of a machine's service")
         history.episodes.sort(key=lambda episode: episode.number)
         return history
 
@@ -146,7 +148,7 @@ class _Reader:
         self.history.whole.samples += 1
         self._day(t).samples += 1
         for name, channel in sample.channels.items():
-            good = channel.quality == "good"
+            good = channel.is_good
             self._append(f"channel {name}", t, number(channel.mean) if good else math.nan)
             missed = self.history.channels.get(name)
             if missed is None:
@@ -222,7 +224,7 @@ class _Reader:
             self._episode = replace(episode, seconds=last - episode.first_s, last_s=last)
             return
         self._close()
-        if state != "ok":
+        if state != State.OK:
             self._episode = Episode(last - first, next(self._numbers), first, last, state, reasons)
 
     def _close(self) -> None:

@@ -6,6 +6,7 @@ import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 
+from compensator.remarks import RecordingEnd
 from compensator.report.envelope import Envelope, Stretches
 
 #: Numbers of events and episodes that are kept; the others are only counted.
@@ -127,14 +128,14 @@ class File:
     first_s, last_s : float
         Times of the first and last sample, s since 1970 UTC; NaN without any.
     end : str
-        `finished`, `no end`, or where it is damaged.
+        `RecordingEnd.FINISHED`, `RecordingEnd.OPEN`, or where it is damaged.
     """
 
     name: str
     samples: int = 0
     first_s: float = math.nan
     last_s: float = math.nan
-    end: str = "finished"
+    end: str = RecordingEnd.FINISHED
 
     def add(self, at_s: float) -> None:
         """Count a sample."""

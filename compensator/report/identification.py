@@ -13,7 +13,7 @@ from compensator.identify.calibration import Calibration, Part
 from compensator.identify.choice import Candidate
 from compensator.identify.comparison import Row as Comparison
 from compensator.identify.criticism import LAGS, Criticism, PathView, ResidualView
-from compensator.identify.summary import verdict, with_std
+from compensator.identify.summary import error_rows, verdict, with_std
 from compensator.model.thermal_model import ThermalModel
 from compensator.report.formats import write
 from compensator.report.page import (
@@ -133,39 +133,14 @@ def _residuals(calibration: Calibration) -> Figure:
 
 
 def _errors(calibration: Calibration) -> Table:
-    hours = calibration.model.period_s / 3600.0
-    rows = [
-        [
-            part.name,
-            part.role,
-            f"{part.y_um.size * hours:.1f}",
-            f"{part.model.fit_pct:.2f}",
-            f"{part.model.rms_um:.2f}",
-            f"{part.model.peak_to_peak_um:.2f}",
-            f"{part.nothing.rms_um:.2f}",
-            f"{part.persistence.rms_um:.2f}",
-        ]
-        for part in calibration.parts
-    ]
-    rows.append(
-        [
-            "cross-validation over blocks of the fitted data",
-            "held out",
-            "",
-            "",
-            f"{calibration.folds_rms_um:.2f}",
-            "",
-            "",
-            "",
-        ]
-    )
-    arx = calibration.arx_rms_um
-    left = f"{arx:.2f}" if np.isfinite(arx) else "unstable"
-    rows.append(["ARX of the same structure, for comparison", "fitted", "", "", left, "", "", ""])
     return Table(
         title="Errors in free run",
         head=["data", "part", "h", "fit %", "rms µm", "peak to peak µm", "uncompensated µm", "persistence µm"],
-        rows=rows,
+        rows=error_rows(
+            calibration,
+            folds="cross-validation over blocks of the fitted data",
+            arx="ARX of the same structure, for comparison",
+        ),
         note="Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖). Persistence: the last value before the part is held. "
         "Runs that were not fitted are zeroed on their first hour.",
     )

@@ -16,7 +16,7 @@ from itertools import chain, count, repeat
 from pathlib import Path
 from typing import Literal
 
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.reasons import Remark, explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
@@ -36,7 +36,7 @@ _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-
 
 
 @dataclass(frozen=True, slots=True)
-class Code:
+class CodeLink:
     """A state, reason, quality or warning; links to its meaning and action at the end of the page.
 
     Parameters
@@ -68,7 +68,7 @@ class Link:
 
 
 #: Content of a cell or line: text, codes and links.
-Cell = str | Code | Link | tuple[str | Code | Link, ...]
+Cell = str | CodeLink | Link | tuple[str | CodeLink | Link, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +116,7 @@ def warnings_of(cautions: Iterable[Remark]) -> Words:
 
 def sentence_of(caution: Remark) -> Cell:
     """Return a warning or remark as a line with a link to its code."""
-    return (str(caution), " ", Code(caution.code))
+    return (str(caution), " ", CodeLink(caution.code))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,7 +194,7 @@ def write_page(path: Path, page: Page) -> Path:
     pathlib.Path
         The same path.
     """
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(html_of(page))
     return path
 
@@ -205,7 +205,7 @@ def codes_of(blocks: Iterable[Block]) -> list[str]:
     for block in blocks:
         for cell in _cells(block):
             for part in cell if isinstance(cell, tuple) else (cell,):
-                if isinstance(part, Code) and explain(part.code) is not None:
+                if isinstance(part, CodeLink) and explain(part.code) is not None:
                     words[part.word] = None
     return list(words)
 
@@ -214,7 +214,7 @@ def _text(cell: Cell) -> str:
     """Return the text of a cell."""
     if isinstance(cell, tuple):
         return "".join(map(_text, cell))
-    return cell if isinstance(cell, str) else cell.code if isinstance(cell, Code) else cell.text
+    return cell if isinstance(cell, str) else cell.code if isinstance(cell, CodeLink) else cell.text
 
 
 def _cells(block: Block) -> Iterator[Cell]:
@@ -310,7 +310,7 @@ def _inline(cell: Cell) -> str:
         return "".join(map(_inline, cell))
     if isinstance(cell, Link):
         return f'<a href="{html.escape(cell.href)}">{html.escape(cell.text)}</a>'
-    if isinstance(cell, Code):
+    if isinstance(cell, CodeLink):
         code = f"<code>{html.escape(cell.code)}</code>"
         return code if explain(cell.code) is None else f'<a href="#word-{html.escape(cell.word)}">{code}</a>'
     return html.escape(cell)
@@ -320,7 +320,7 @@ def _inline(cell: Cell) -> str:
 __all__ = [
     "Block",
     "Cell",
-    "Code",
+    "CodeLink",
     "Details",
     "Figure",
     "Line",

@@ -7,14 +7,15 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
-from compensator.reasons import Remark, explain
+from compensator.reasons import Remark, State, explain
+from compensator.remarks import AuditRemark, RecordingEnd
 from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
 from compensator.report.notation import plain, signed
 from compensator.report.page import (
     Block,
     Cell,
-    Code,
+    CodeLink,
     Details,
     Figure,
     Page,
@@ -29,9 +30,9 @@ from compensator.report.page import (
 
 TIME = "time, UTC"
 #: Order of the states on the page.
-STATES = ("ok", "degraded", "starting", "hold", "fault", NO_RECORDING)
+STATES = (State.OK, State.DEGRADED, State.STARTING, State.HOLD, State.FAULT, NO_RECORDING)
 #: States in which the offset follows the machine.
-_FOLLOWS = ("ok", "degraded")
+_FOLLOWS = (State.OK, State.DEGRADED)
 #: Share of the time without a following offset (or degraded) above which the verdict is worse.
 _MUCH = 0.1
 #: A remaining error beyond this multiple of the stated standard deviation is not noise: the model or a sensor is wrong.
@@ -40,8 +41,6 @@ _BEYOND = 3.0
 _DAYS = 31
 #: Longest table that is shown unfolded, rows.
 _ROWS = 12
-#: Ends of a recording that are codes.
-_ENDS: Mapping[str, Cell] = {"finished": Code("finished"), "no end": Code("open")}
 #: Largest numbers of curves and of shaded intervals in a figure.
 _CURVES, _SHADED = 5, 100
 _UNITS = (
@@ -148,7 +147,7 @@ def _beyond(whole: Period) -> Remark | None:
     if not (whole.left.samples and 0.0 < _BEYOND * whole.std.rms < whole.left.rms):
         return None
     remains = f"{_short(whole.left.rms)} rms remain with the correction; the service states {_short(whole.std.rms)}."
-    return Remark("left_beyond_stated", remains)
+    return Remark(AuditRemark.LEFT_BEYOND_STATED, remains)
 
 
 def _short(value_um: float) -> str:
@@ -160,9 +159,9 @@ def _tone(history: History) -> Tone:
     total = sum(seconds.values())
     without = total - sum(seconds[state] for state in _FOLLOWS)
     worse = history.whole.left.samples and history.whole.left.rms > history.whole.measured.rms
-    if "fault" in history.states or without > _MUCH * total or worse:
+    if State.FAULT in history.states or without > _MUCH * total or worse:
         return "bad"
-    doubtful = without or seconds["degraded"] > _MUCH * total or _beyond(history.whole) is not None
+    doubtful = without or seconds[State.DEGRADED] > _MUCH * total or _beyond(history.whole) is not None
     return "warn" if doubtful else "good"
 
 
@@ -196,9 +195,9 @@ def _curves(
 
 
 def _offset(history: History) -> Figure:
-    stood = [
+    held = [
         Span("offset held", *piece)
-        for state in ("hold", "fault")
+        for state in (State.HOLD, State.FAULT)
         if state in history.states
         for piece in history.states[state].pieces
     ]
@@ -207,12 +206,12 @@ def _offset(history: History) -> Figure:
     if history.whole.left.samples:
         curves = {"measured": "measured", "remaining (measured + offset)": "left"} | curves
         words += f" Remaining error: {history.whole.left.rms:.2f} µm rms."
-    return _curves(history, "Offset and remaining error", "Y, µm", curves, words, 3.4, tuple(stood[:_SHADED]))
+    return _curves(history, "Offset and remaining error", "Y, µm", curves, words, 3.4, tuple(held[:_SHADED]))
 
 
 def _band(history: History) -> Figure:
     strips = [
-        Strip(state, tuple(history.states[state].pieces), 1 if state == "ok" else 0)
+        Strip(state, tuple(history.states[state].pieces), 1 if state == State.OK else 0)
         for state in STATES
         if state in history.states
     ]
@@ -298,7 +297,7 @@ def _states(history: History) -> Table:
         if state in history.states:
             seconds, times = history.whole.seconds[state], history.states[state].count
             meaning, action = explain(state) or ("The service did not run.", "See the events before and after.")
-            cell: Cell = state if state == NO_RECORDING else Code(state)
+            cell: Cell = state if state == NO_RECORDING else CodeLink(state)
             rows.append([cell, _minutes(seconds), _share(history, state), str(times), meaning, action])
     return Table(title="Time in each state", rows=rows, head=["state", "min", "share", "times", "meaning", "action"])
 
@@ -308,16 +307,16 @@ def _reasons(history: History) -> Table:
     for reason, stretch in sorted(history.reasons.items(), key=lambda item: -history.reason_seconds[item[0]]):
         meaning, action = explain(reason) or ("", "")
         seconds, last = history.reason_seconds[reason], stretch.pieces[-1][1]
-        rows.append([Code(reason), _minutes(seconds), str(stretch.count), _utc(last), meaning, action])
+        rows.append([CodeLink(reason), _minutes(seconds), str(stretch.count), _utc(last), meaning, action])
     return Table(title="Reasons", rows=rows, head=["reason", "min", "times", "last, UTC", "meaning", "action"])
 
 
 def _episodes(history: History) -> Block:
     def row(episode: Episode) -> list[Cell]:
-        reasons: list[str | Code] = []
+        reasons: list[str | CodeLink] = []
         for reason in episode.reasons:
-            reasons += [", ", Code(reason)] if reasons else [Code(reason)]
-        state: Cell = Code(episode.state) if episode.state else NO_RECORDING
+            reasons += [", ", CodeLink(reason)] if reasons else [CodeLink(reason)]
+        state: Cell = CodeLink(episode.state) if episode.state else NO_RECORDING
         return [_utc(episode.first_s), _minutes(episode.seconds), state, tuple(reasons)]
 
     note = f"The longest {EPISODES} of {history.episodes_count}." if history.episodes_count > EPISODES else ""
@@ -354,8 +353,8 @@ def _days(history: History) -> list[Block]:
 
 def _day(name: str, period: Period) -> list[Cell]:
     seconds = period.seconds
-    held = sum(seconds[state] for state in ("starting", "hold", "fault"))
-    times = (seconds["ok"], seconds["degraded"], held, seconds[NO_RECORDING])
+    held = sum(seconds[state] for state in (State.STARTING, State.HOLD, State.FAULT))
+    times = (seconds[State.OK], seconds[State.DEGRADED], held, seconds[NO_RECORDING])
     return [
         name,
         str(period.samples),
@@ -392,9 +391,9 @@ def _missed(history: History) -> Block:
 
 
 def _codes(counts: Mapping[str, int]) -> Cell:
-    parts: list[str | Code] = []
+    parts: list[str | CodeLink] = []
     for code, number in sorted(counts.items(), key=lambda item: -item[1]):
-        parts += [", ", Code(code), f" {number}"] if parts else [Code(code), f" {number}"]
+        parts += [", ", CodeLink(code), f" {number}"] if parts else [CodeLink(code), f" {number}"]
     return tuple(parts) or ""
 
 
@@ -406,7 +405,13 @@ def _events(history: History) -> Block:
 
 def _files(history: History) -> Details:
     files: list[list[Cell]] = [
-        [file.name, str(file.samples), _utc(file.first_s), _utc(file.last_s), _ENDS.get(file.end, file.end)]
+        [
+            file.name,
+            str(file.samples),
+            _utc(file.first_s),
+            _utc(file.last_s),
+            CodeLink(file.end) if isinstance(file.end, RecordingEnd) else file.end,
+        ]
         for file in history.files
     ]
     models: list[list[Cell]] = [[name, _utc(first), sha] for sha, (name, first) in history.models.items()]

@@ -18,7 +18,7 @@ _HEAD = re.compile(r'<h1>([^<]*)</h1><p class="verdict (good|warn|bad)"><b>[^<]*
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
+class PageFile:
     """A page of the compensator.
 
     Parameters
@@ -35,7 +35,7 @@ class Found:
     tone: Tone
 
 
-def pages_in(folder: Path) -> list[Found]:
+def pages_in(folder: Path) -> list[PageFile]:
     """Return the pages of a folder and its subfolders, the uppermost first.
 
     Parameters
@@ -48,18 +48,18 @@ def pages_in(folder: Path) -> list[Found]:
         head = _HEAD.search(path.read_text(encoding="utf-8", errors="replace"))
         if head is not None:
             title, tone, verdict = map(html.unescape, head.groups())
-            found.append(Found(path=path, title=title, verdict=verdict, tone=cast(Tone, tone)))
+            found.append(PageFile(path=path, title=title, verdict=verdict, tone=cast(Tone, tone)))
     return found
 
 
-def overview(folder: Path, pages: Sequence[Found], *, relative_to: Path) -> Page:
+def overview(folder: Path, pages: Sequence[PageFile], *, relative_to: Path) -> Page:
     """Make a page that links to others and lists folders of recordings.
 
     Parameters
     ----------
     folder : pathlib.Path
         The folder of the results.
-    pages : sequence of Found
+    pages : sequence of PageFile
         The pages, the most important first.
     relative_to : pathlib.Path
         Folder of the overview itself: links are relative to it.

@@ -1,1 +1,1 @@
-"""JSON Schemas of the messages; `python -m compensator.schemas` writes them anew from the classes."""
+"""JSON Schemas of the messages; `python -m compensator.schemas` generates them from the classes."""

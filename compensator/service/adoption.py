@@ -1,6 +1,6 @@
 """Prepares another model while the service runs: checks it, warms it up on the recordings, stores it.
 
-All of this runs on a thread of its own and lets samples go first; the swap itself lies between two samples and is the
+All of this runs on a thread of its own that yields to samples; the swap itself lies between two samples and is the
 daemon's.
 """
 
@@ -14,6 +14,7 @@ from typing import Any
 
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError, ModelError, ServiceError
+from compensator.events import CommandName
 from compensator.messages import Sample
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
@@ -24,7 +25,7 @@ from compensator.service.warm_up import WARM_UP, WarmUp, warm_up
 
 #: Longest payload of a command that brings a model, bytes.
 LONGEST_MODEL = 1_000_000
-#: After so many samples of a warm-up the thread sleeps for a moment, so that it never holds a sample up.
+#: Number of samples of a warm-up after which the thread sleeps for a moment, so that it never delays a sample.
 LET_OTHERS = 10
 MOMENT_S = 0.001
 
@@ -94,7 +95,7 @@ class Wanted:
             text=arguments.get("model", ""),
             force=arguments.get("force", False),
         )
-        if action == "adopt" and not (wanted.sha256 or wanted.text):
+        if action == CommandName.ADOPT and not (wanted.sha256 or wanted.text):
             raise ServiceError("adopt: expected model, the text of a model file, or sha256, that of one adopted before")
         if wanted.text and wanted.sha256 and sha256_of(wanted.text.encode()) != wanted.sha256:
             raise ServiceError(f"adopt: the model's sha256 is {sha256_of(wanted.text.encode())}, not {wanted.sha256}")
@@ -158,7 +159,7 @@ class Adoption:
         running : ThermalModel
             The model in use.
         zero : dict or None
-            The zero that stands, None before the first.
+            The zero in force, None before the first.
         now_ns : int
             Now, ns since 1970 UTC.
 
@@ -176,14 +177,14 @@ class Adoption:
                 f"model {model.name}: sample_period_s = {model.period_s:g}, the service runs at {running.period_s:g} s"
             )
         prepared = Prepared(data=data, warm=self._warmed(model, zero, wanted.force))
-        if wanted.action == "back":
+        if wanted.action == CommandName.BACK:
             self._store.back(name=model.name, time_utc_ns=now_ns)
         else:
             self._store.adopt(data, name=model.name, time_utc_ns=now_ns)
         return prepared
 
     def _data(self, wanted: Wanted) -> bytes:
-        if wanted.action == "adopt":
+        if wanted.action == CommandName.ADOPT:
             return wanted.text.encode() if wanted.text else self._store.load(wanted.sha256)
         before = self._store.before()
         if before is None:

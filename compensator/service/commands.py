@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from compensator.errors import ServiceError
+from compensator.events import CommandName, EventKind
 from compensator.service.adoption import LONGEST_MODEL, Wanted
 from compensator.service.compensation import Compensation
 from compensator.service.journal import Journal
@@ -18,9 +19,9 @@ from compensator.service.takeover import Takeover, refusal, sent_by
 
 #: Longest payload of a command without a model, bytes.
 LONGEST_COMMAND = 10_000
-#: So many commands wait for the next sample at most.
+#: Largest number of commands that wait for the next sample.
 WAITING_COMMANDS = 100
-#: So many refused commands are noted between two samples; a flood must not displace other events.
+#: Largest number of refused commands noted between two samples; a flood must not displace other events.
 NOTED_REFUSALS = 10
 
 
@@ -59,8 +60,8 @@ class Commands:
         try:
             arguments = self._checked(name, payload, sender)
             if loop is None or self._waiting.full():
-                raise ServiceError("the service cannot take a command now")
-            if name in ("adopt", "back"):
+                raise ServiceError("the service cannot accept a command now")
+            if name in (CommandName.ADOPT, CommandName.BACK):
                 wanted = Wanted.of(name, arguments)
                 reply: Future[dict[str, Any]] = Future()
                 loop.call_soon_threadsafe(self._takeover.begin, wanted, reply, sender)
@@ -77,19 +78,19 @@ class Commands:
         self._refused = 0
         while not self._waiting.empty():
             name, arguments, sender = self._waiting.get_nowait()
-            self._journal.note("command", name, arguments | {"command": name} | sent_by(sender))
+            self._journal.note(EventKind.COMMAND, name, arguments | {"command": name} | sent_by(sender))
             execute(compensation, name, arguments)
 
     def _checked(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
         """Return the arguments of an acceptable command."""
-        if len(payload) > (LONGEST_MODEL if name in ("adopt", "back") else LONGEST_COMMAND):
+        if len(payload) > (LONGEST_MODEL if name in (CommandName.ADOPT, CommandName.BACK) else LONGEST_COMMAND):
             raise ServiceError(f"{name}: the payload has {len(payload)} bytes, more than a command may have")
         try:
             arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise ServiceError(f"{name}: the payload is no JSON object") from error
         mode = arguments.get("mode", "auto")
-        if name not in COMMANDS or (name == "zero" and mode not in ("auto", "rest", "warm")):
+        if name not in COMMANDS or (name == CommandName.ZERO and mode not in ("auto", "rest", "warm")):
             raise ServiceError(
                 f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back"
             )
@@ -109,4 +110,4 @@ class Commands:
     def _note_refusal(self, name: str, why: str, sender: Sender) -> None:
         self._refused += 1
         if self._refused <= NOTED_REFUSALS:
-            self._journal.note("command_refused", why, {"name": name, "ok": False} | sent_by(sender))
+            self._journal.note(EventKind.COMMAND_REFUSED, why, {"name": name, "ok": False} | sent_by(sender))

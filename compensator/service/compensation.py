@@ -41,7 +41,7 @@ MEAN_SAMPLES = 5
 
 #: Longest pause that is passed over, in samples: a longer one would delay the sample after it.
 MOST_BRIDGED = 1500
-#: A state that started unknown counts as known after so many of the slowest time constants (5 % are left then).
+#: After how many slowest time constants an unknown initial state counts as known (5 % are left then).
 KNOWN_AFTER = 3.0
 
 
@@ -279,7 +279,7 @@ class Compensation:
         """Wait for the zero of a record, whatever the configuration requests for the start."""
         self._zero = ZeroState()
 
-    def go_on_from(self, offset_um: float, *, model_changed: bool = False) -> None:
+    def continue_from(self, offset_um: float, *, model_changed: bool = False) -> None:
         """Continue from an offset; from there it moves at the permitted rate.
 
         Parameters
@@ -303,7 +303,7 @@ class Compensation:
         memory = other._memory
         self._memory.operator_hold, self._memory.internal_error = memory.operator_hold, memory.internal_error
         self._zero.wanted, self._zero.mode = other._zero.wanted, other._zero.mode
-        self.go_on_from(other.offset_um, model_changed=memory.estimate is not None)
+        self.continue_from(other.offset_um, model_changed=memory.estimate is not None)
 
     # ------------------------------------------------------------------ one sample
 

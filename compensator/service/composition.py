@@ -61,7 +61,7 @@ async def run_service(
     clock : Clock, optional
         The machine's own by default.
     samples : int, optional
-        Stop after so many.
+        Number of samples to stop after.
     on_ready : callable, optional
         Called with the daemon once everything is open.
     on_sample : callable, optional
@@ -94,11 +94,11 @@ async def run_service(
         try:
             for warning in setup.warnings():
                 log.warning("%s: warning: %s", loaded.path, warning.marked)
-        except ConfigError as error:  # recording continues, whether anybody can receive the offset or not
+        except ConfigError as error:  # recording continues, whether the offset can be received or not
             log.error("%s; the router will refuse the service", error)
         checkpoint = OffsetCheckpoint(folder, machine)
-        early = checkpoint.read(config.limits.offset_max_um)
-        resumed = resume(loaded, setup.model, early)
+        checkpointed = checkpoint.read(config.limits.offset_max_um)
+        resumed = resume(loaded, setup.model, checkpointed)
         first = first_sequence(folder, machine, clock.utc_ns(), setup.model.period_s)
         checks = Note(EventKind.PLAUSIBILITY, resumed.compensation.plausibility.describe(), {})
         daemon = Daemon(
@@ -108,7 +108,7 @@ async def run_service(
             recorder=recorder,
             publish=publish,
             clock=clock,
-            first_sequence=max(first, early.seq + 1 if early is not None else 0),
+            first_sequence=max(first, checkpointed.seq + 1 if checkpointed is not None else 0),
             adoption=Adoption(config, folder, setup.store),
             notes=(*resumed.notes, checks),
             checkpoint=checkpoint,

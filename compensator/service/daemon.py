@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from compensator import __version__
 from compensator.clock import NS, Clock
 from compensator.config import Config
-from compensator.events import Note, PauseData
+from compensator.events import EventKind, Note, PauseData
 from compensator.messages import SCHEMA, Offset, Sample, Status, encode
 from compensator.service.adoption import Adoption
 from compensator.service.commands import Commands
@@ -28,10 +28,10 @@ from drivers.reading import Device
 
 log = logging.getLogger("compensator")
 
-#: So long the loop blocks for the disk: a fraction of the poll interval, so that no poll is late, at most so many s.
+#: How long the loop blocks for the disk: a fraction of the poll interval, so that no poll is late, and a limit in s.
 DISK_PART, DISK_S = 0.4, 2.0
-#: So long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
-#: at most so many s. An offset of that age does no harm, its rate is published with it; one not on record might.
+#: How long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
+#: and a limit in s. An offset of that age does no harm, its rate is published with it; one not on record might.
 PATIENCE_PART, PATIENCE_S = 0.25, 15.0
 
 
@@ -140,7 +140,7 @@ class Daemon:
         Parameters
         ----------
         samples : int, optional
-            Stop after so many.
+            Number of samples to stop after.
         on_sample : callable, optional
             Called with the outcome after each sample was published.
         on_poll : callable, optional
@@ -150,7 +150,7 @@ class Daemon:
         period_s = self._compensation.model.period_s
         polls = max(1, round(period_s / self._config.sampling.poll_interval_s))
         grid = Grid(self._clock, period_s, polls)
-        self._journal.note("start", f"compensator {__version__} with model {self._compensation.model.name}")
+        self._journal.note(EventKind.START, f"compensator {__version__} with model {self._compensation.model.name}")
         for kind, text, data in self._earlier:
             self._journal.note(kind, text, data)
         done = 0
@@ -189,7 +189,7 @@ class Daemon:
                 await self._sample(label_ns)
         except Exception as error:
             log.exception("internal error")
-            self._journal.note("error", f"internal error: {type(error).__name__}: {error}")
+            self._journal.note(EventKind.ERROR, f"internal error: {type(error).__name__}: {error}")
             self._compensation.fail()
             if label_ns is not None:
                 await self._hold(label_ns)
@@ -286,9 +286,7 @@ class Daemon:
         minutes = missing * period_s / 60.0
         text = f"{missing} sample(s) are missing between the last recording and now; "
         if label_ns <= last_ns:
-            text = (
-                "the wall clock stands before the end of the last recording: how long the service was away is unknown"
-            )
+            text = "the wall clock is before the end of the last recording: how long the service was away is unknown"
             self._compensation.pause_of_unknown_length()
         else:
             self._compensation.pause(missing)
@@ -304,7 +302,7 @@ class Daemon:
             bridged=known and minutes <= bridged,
             y_std_um=std,
         )
-        self._journal.note("restart", text, data.table())
+        self._journal.note(EventKind.RESTART, text, data.table())
 
     def _status(self, outcome: Outcome) -> Status:
         model = self._compensation.model
@@ -330,12 +328,12 @@ class Daemon:
     def _note_state(self, offset: Offset) -> None:
         now = " ".join([offset.state, *offset.reasons])
         if now != self._last_state:
-            self._journal.note("state", now, {"state": offset.state, "reasons": offset.reasons})
+            self._journal.note(EventKind.STATE, now, {"state": offset.state, "reasons": offset.reasons})
             self._last_state = now
 
     def _note_clock_step(self, seconds: float) -> None:
         if seconds:
-            self._journal.note("clock", f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
+            self._journal.note(EventKind.CLOCK, f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
 
     def command(self, name: str, payload: bytes, sender: Sender = UNNAMED) -> Reply:
         """Accept a command from another thread; it acts at the next sample.

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from compensator.clock import NS, Clock
-from compensator.events import RecordingCode, RecordingData
+from compensator.events import EventKind, RecordingCode, RecordingData
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
 from compensator.reasons import Reason, Remark
 from compensator.remarks import ServiceWarning
@@ -27,15 +27,15 @@ from compensator.service.offset_checkpoint import OffsetCheckpoint
 
 log = logging.getLogger("compensator")
 
-#: So many samples wait for the disk at most (four hours at one a minute), so that a lost disk costs no memory; then the
-#: oldest are dropped.
+#: Largest number of samples that wait for the disk (four hours at one a minute), so that a lost disk costs no memory;
+#: then the oldest are dropped.
 WAITING_SAMPLES = 240
-#: So many events wait with them; the newest are kept.
+#: Largest number of events that wait with them; the newest are kept.
 WAITING_EVENTS = 1000
 #: Texts of the events when the disk refuses the recording, accepts it too late, and accepts it again.
-DISK_FAILED = "the disk does not take the recording"
-DISK_LATE = "the disk takes the recording too late"
-DISK_BACK = "the disk takes the recording again"
+DISK_FAILED = "the disk does not accept the recording"
+DISK_LATE = "the disk accepts the recording too late"
+DISK_BACK = "the disk accepts the recording again"
 #: How often the log warns that the service waits for the disk at its end, s.
 CLOSING_S = 10.0
 
@@ -112,7 +112,7 @@ class Entry:
         return datetime.fromtimestamp(self.time_utc_ns / NS, UTC).strftime("%Y%m%d")
 
     def inherit(self, dropped: Entry) -> None:
-        """Take over what must not be lost with a sample that is dropped."""
+        """Keep what must not be lost with a sample that is dropped."""
         self.events = [*dropped.events, *self.events][-WAITING_EVENTS:]
         self.model = self.model if self.model is not None else dropped.model
         self.new_file = True
@@ -188,7 +188,7 @@ class Journal:
 
     # ------------------------------------------------------------------ on the loop
 
-    def note(self, kind: str, text: str, data: Mapping[str, Any] | None = None) -> None:
+    def note(self, kind: EventKind, text: str, data: Mapping[str, Any] | None = None) -> None:
         """Publish an event and keep it for the recording."""
         event = Event(
             schema=SCHEMA,
@@ -217,7 +217,7 @@ class Journal:
         estimate: bytes = b"",
         offset: Offset | None = None,
     ) -> Entry:
-        """Have a sample and the waiting events written after everything that waits.
+        """Enqueue a sample and the pending events to be written after everything that waits.
 
         Parameters
         ----------
@@ -278,7 +278,7 @@ class Journal:
             in_flight = bool(entry.reason) and entry in self._writing
         self._note_disk(entry.reason, in_flight, entry.attempt.exception() if entry.attempt.done() else None)
         for text, data in self._recorder.remarks():
-            self.note("recording", text, data)
+            self.note(EventKind.RECORDING, text, data)
         if self._checkpoint is not None and not entry.reason:
             self._checkpoint.remove()
         elif self._checkpoint is not None and entry.offset is not None:
@@ -303,20 +303,20 @@ class Journal:
         if reason and (reason != self._reason or in_flight):
             if error is not None and not isinstance(error, OSError):
                 log.error("internal error", exc_info=error)
-                self.note("recording", f"{DISK_FAILED}: internal error: {type(error).__name__}: {error}", data)
+                self.note(EventKind.RECORDING, f"{DISK_FAILED}: internal error: {type(error).__name__}: {error}", data)
             elif reason == Reason.RECORDING_FAILED:
-                self.note("recording", f"{DISK_FAILED}: {error or self._error}", data)
+                self.note(EventKind.RECORDING, f"{DISK_FAILED}: {error or self._error}", data)
             else:
-                self.note("recording", f"{DISK_LATE}: not within {self._limit_s + self._patience_s:g} s", data)
+                self.note(EventKind.RECORDING, f"{DISK_LATE}: not within {self._limit_s + self._patience_s:g} s", data)
         elif self._reason and not reason:
             lost, self._dropped = self._dropped, 0
             text = f"{DISK_BACK}; " + (f"{lost} sample(s) were not recorded" if lost else "nothing was lost")
-            self.note("recording", text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
+            self.note(EventKind.RECORDING, text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
         self._reason, self._error = reason, error or self._error
 
     async def close(self, state: bytes) -> None:
         """Note that the service ends, and finish the recording, however long the disk takes."""
-        self.note("stop", "the service ends")
+        self.note(EventKind.STOP, "the service ends")
         await self.record(self._clock.utc_ns(), state)
         closing = asyncio.wrap_future(self._executor.submit(self._finish))
         self._executor.shutdown(wait=False)
@@ -328,7 +328,7 @@ class Journal:
         error = closing.exception()
         if isinstance(error, OSError):
             data = RecordingData(code=RecordingCode.NOT_FINISHED)
-            self.note("recording", f"the recording could not be finished: {error}", data.table())
+            self.note(EventKind.RECORDING, f"the recording could not be finished: {error}", data.table())
         elif error is not None:
             raise error
 

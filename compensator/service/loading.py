@@ -181,8 +181,8 @@ def load_signer(loaded: LoadedConfig) -> Signer | None:
     path, folder = loaded.resolve(name), loaded.resolve(loaded.config.recording.folder)
     if path.is_relative_to(folder):
         raise ConfigError(
-            f"{loaded.path}: recording.signing_key = {name!r}: is among the recordings, expected a place that nobody "
-            f"who can change them can read"
+            f"{loaded.path}: recording.signing_key = {name!r}: is among the recordings, expected a place where "
+            f"whoever can change them cannot read it"
         )
     return Signer(path)
 
@@ -206,7 +206,7 @@ def _exposures(zenoh: Zenoh) -> list[Remark]:
     found = []
     outside = [endpoint for endpoint in zenoh.listen if not zenoh.is_loopback(endpoint)]
     if outside:
-        figures = f"zenoh.listen {', '.join(outside)}: anybody who reaches it can publish offsets and send commands."
+        figures = f"zenoh.listen {', '.join(outside)}: whoever reaches it can publish offsets and send commands."
         found.append(Remark(ServiceWarning.OPEN_LISTEN, figures))
     outside = [endpoint for endpoint in zenoh.connect if not zenoh.is_loopback(endpoint)]
     if outside and not zenoh.secured():

@@ -76,7 +76,7 @@ class ModelStore:
         return self.load(adopted[-1].sha256) if adopted else self.configured
 
     def adopted(self) -> bool:
-        """Tell whether a model other than the configured one is in use."""
+        """Return whether a model other than the configured one is in use."""
         return bool(self._read().in_use)
 
     def before(self) -> bytes | None:

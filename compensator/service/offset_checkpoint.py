@@ -28,7 +28,7 @@ MEMORY = Path("/dev/shm")
 _LONGEST = 4096
 
 
-class EarlyOffset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CheckpointedOffset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An offset that was published before it was on disk.
 
     Parameters
@@ -69,13 +69,13 @@ class OffsetCheckpoint:
         value = number(offset.y_offset_um)
         if math.isnan(value):
             return
-        early = EarlyOffset(seq=offset.seq, time_utc_ns=offset.time_utc_ns, y_offset_um=value)
+        checkpointed = CheckpointedOffset(seq=offset.seq, time_utc_ns=offset.time_utc_ns, y_offset_um=value)
         part = self.path.with_suffix(".part")
         try:
             part.unlink(missing_ok=True)
             descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
             with os.fdopen(descriptor, "wb") as file:
-                file.write(msgspec.json.encode(early))
+                file.write(msgspec.json.encode(checkpointed))
             part.replace(self.path)
         except OSError as error:
             if self._written:
@@ -95,7 +95,7 @@ class OffsetCheckpoint:
             figures = f"{self.path}: cannot be removed: {error}."
             log.warning("%s", Remark(ServiceWarning.NOTE_NOT_REMOVED, figures).marked)
 
-    def read(self, offset_max_um: float) -> EarlyOffset | None:
+    def read(self, offset_max_um: float) -> CheckpointedOffset | None:
         """Return the offset, None if there is none that this user wrote and a service could have published.
 
         Parameters
@@ -114,14 +114,14 @@ class OffsetCheckpoint:
                 self._refuse("not written by this service")
                 return None
             try:
-                early = msgspec.json.decode(file.read(_LONGEST), type=EarlyOffset)
+                checkpointed = msgspec.json.decode(file.read(_LONGEST), type=CheckpointedOffset)
             except (msgspec.MsgspecError, UnicodeDecodeError) as error:
                 self._refuse(str(error))
                 return None
-        if not abs(early.y_offset_um) <= offset_max_um or early.seq < 0:
-            self._refuse(f"offset {early.y_offset_um:g} µm, number {early.seq}")
+        if not abs(checkpointed.y_offset_um) <= offset_max_um or checkpointed.seq < 0:
+            self._refuse(f"offset {checkpointed.y_offset_um:g} µm, number {checkpointed.seq}")
             return None
-        return early
+        return checkpointed
 
     def _refuse(self, why: str) -> None:
         log.warning("%s", Remark(ServiceWarning.NOTE_REFUSED, f"{self.path}: ignored: {why}.").marked)

@@ -29,13 +29,13 @@ from compensator.service.session import session_config, set_key
 
 log = logging.getLogger("compensator")
 
-#: So long a router that refuses is retried at the start, s.
+#: How long a router that refuses is retried at the start, s.
 REACHED_S = 1.0
-#: So long the token of a service that was killed may remain (the lease, and some more), s.
+#: How long the token of a killed service may remain (the lease and a margin), s.
 STALE_S = 6.0
-#: So long a starting service waits for others that start, s.
+#: How long a starting service waits for others that start, s.
 SHOWN_S = 0.4
-#: So long a query for tokens may take, s.
+#: Time limit of a query for tokens, s.
 ANSWER_S = 2.0
 
 

@@ -19,6 +19,7 @@ import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
+from compensator.events import CommandName
 from compensator.reasons import Remark
 from compensator.remarks import ServiceWarning
 from compensator.service.presence import sole_voice
@@ -29,7 +30,7 @@ log = logging.getLogger("compensator")
 #: How long a client waits before it retries its router, s.
 RETRY_S = 1.0
 #: Commands of the service, each a query on `thermal/command/<name>/<sender>` or `thermal/command/<name>`.
-COMMANDS = ("zero", "hold", "resume", "adopt", "back")
+COMMANDS = tuple(CommandName)
 #: Characters of a sender's name, which is a chunk of a key.
 SENDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 

@@ -26,7 +26,7 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Config, parse_config
 from compensator.errors import DataError
-from compensator.events import EventKind, PauseData, command_of, data_of
+from compensator.events import CommandName, EventKind, PauseData, command_of, data_of
 from compensator.messages import EstimateMessage, Event, Offset, Sample
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
@@ -104,7 +104,7 @@ def step_of(records: Sequence[Record], contents: Contents, file: str) -> Step:
 
 
 def steps_in(container: Container) -> Iterator[Step]:
-    """Yield the groups of a recording as far as it can be read; what is whole in a torn group comes last.
+    """Yield the groups of a recording as far as it can be read; what is complete in a torn group comes last.
 
     Raises
     ------
@@ -163,12 +163,12 @@ def _attachment(contents: Contents, name: str, file: str) -> bytes:
 
 def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
     """Execute a command, live or recorded; `adopt` and `back` are not the compensation's own and change nothing."""
-    if name == "zero":
+    if name == CommandName.ZERO:
         mode = arguments.get("mode", "auto")
         compensation.zero(mode if mode in ("auto", "rest", "warm") else "auto")
-    elif name == "hold":
+    elif name == CommandName.HOLD:
         compensation.hold()
-    elif name == "resume":
+    elif name == CommandName.RESUME:
         compensation.resume()
 
 
@@ -270,7 +270,7 @@ class FreeRun:
                     f"{step.file}: samples of {sample.period_s:g} s, expected those of the model, {period_s:g} s"
                 )
             if self._before_torn_um is not None:
-                compensation.go_on_from(self._before_torn_um, model_changed=compensation.is_under_way)
+                compensation.continue_from(self._before_torn_um, model_changed=compensation.is_under_way)
             if self.seq >= 0:
                 self._pass_pause(step, sample)
             self._before_torn_um = compensation.offset_um if "offset" not in step.records else None
@@ -292,7 +292,7 @@ class FreeRun:
                 self.compensation.pause_of_unknown_length()
                 return
             if pause is not None:
-                # Noted with the first sample of that start; what a full disk never took comes on top.
+                # Noted with the first sample of that start; what a full disk never accepted is added.
                 self.compensation.pause((pause.missing or 0) + sample.seq - event.seq)
                 return
         self.compensation.pause(sample.seq - self.seq - 1)

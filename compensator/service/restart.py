@@ -1,8 +1,8 @@
 """The start of the service: finds its last recording and brings the state to where that ended.
 
-A clean stop, a kill and a power cut are the same here: whatever is whole on disk is used. The samples of the last file
-run from the state that it opens with, and give the state after the last of them, bit for bit. Where the configuration
-or the model has changed since, the recordings warm the new one up instead.
+A clean stop, a kill and a power cut are the same here: whatever is complete on disk is used. The samples of the last
+file run from the state that it opens with, and give the state after the last of them, bit for bit. Where the
+configuration or the model has changed since, the recordings warm the new one up instead.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import Any
 
 from compensator.config import Config, LoadedConfig
 from compensator.errors import CompensatorError, DataError
-from compensator.events import EventKind, Note, command_of
+from compensator.events import CommandName, EventKind, Note, command_of
 from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.offset_checkpoint import EarlyOffset
+from compensator.service.offset_checkpoint import CheckpointedOffset
 from compensator.service.replay import Step, apply, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
 from compensator.service.warm_up import warm_up
@@ -27,7 +27,7 @@ from compensator.service.warm_up import warm_up
 
 @dataclass(slots=True)
 class Resumed:
-    """A compensation that goes on where the last recording ends.
+    """A compensation that continues where the last recording ends.
 
     Parameters
     ----------
@@ -67,11 +67,11 @@ class _LastFile:
         for event in step.events:
             if event.kind == EventKind.COMMAND:
                 name = command_of(event)
-                self.operator_hold = name == "hold" or (self.operator_hold and name != "resume")
+                self.operator_hold = name == CommandName.HOLD or (self.operator_hold and name != CommandName.RESUME)
         return published
 
 
-def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None = None) -> Resumed:
+def resume(loaded: LoadedConfig, model: ThermalModel, checkpointed: CheckpointedOffset | None = None) -> Resumed:
     """Bring a compensation to where the last recording ends.
 
     Parameters
@@ -80,7 +80,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None 
         The present configuration.
     model : ThermalModel
         The present model.
-    early : EarlyOffset, optional
+    checkpointed : CheckpointedOffset, optional
         The last offset that was published while the disk failed.
 
     Returns
@@ -90,13 +90,13 @@ def resume(loaded: LoadedConfig, model: ThermalModel, early: EarlyOffset | None 
     """
     resumed = _from_disk(loaded, model)
     compensation = resumed.compensation
-    if early is not None and early.seq > compensation.last[0]:
-        compensation.go_on_from(early.y_offset_um, model_changed=compensation.is_under_way)
+    if checkpointed is not None and checkpointed.seq > compensation.last[0]:
+        compensation.continue_from(checkpointed.y_offset_um, model_changed=compensation.is_under_way)
         resumed.note(
-            f"goes on from the offset {early.y_offset_um:.3f} µm of sample {early.seq}, "
+            f"continues from the offset {checkpointed.y_offset_um:.3f} µm of sample {checkpointed.seq}, "
             "which was published while the disk failed",
-            early_seq=early.seq,
-            offset_um=early.y_offset_um,
+            early_seq=checkpointed.seq,
+            offset_um=checkpointed.y_offset_um,
         )
     return resumed
 
@@ -190,11 +190,11 @@ def _go_on(resumed: Resumed, last: _LastFile, compensation: Compensation, differ
         )
     if last.samples:
         # Not from the offset of a torn last sample, which was not published.
-        compensation.go_on_from(last.offset_um, model_changed=compensation.is_under_way)
+        compensation.continue_from(last.offset_um, model_changed=compensation.is_under_way)
     seq, _ = compensation.last
     resumed.compensation = compensation
     resumed.note(
-        f"goes on from {last.path.name}: {last.samples} sample(s) run again, the last one {seq}",
+        f"continues from {last.path.name}: {last.samples} sample(s) run again, the last one {seq}",
         file=last.path.name,
         samples=last.samples,
         last_seq=seq,
@@ -210,7 +210,7 @@ def _warm(
     try:
         warm = warm_up(folder, config, model)
     except DataError as error:
-        resumed.compensation.go_on_from(last.offset_um, model_changed=model_changed)
+        resumed.compensation.continue_from(last.offset_um, model_changed=model_changed)
         if last.operator_hold:
             resumed.compensation.hold()
         resumed.note(
@@ -218,7 +218,7 @@ def _warm(
         )
         return
     resumed.compensation = warm.compensation
-    resumed.compensation.go_on_from(last.offset_um, model_changed=model_changed)
+    resumed.compensation.continue_from(last.offset_um, model_changed=model_changed)
     if last.operator_hold:
         resumed.compensation.hold()
     resumed.note(

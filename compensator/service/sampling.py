@@ -17,6 +17,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.clock import NS, Clock
 from compensator.config import Config
+from compensator.events import EventKind
 from compensator.messages import ChannelSample
 from compensator.reasons import SampleQuality
 from drivers.errors import DriverError
@@ -140,7 +141,7 @@ class ChannelCollector:
 
 
 def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
-    """Leave single wild readings out; a slope over the minute is not wild."""
+    """Leave single outliers out; a slope over the minute is none."""
     if len(readings) < 5:
         return readings, 0
     values = np.array([reading.value for reading in readings])
@@ -155,7 +156,7 @@ def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
 
 
 def _near(values: Vector) -> bool:
-    """Return whether one deviating reading among equal ones is a step of the converter rather than wild."""
+    """Return whether one deviating reading among equal ones is a step of the converter and no outlier."""
     return bool(np.ptp(values) <= 1e-3 * max(1.0, abs(float(np.median(values)))))
 
 
@@ -194,7 +195,7 @@ class Sampler:
         config: Config,
         devices: Mapping[str, Device],
         clock: Clock,
-        note: Callable[[str, str, dict[str, object]], None],
+        note: Callable[[EventKind, str, dict[str, object]], None],
     ) -> None:
         self._channels = config.channel
         self._devices = {name: _DeviceState(device) for name, device in devices.items()}
@@ -251,7 +252,7 @@ class Sampler:
         """Note once when a device stops answering, and once when it answers again."""
         if bool(error) != bool(state.error):
             name = state.device.name
-            self._note("device", error or f"{name}: answers again", {"device": name, "ok": not error})
+            self._note(EventKind.DEVICE, error or f"{name}: answers again", {"device": name, "ok": not error})
         state.error = error
 
 

@@ -60,7 +60,7 @@ def session_config(settings: Zenoh) -> zenoh.Config:
     # Shared memory between processes of one computer: others there could open it, and a killed process leaves its
     # files behind in /dev/shm.
     set_key(config, "transport/shared_memory/enabled", False)
-    # A dead service loses its liveliness token after so many ms if the network gives no sign.
+    # A dead service loses its liveliness token after this time, ms, if the network gives no sign.
     set_key(config, "transport/link/tx/lease", 4000)
     if settings.mode == "router":
         enlarge_queues(config)

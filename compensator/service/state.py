@@ -94,11 +94,11 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     model_sha256 : str
         Hash of the model file that it belongs to.
     alternative : str or None
-        The alternative path that stood in for the model's own.
+        The alternative path used instead of the model's own.
     engine : EngineState
         Observer, effects, held channels, reference, gap under way.
     guards : dict of str to four floats
-        By channel: last good value, min since it, value that it stands still at, min for which it has.
+        By channel: last good value, min since it, value that it is stuck at, min for which it has been.
     offset_um : float
         The last offset, µm.
     zero : ZeroState
@@ -146,7 +146,7 @@ def decode_state(data: bytes) -> CompensationState:
         If it is no state of this version.
     """
     try:
-        # Not strict: only so does a text stand for a number.
+        # Not strict: only so may a text be a number.
         state = msgspec.json.decode(data, type=CompensationState, strict=False)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise DataError(f"state: {error}") from error

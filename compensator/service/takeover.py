@@ -62,12 +62,12 @@ class Takeover:
             why = f"{wanted.action}: this service adopts no model now"
             if self._adopting is not None:
                 why = f"{wanted.action}: another model is under way until the next sample; ask again then"
-            self._journal.note("command_refused", why, {"name": wanted.action, "ok": False} | sent_by(sender))
+            self._journal.note(EventKind.COMMAND_REFUSED, why, {"name": wanted.action, "ok": False} | sent_by(sender))
             reply.set_result(refusal(why))
             return
         # The text of the model is not repeated here: it travels in the recording that begins with it.
         data = {"sha256": wanted.sha256, "force": wanted.force}
-        self._journal.note("command", wanted.action, data | {"command": wanted.action} | sent_by(sender))
+        self._journal.note(EventKind.COMMAND, wanted.action, data | {"command": wanted.action} | sent_by(sender))
         self._adopting = _Adopting(wanted, reply)
         self._adopting.task = asyncio.create_task(self._prepare(self._adoption, self._adopting))
         self._adopting.task.add_done_callback(self._answer_refusal)
@@ -93,7 +93,7 @@ class Takeover:
         self._journal.start_new_file(prepared.data)
         named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
         self._journal.note(
-            "adopt",
+            EventKind.ADOPT,
             f"model {named[0]} replaces {named[1]}, "
             f"warm-up {prepared.warm.minutes / 60.0:.1f} h, the offset moves by {difference:+.2f} µm",
             {
@@ -137,7 +137,7 @@ class Takeover:
         )
 
     def _answer_refusal(self, task: asyncio.Task[None]) -> None:
-        """Answer with the reason where a model could not be prepared; the running one goes on."""
+        """Answer with the reason where a model could not be prepared; the running one stays."""
         adopting, error = self._adopting, None if task.cancelled() else task.exception()
         if adopting is None or error is None:
             return
@@ -146,7 +146,7 @@ class Takeover:
         if not isinstance(error, CompensatorError):
             log.error("internal error", exc_info=error)
             text = f"internal error: {type(error).__name__}: {error}"
-        self._journal.note("adopt", f"refused: {text}", {"ok": False, "action": adopting.wanted.action})
+        self._journal.note(EventKind.ADOPT, f"refused: {text}", {"ok": False, "action": adopting.wanted.action})
         adopting.reply.set_result(refusal(text))
 
 

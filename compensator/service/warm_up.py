@@ -24,7 +24,7 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import FreeRun, Step, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
 
-#: A warm-up goes back by so many of the slowest time constants at most: 0.03 % of what was before is left then.
+#: Length of a warm-up at most, in slowest time constants: 0.03 % of what was before is left then.
 WARM_UP = 8.0
 
 
@@ -57,7 +57,7 @@ class WarmUp:
 def warm_up(
     folder: Path, config: Config, model: ThermalModel, *, let_others: Callable[[], None] = lambda: None
 ) -> WarmUp:
-    """Bring a new compensation to the end of the recordings, with the zero that stands there.
+    """Bring a new compensation to the end of the recordings, with the zero that is in force there.
 
     It begins at the last zero at rest, or, where that is longer ago, `WARM_UP` of the model's slowest time constants
     before the end (before the last zero on a warm machine, where there was one).
@@ -100,7 +100,7 @@ def warm_up(
     if window.at_rest is not None:
         run(window.at_rest)
     elif absolute and model.inputs == "changes":
-        raise DataError(f"{folder}: no zero on record, and the model before took the temperatures as they are")
+        raise DataError(f"{folder}: no zero on record, and the previous model used the temperatures as they are")
     else:
         compensation.begin(
             t_q_ref_degc=number(last.t_q_ref_degc),
@@ -118,14 +118,14 @@ def warm_up(
         raise DataError(f"{folder}: no recorded sample to warm the model up with")
     same = (last.t_q_ref_degc, last.at_ref_degc) == (made.t_q_ref_degc, made.at_ref_degc)
     if not same and model.inputs == "changes" and not absolute:
-        raise DataError(f"{folder}: the recordings do not lead to the zero that stands")
+        raise DataError(f"{folder}: the recordings do not lead to the zero in force")
     minutes = (free.time_ns - first_ns) / (60.0 * NS)
     return WarmUp(compensation=compensation, samples=samples, minutes=minutes, known=not compensation.is_cold)
 
 
 @dataclass(slots=True)
 class _Window:
-    """The part of the recordings that a warm-up takes."""
+    """The part of the recordings that a warm-up uses."""
 
     last: EstimateMessage
     files: list[Path]
@@ -134,7 +134,7 @@ class _Window:
 
 
 def _window(folder: Path, machine: str, slowest_min: float, let_others: Callable[[], None]) -> _Window:
-    """Look for the zero that stands and for how far back the warm-up must begin."""
+    """Look for the zero in force and for how far back the warm-up must begin."""
     files = recordings(folder, machine)
     last = _last_estimate(files)
     if last is None or math.isnan(number(last.t_q_ref_degc)):
@@ -182,7 +182,7 @@ def _last_estimate(files: list[Path]) -> EstimateMessage | None:
 
 
 def _opens_with_zero(path: Path, last: EstimateMessage) -> bool:
-    """Tell whether a recording opens with the zero that stands at the end."""
+    """Return whether a recording opens with the zero in force at the end."""
     state = _state_of(path)
     if state is None:
         return False

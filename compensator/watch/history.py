@@ -157,7 +157,7 @@ def spells(history: Mapping[str, Sequence[Any]], valid_for_s: float | None) -> l
 def usable(sample: Sample, name: str) -> float | None:
     """Return the mean of a channel; None if it is missing or refused."""
     channel = sample.channels.get(name)
-    return channel.mean if channel is not None and channel.quality == "good" else None
+    return channel.mean if channel is not None and channel.is_good else None
 
 
 def _short(value: Any) -> Any:

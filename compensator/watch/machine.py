@@ -8,8 +8,10 @@ from typing import Any
 import msgspec
 
 from compensator.clock import NS
+from compensator.events import EventKind
 from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
-from compensator.reasons import Remark
+from compensator.reasons import Reason, Remark, State
+from compensator.remarks import WatchWarning
 from compensator.watch.history import History, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import TONES, Tone, Words, age, in_words, to_do
@@ -23,7 +25,7 @@ EVENTS = 50
 #: Interval of the median of |measured − predicted|, min, and its limit in standard deviations and in µm.
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
 #: Warnings that need attention although the service itself reports `ok`.
-ATTENTION = {"token_gone", "malformed_messages", "misfit"}
+ATTENTION = {WatchWarning.TOKEN_GONE, WatchWarning.MALFORMED_MESSAGES, WatchWarning.MISFIT}
 #: A message farther ahead of this computer's clock shows that the clocks differ, s.
 AHEAD_S = 5.0
 #: Values of a snapshot that come from the messages as they are.
@@ -134,7 +136,7 @@ class Machine:
             if message in self.events:
                 return False
             self.events.append(message)
-            if message.kind == "start":
+            if message.kind == EventKind.START:
                 self.numbers.started(message.time_utc_ns)
             return True
         if isinstance(message, Status):
@@ -173,40 +175,48 @@ class Machine:
         """Return the state to show: that of the last offset while it is valid, else `silent` or `unknown`."""
         old_s = self.age_s(now_ns, monotonic_s)
         if self._offset is None or old_s is None:
-            return "unknown"
-        return "silent" if old_s > self._offset.valid_for_s else self._offset.state
+            return WatchWarning.UNKNOWN
+        return WatchWarning.SILENT if old_s > self._offset.valid_for_s else self._offset.state
 
     def warnings(self, now_ns: int, monotonic_s: float) -> list[Remark]:
         """Return warnings about what was received."""
         found = []
         offset, shown = self._offset, self.shown(now_ns, monotonic_s)
-        if self.alive is False and shown not in ("silent", "unknown"):
+        if self.alive is False and shown not in (WatchWarning.SILENT, WatchWarning.UNKNOWN):
             found.append(
-                Remark("token_gone", "Its liveliness token is gone: the service has ended or is disconnected.")
+                Remark(
+                    WatchWarning.TOKEN_GONE, "Its liveliness token is gone: the service has ended or is disconnected."
+                )
             )
-        if self.alive and shown == "silent":
+        if self.alive and shown == WatchWarning.SILENT:
             figures = "Its liveliness token exists: the service is connected, but publishes nothing new."
-            found.append(Remark("alive_but_silent", figures))
+            found.append(Remark(WatchWarning.ALIVE_BUT_SILENT, figures))
         other, heard_s = self._other
         if offset is not None and monotonic_s - heard_s < 4.0 * offset.valid_for_s:
-            found.append(Remark("two_services", f"Two services publish below this prefix: {other} and {self.name}."))
+            found.append(
+                Remark(WatchWarning.TWO_SERVICES, f"Two services publish below this prefix: {other} and {self.name}.")
+            )
         if offset is not None and offset.time_utc_ns - now_ns > AHEAD_S * NS:
             figures = f"Its clock is ahead of this computer's by {age((offset.time_utc_ns - now_ns) / NS)}."
-            found.append(Remark("clock_ahead", figures))
-        if offset is not None and shown == "silent" and monotonic_s - self._arrived_s < offset.valid_for_s / 2.0:
+            found.append(Remark(WatchWarning.CLOCK_AHEAD, figures))
+        if (
+            offset is not None
+            and shown == WatchWarning.SILENT
+            and monotonic_s - self._arrived_s < offset.valid_for_s / 2.0
+        ):
             figures = "Messages arrive with old times: one of the two clocks is wrong, or messages are repeated."
-            found.append(Remark("old_messages", figures))
+            found.append(Remark(WatchWarning.OLD_MESSAGES, figures))
         misfit = self._misfit(now_ns, shown)
         if misfit is not None:
             found.append(misfit)
         if self.malformed:
             figures = f"{self.malformed} malformed message(s), the last: {self.last_malformed}."
-            found.append(Remark("malformed_messages", figures))
+            found.append(Remark(WatchWarning.MALFORMED_MESSAGES, figures))
         if self.numbers.missed:
-            found.append(Remark("missed_messages", f"{self.numbers.missed} message(s) never arrived here."))
+            found.append(Remark(WatchWarning.MISSED_MESSAGES, f"{self.numbers.missed} message(s) never arrived here."))
         if self.numbers.repeated:
             figures = f"{self.numbers.repeated} message(s) had a number that was received before."
-            found.append(Remark("repeated_numbers", figures))
+            found.append(Remark(WatchWarning.REPEATED_NUMBERS, figures))
         return found
 
     def _misfit(self, now_ns: int, shown: str) -> Remark | None:
@@ -214,9 +224,9 @@ class Machine:
 
         The median is used because a valid model deviates for some minutes after the heat is switched.
         """
-        if self._offset is None or shown not in ("ok", "degraded"):
+        if self._offset is None or shown not in (State.OK, State.DEGRADED):
             return None
-        if any(code.startswith("implausible") for code in self._offset.reasons):
+        if any(code.startswith(Reason.IMPLAUSIBLE) for code in self._offset.reasons):
             return None
         residual_um, std_um, count = self.history.misfit(now_ns, MISFIT_MIN)
         if count < MISFIT_MIN // 2 or residual_um < max(MISFIT_STDS * std_um, MISFIT_UM):
@@ -225,7 +235,7 @@ class Machine:
             f"Over half an hour, measured and predicted Y were {residual_um:.1f} µm apart (median); the service "
             f"states a standard deviation of {std_um:.2f} µm."
         )
-        return Remark("misfit", figures)
+        return Remark(WatchWarning.MISFIT, figures)
 
     def snapshot(self, now_ns: int, monotonic_s: float) -> dict[str, Any]:
         """Return the present state for a view or as JSON.
@@ -258,7 +268,9 @@ class Machine:
             "warning_codes": [warning.code for warning in warnings],
             "age_s": round(old_s, 3) if old_s is not None else None,
             **{name: getattr(offset, name, None) for name in _OFFSET},
-            "y_offset_rate_um_per_min": offset.y_offset_rate_um_per_min if offset and shown != "silent" else None,
+            "y_offset_rate_um_per_min": offset.y_offset_rate_um_per_min
+            if offset and shown != WatchWarning.SILENT
+            else None,
             **self._estimated(now_ns),
             **self._measured(now_ns),
             "received": self.numbers.received,
@@ -312,7 +324,7 @@ class Machine:
 def _tone(shown: str, warnings: list[Remark]) -> Tone:
     """Return the severity of a machine's state and warnings."""
     codes = {warning.code for warning in warnings}
-    if "two_services" in codes:
+    if WatchWarning.TWO_SERVICES in codes:
         return "bad"
     tone = TONES[shown]
     return "warn" if tone == "good" and codes & ATTENTION else tone
@@ -320,7 +332,7 @@ def _tone(shown: str, warnings: list[Remark]) -> Tone:
 
 def _to_do(shown: str, reasons: list[Words], warnings: list[Remark]) -> str:
     """Return the actions in one line; the last reasons of a silent machine are out of date and ignored."""
-    asked = [words.do for words in reasons if shown not in ("silent", "unknown")]
-    if not asked and not (warnings and shown == "ok"):
+    asked = [words.do for words in reasons if shown not in (WatchWarning.SILENT, WatchWarning.UNKNOWN)]
+    if not asked and not (warnings and shown == State.OK):
         asked = [in_words(shown).do]
     return " ".join(dict.fromkeys([*asked, *map(str, warnings)]))

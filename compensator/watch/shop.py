@@ -8,6 +8,7 @@ from typing import Any
 
 from compensator.clock import NS, Clock
 from compensator.watch.machine import KINDS, Machine
+from compensator.watch.words import TONES
 
 #: Largest number of machines; messages of others are only counted.
 MACHINES = 1000
@@ -129,7 +130,7 @@ def headline(machines: list[dict[str, Any]]) -> str:
     if not machines:
         return "No machine received."
     counts: dict[str, int] = {}
-    for name in ("silent", "unknown", "fault", "hold", "degraded", "starting", "ok"):
+    for name in TONES:
         count = sum(machine["shown"] == name for machine in machines)
         counts |= {name: count} if count else {}
     words = ", ".join(f"{count} {name}" for name, count in counts.items())

@@ -11,7 +11,7 @@ import json
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
@@ -20,9 +20,10 @@ from typing import Any, NamedTuple
 from compensator import __version__
 from compensator.clock import NS, Clock
 from compensator.errors import DataError
+from compensator.events import EventKind
 from compensator.messages import MESSAGES, shipped_schema
 from compensator.recording.compaction import rewrite
-from compensator.recording.live_file import LiveFile
+from compensator.recording.live_file import LiveFile, new_names
 from compensator.watch.machine import KINDS, Malformed, decoded
 from compensator.watch.sequence import Sequence
 
@@ -184,7 +185,7 @@ class ShopRecorder:
         if kind in ("offset", "sample", "estimate"):
             numbers.setdefault((prefix, rest), Sequence()).update(message.seq, message.time_utc_ns)
         started_ns = message.started_utc_ns if kind == "status" else 0
-        if kind == "event" and message.kind == "start":
+        if kind == "event" and message.kind == EventKind.START:
             started_ns = message.time_utc_ns
         for other in ("y/offset", "sample", "estimate") if started_ns else ():
             numbers.setdefault((prefix, other), Sequence()).started(started_ns)
@@ -228,7 +229,7 @@ def _compact_all(paths: list[Path]) -> None:
             log.info("%s: could not be compacted and stays as it is: %s", path.name, error)
             continue
         if copy is not None:
-            end = "" if copy.contents.ended else "; it had no end, every whole message was kept"
+            end = "" if copy.contents.ended else "; it had no end, every complete message was kept"
             log.info("%s: %d messages, compact%s", path.name, copy.messages, end)
 
 
@@ -236,7 +237,7 @@ class _File(LiveFile):
     """The file that is being written; channels are registered with their first message."""
 
     def __init__(self, folder: Path, time_ns: int, prefix: str) -> None:
-        super().__init__(_names(folder, time_ns))
+        super().__init__(new_names(folder, "shop", time_ns))
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self.writer.start(profile="", library=f"compensator {__version__}")
@@ -297,10 +298,3 @@ ALIVE = (
     b'{"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "thermal.alive", "type": "object", '
     b'"properties": {"alive": {"type": "boolean"}}, "required": ["alive"]}'
 )
-
-
-def _names(folder: Path, time_ns: int) -> Iterator[Path]:
-    """Yield names for a new file at a time."""
-    stamp = datetime.fromtimestamp(time_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
-    for count in range(1000):
-        yield folder / f"shop_{stamp}{f'-{count:03d}' if count else ''}.mcap"

@@ -12,6 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from compensator.clock import NS
+from compensator.reasons import SampleQuality, State
+from compensator.remarks import WatchWarning
 from compensator.report.notation import plain, signed
 from compensator.watch.day import STYLES, drawn, evenly, sparkline
 from compensator.watch.history import Spell, spells
@@ -142,12 +144,14 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
 
 def _cells(machine: dict[str, Any]) -> dict[str, Text]:
     # Codes, as sentences would be cut off; the actions are below, or in the view of one machine.
-    reasons = [reason["code"] for reason in machine["reasons"]] if machine["shown"] != "silent" else []
+    reasons = [reason["code"] for reason in machine["reasons"]] if machine["shown"] != WatchWarning.SILENT else []
     why = " ".join([*reasons, *machine["warning_codes"]])
     return {
         "machine": Text(machine["prefix"]),
         "state": state(machine),
-        "offset µm": Text(signed(machine["y_offset_um"]), style="dim" if machine["shown"] == "silent" else ""),
+        "offset µm": Text(
+            signed(machine["y_offset_um"]), style="dim" if machine["shown"] == WatchWarning.SILENT else ""
+        ),
         "µm/min": Text(signed(machine["y_offset_rate_um_per_min"])),
         "std µm": Text(plain(machine["y_offset_std_um"])),
         "residual µm": Text(signed(machine["residual_um"])),
@@ -217,15 +221,15 @@ def detail(
 def _verdict(machine: dict[str, Any]) -> Text:
     text = state(machine)
     old = age(machine["age_s"]) if machine["age_s"] is not None else ""
-    if machine["shown"] == "silent":
+    if machine["shown"] == WatchWarning.SILENT:
         text.append(f" for {old}; the last offset was {signed(machine['y_offset_um'])} µm", style="bold red")
-    elif machine["y_offset_um"] is None and machine["shown"] != "unknown":
+    elif machine["y_offset_um"] is None and machine["shown"] != WatchWarning.UNKNOWN:
         text.append(f"  no offset, {old} old", style="bold")
-    elif machine["shown"] != "unknown":
+    elif machine["shown"] != WatchWarning.UNKNOWN:
         text.append(f"  offset {signed(machine['y_offset_um'])} µm, {old} old", style="bold")
     text.append(f"\n{machine['means']}", style="")
     if machine["tone"] != "good":
-        text.append(f" {machine['do'] if machine['shown'] != 'ok' else BELOW}")
+        text.append(f" {machine['do'] if machine['shown'] != State.OK else BELOW}")
     return text
 
 
@@ -254,7 +258,9 @@ def _about(machine: dict[str, Any]) -> str:
 
 def _lists(machine: dict[str, Any], past: list[str], now: datetime) -> list[tuple[str, list[str]]]:
     reasons = [f"{one['code']}: {one['means']} {one['do']}" for one in machine["reasons"]]
-    channels = [_channel(name, one) for name, one in machine["channels"].items() if one["quality"] != "good"]
+    channels = [
+        _channel(name, one) for name, one in machine["channels"].items() if one["quality"] != SampleQuality.GOOD
+    ]
     devices = [f"{name}: {error}" for name, error in (machine["devices"] or {}).items() if error != "ok"]
     events = [
         f"{here(event['time_utc_ns']):%m-%d %H:%M:%S} {event['kind']}: {event['text']}"

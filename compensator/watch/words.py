@@ -9,31 +9,32 @@ from typing import Literal, NamedTuple
 from compensator.clock import NS
 from compensator.events import EventKind, RecordingData, data_of
 from compensator.messages import Event
-from compensator.reasons import explain
+from compensator.reasons import State, explain
+from compensator.remarks import WatchWarning
 
 Tone = Literal["good", "warn", "bad"]
 
-#: Severity of each state.
+#: Severity of each state, the worst first.
 TONES: Mapping[str, Tone] = {
-    "ok": "good",
-    "starting": "warn",
-    "degraded": "warn",
-    "hold": "bad",
-    "fault": "bad",
-    "silent": "bad",
-    "unknown": "bad",
+    WatchWarning.SILENT: "bad",
+    WatchWarning.UNKNOWN: "bad",
+    State.FAULT: "bad",
+    State.HOLD: "bad",
+    State.DEGRADED: "warn",
+    State.STARTING: "warn",
+    State.OK: "good",
 }
 #: Sign of each severity, for readers without colour.
 SIGNS: Mapping[Tone, str] = {"good": "✓", "warn": "⚠", "bad": "✗"}
 #: Action for each kind of event.
 _DO: Mapping[str, str] = {
-    "device": "Check power, cable and address of the device; `compensator probe` reads it once.",
-    "recording": "Check free space, permissions and the disk.",
-    "clock": "Check the time service of the machine's computer.",
-    "error": "Report it with its text; the offset is held until the error is gone.",
-    "command_refused": "Find out who sent it and with what permission; the offset did not change.",
-    "adopt": "The previous model remains active; see the text for what is wrong with the new one.",
-    "restart": "None if the standard deviation is small enough for the work.",
+    EventKind.DEVICE: "Check power, cable and address of the device; `compensator probe` reads it once.",
+    EventKind.RECORDING: "Check free space, permissions and the disk.",
+    EventKind.CLOCK: "Check the time service of the machine's computer.",
+    EventKind.ERROR: "Report it with its text; the offset is held until the error is gone.",
+    EventKind.COMMAND_REFUSED: "Find out who sent it and with what permission; the offset did not change.",
+    EventKind.ADOPT: "The previous model remains active; see the text for what is wrong with the new one.",
+    EventKind.RESTART: "None if the standard deviation is small enough for the work.",
 }
 
 
@@ -65,13 +66,13 @@ def in_words(code: str) -> Words:
 
 def to_do(event: Event) -> str:
     """Return the action for an event; empty if none is needed."""
-    if event.kind in ("device", "adopt") and event.data.get("ok") is not False:
+    if event.kind in (EventKind.DEVICE, EventKind.ADOPT) and event.data.get("ok") is not False:
         return ""
-    if event.kind == "state":
+    if event.kind == EventKind.STATE:
         state = str(event.data.get("state", ""))
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
-        return " ".join(dict.fromkeys(in_words(code).do for code in codes)) if state not in ("", "ok") else ""
+        return " ".join(dict.fromkeys(in_words(code).do for code in codes)) if state not in ("", State.OK) else ""
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
     if recording is not None and recording.is_resolved:
         return ""

@@ -220,7 +220,7 @@ def parse() -> argparse.Namespace:
     for role in ROLES:
         for name in getattr(arguments, role):
             if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}", name):
-                parser.error(f"--{role} {name!r}: expected letters, digits, . _ -; the name stands in keys")
+                parser.error(f"--{role} {name!r}: expected letters, digits, . _ -; the name is part of keys")
             if name in ("router", *("ca",)):
                 parser.error(f"--{role} {name!r}: this name is taken")
     return arguments

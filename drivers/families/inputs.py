@@ -77,7 +77,7 @@ def thermocouples(
 
 
 def analogue_inputs(config: DeviceSettings, count: int, where: Where) -> dict[int, Probe | None]:
-    """Convert the voltage inputs of a module; None stands for a plain voltage.
+    """Convert the voltage inputs of a module; None means a plain voltage.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Any Modbus device whose registers are written into the configuration: drives, chillers, transmitters.
 
-`value = (number in the registers) × scale + offset`, in the input's unit. Numbers that stand for a fault
+`value = (number in the registers) × scale + offset`, in the input's unit. Numbers that mean a fault
 (`bad_values`) and limits of what is plausible (`minimum`, `maximum`, in the unit) give the quality.
 """
 
@@ -26,7 +26,7 @@ _BAD = {str(quality): quality for quality in Quality if quality is not Quality.G
 
 
 class MapSettings(ModbusSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Keys of a mapped device.
+    """Keys of a device given by its registers.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def _bad_values(given: MapInput, where: Where) -> dict[float, Quality]:
                 raw: Any = int(number, 0) if isinstance(number, str) else number
                 found[float(raw)] = _BAD[quality]
             except (TypeError, ValueError):
-                raise where.wrong(f"bad_values.{key}", number, "a number as it stands in the registers") from None
+                raise where.wrong(f"bad_values.{key}", number, "a number as in the registers") from None
     return found
 
 

@@ -19,7 +19,7 @@ from drivers.protocols.capancdt_sums import Sums, sums
 
 # Between attempts to connect, s: short at first, as after a loose cable.
 RETRY_S = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
-# A stream silent for so many time limits, and so many seconds, is reconnected: the other end may be long gone.
+# Time limits and seconds of silence after which a stream is reconnected: the other end may be long gone.
 SILENT_TIMEOUTS = 10.0
 SILENT_S = 2.0
 _MOST_BLOCKS = 2048

@@ -139,8 +139,8 @@ def renamed(body: bytes) -> bytes:
 #: What is done to a file, which part of the index is named, and in which words.
 CASES: dict[str, tuple[Callable[[list[Record]], list[Record]], str, str]] = {
     "chunk index gone": (edit(CHUNK_INDEX, gone, 1), "chunk index", "no entry leads to the chunk at byte"),
-    "chunk index twice": (twice(CHUNK_INDEX), "chunk index", "stands there twice"),
-    "chunk index elsewhere": (edit(CHUNK_INDEX, add(OFFSET, 9)), "chunk index", "no chunk stands there"),
+    "chunk index twice": (twice(CHUNK_INDEX), "chunk index", "occurs twice"),
+    "chunk index elsewhere": (edit(CHUNK_INDEX, add(OFFSET, 9)), "chunk index", "no chunk is there"),
     "chunk index, length": (edit(CHUNK_INDEX, add(LENGTH, -1)), "chunk index", "length:"),
     "chunk index, from": (edit(CHUNK_INDEX, add(START, 60 * 10**9)), "chunk index", "first message (ns):"),
     "chunk index, to": (edit(CHUNK_INDEX, add(END, -(10**9)), 1), "chunk index", "last message (ns):"),
@@ -151,7 +151,7 @@ CASES: dict[str, tuple[Callable[[list[Record]], list[Record]], str, str]] = {
     "message index, time": (edit(MESSAGE_INDEX, add(6, 10**9), 2), "message index", "and 1 time(s) to something else"),
     "message index skips one": (edit(MESSAGE_INDEX, last_entry_as_the_first), "message index", "of the"),
     "attachment index gone": (edit(ATTACHMENT_INDEX, gone, 1), "attachment index", ", model.toml"),
-    "attachment index elsewhere": (edit(ATTACHMENT_INDEX, add(0, 1)), "attachment index", "no attachment stands there"),
+    "attachment index elsewhere": (edit(ATTACHMENT_INDEX, add(0, 1)), "attachment index", "no attachment is there"),
     "attachment index, size": (edit(ATTACHMENT_INDEX, add(32, -5)), "attachment index", "size:"),
     "attachment index, name": (edit(ATTACHMENT_INDEX, renamed, 1), "attachment index", "'model.toml' is right"),
     "metadata index gone": (edit(METADATA_INDEX, gone), "metadata index", "no entry leads to the metadata table"),
@@ -162,7 +162,7 @@ CASES: dict[str, tuple[Callable[[list[Record]], list[Record]], str, str]] = {
     "statistics, end": (edit(STATISTICS, add(34, -(10**9))), "statistics", "last message (ns):"),
     "statistics, one channel": (edit(STATISTICS, add(48, 1)), "statistics", "messages by channel:"),
     "statistics gone": (edit(STATISTICS, gone), "statistics", "are missing"),
-    "channel under another name": (edit(CHANNEL, renamed, -4), "channel 3", "otherwise than it stands"),
+    "channel under another name": (edit(CHANNEL, renamed, -4), "channel 3", "otherwise than in the file"),
     "channel gone": (edit(CHANNEL, gone, -1), "channel 6", "is not repeated"),
     "schema gone": (edit(SCHEMA, gone, -1), "schema 6", "is not repeated"),
     "summary offset gone": (edit(SUMMARY_OFFSET, gone, 3), "summary offset", "none leads to those at byte"),
@@ -226,7 +226,7 @@ def test_messages_behind_the_chunks_are_seen_by_no_index(path: Path) -> None:
     statistics = edit(STATISTICS, add(22, -1, "<I"))
     write(path, statistics([*chunked[:last], *messages, *chunked[end:index], *chunked[index + 1 :]]))
     (finding,) = audit([path]).findings
-    assert finding.kind == "index" and f"{len(messages)} message(s) stand in no chunk" in finding.text
+    assert finding.kind == "index" and f"{len(messages)} message(s) are in no chunk" in finding.text
 
 
 def test_a_great_many_faults_are_counted_and_some_are_kept(path: Path) -> None:

@@ -100,7 +100,7 @@ def test_what_is_behind_the_last_signature_of_a_live_file_is_said(tmp_path: Path
     private, public = write_key(tmp_path, "machine", 7)
     service = Service(tmp_path / "rec", signer=Signer(private)).run(70)
     found = audit([path_in(tmp_path / "rec")], public_key=public)
-    assert found.clean and f"{9 * 3} record(s) behind the last signature" in " ".join(found.remarks)
+    assert found.clean and f"{9 * 3} record(s) after the last signature" in " ".join(found.remarks)
     service.kill()
 
 
@@ -135,7 +135,7 @@ def test_what_is_no_key_is_said(tmp_path: Path) -> None:
     wrong = tmp_path / "x25519.pem"
     key = X25519PrivateKey.from_private_bytes(b"1" * 32)
     wrong.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
-    with pytest.raises(ConfigError, match="expected an Ed25519 key"):
+    with pytest.raises(ConfigError, match="expected an Ed25519 private key"):
         Signer(wrong)
     with pytest.raises(ConfigError, match="no PEM private key"):
         Signer(public)

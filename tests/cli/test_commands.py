@@ -292,7 +292,7 @@ def test_two_devices_on_one_address_are_refused(tmp_path: Path, capsys: pytest.C
     (tmp_path / "bad.toml").write_text(configuration("vmc-07", lines, 7447) + second)
     assert main(["check", "--config", str(tmp_path / "bad.toml")]) == 2
     error = capsys.readouterr().err
-    assert "twin" in error and "spindle-couples" in error and error.count("\n") == 1
+    assert "twin" in error and "spindle-thermocouples" in error and error.count("\n") == 1
 
 
 def test_model_with_an_unstable_inverse_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

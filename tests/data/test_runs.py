@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from compensator.data.record import SHORT_GAP_SAMPLES, Record
-from compensator.data.runs import SHORTEST_RUN, is_noise, noise_of, noise_std, runs_of, walk_std, without_wild
+from compensator.data.runs import SHORTEST_RUN, is_noise, noise_of, noise_std, runs_of, walk_std, without_outliers
 
 N = 600
 
@@ -107,7 +107,7 @@ def test_heat_is_never_cleaned():
 def test_wild_readings_of_either_sign_go(size):
     values = np.random.default_rng(1).normal(0.0, 0.05, 400)
     values[[50, 120, 300]] += size
-    cleaned, count = without_wild(values)
+    cleaned, count = without_outliers(values)
     assert count == 3
     assert np.flatnonzero(np.isnan(cleaned)).tolist() == [50, 120, 300]
     assert not np.isnan(values).any()
@@ -119,20 +119,20 @@ def test_a_step_a_ramp_and_a_pulse_of_two_samples_stay():
     step[200:] += 20.0
     pulse[200:202] += 20.0
     for values in (step, ramp, pulse):
-        assert without_wild(values)[1] == 0
+        assert without_outliers(values)[1] == 0
 
 
 def test_a_signal_full_of_spikes_is_a_signal():
     values = np.random.default_rng(3).normal(0.0, 0.01, 400)
     values[10::15] += 5.0
-    assert without_wild(values)[1] == 0
+    assert without_outliers(values)[1] == 0
 
 
 def test_a_wild_reading_beside_a_gap_does_not_hide():
     values = np.random.default_rng(4).normal(0.0, 0.05, 400)
     values[100:110] = np.nan
     values[110] = 6.0
-    cleaned, count = without_wild(values)
+    cleaned, count = without_outliers(values)
     assert count == 1
     assert np.isnan(cleaned[110])
 

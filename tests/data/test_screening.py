@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from compensator.data.record import Record
-from compensator.data.runs import noise_std, runs_of, without_wild
+from compensator.data.runs import noise_std, runs_of, without_outliers
 from compensator.data.screening import screen, screen_temperatures
 from compensator.errors import DataError
 from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
@@ -128,7 +128,7 @@ def test_a_wild_reading_goes_and_a_step_stays():
     values = rng.normal(0.0, 0.05, 400)
     values[200:] += 5.0
     values[77] += 4.0
-    cleaned, count = without_wild(values)
+    cleaned, count = without_outliers(values)
     assert count == 1
     assert np.isnan(cleaned[77])
     assert np.isnan(cleaned).sum() == 1

@@ -169,7 +169,7 @@ def test_a_torn_and_a_damaged_file_are_shown_up_to_there(tmp_path: Path) -> None
     service.kill()
     data = recordings(tmp_path / "rec", MACHINE)[0].read_bytes()
     for name, changed, end in (
-        ("torn", data[: len(data) // 2], "no end"),
+        ("torn", data[: len(data) // 2], "open"),
         ("damaged", data[: len(data) // 2] + b"\xff" * 4000, "damaged from byte"),
     ):
         broken = tmp_path / f"{name}.mcap"

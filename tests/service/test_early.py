@@ -12,7 +12,7 @@ from compensator.audit.series import audit
 from compensator.messages import Offset
 from compensator.recording import recorder as recorder_module
 from compensator.recording.reading import recordings
-from compensator.service.offset_checkpoint import EarlyOffset, OffsetCheckpoint
+from compensator.service.offset_checkpoint import CheckpointedOffset, OffsetCheckpoint
 from tests.service.living import MACHINE, Machine, largest_step, settings
 from tests.service.simulated import TABLE
 
@@ -76,7 +76,7 @@ def test_the_note_is_of_one_machine_and_its_newest(tmp_path: Path) -> None:
     note.write(offset(1.5))
     note.write(offset(float("nan"), 8))  # nothing was published that a control could apply
     note.write(offset(-2.5, 9))
-    assert note.read(100.0) == EarlyOffset(seq=9, time_utc_ns=5, y_offset_um=-2.5)
+    assert note.read(100.0) == CheckpointedOffset(seq=9, time_utc_ns=5, y_offset_um=-2.5)
     assert other.read(100.0) is None and note.path.stat().st_mode & 0o777 == 0o600
     assert note.read(2.0) is None  # beyond the limit: no service published that
     note.remove()

@@ -66,7 +66,7 @@ def test_the_compact_file_says_what_the_live_one_said(tmp_path: Path) -> None:
     before, size, end = list(read_messages(path)), path.stat().st_size, end_of_chain(path)
     assert end is not None and not end.chunked and not end.whole
     said = compact(path)
-    assert "it had no end; 0 whole record(s)" in said
+    assert "it had no end; 0 complete record(s)" in said
     after, new = list(read_messages(path)), end_of_chain(path)
     assert after[: len(before)] == before and [m.topic for m in after[len(before) :]] == ["seal", "chain"]
     assert new is not None and new.value == end.value and new.chunked and new.whole and new.sealed == "recovered"

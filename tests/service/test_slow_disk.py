@@ -126,7 +126,7 @@ async def test_polling_goes_on_nothing_is_lost_and_the_receiver_is_told(
     assert [o.seq for o in recorded] == list(range(50))
     assert [a.seq for a, b in zip(recorded, offsets, strict=True) if a != b] == [10]
     assert [e.data.get("published_early") for e in events(bench)] == [10, None]
-    assert events(bench)[1].text == "the disk takes the recording again; nothing was lost"
+    assert events(bench)[1].text == "the disk accepts the recording again; nothing was lost"
     found = look(tmp_path / "rec")
     assert found.clean and found.samples == 50 and sum(file.early for file in found.files) == 20, summary(found)
     assert "20 offset(s) were published before they were on disk" in summary(found)
@@ -190,7 +190,7 @@ async def test_what_waits_is_bounded_and_what_is_given_up_is_said(
     await bench.run(40)
     # The one that is being written and eight that wait; the zero that was set with one of the lost ones stands.
     assert [o.seq for o in logged(tmp_path / "rec")] == [*range(11), *range(22, 40)]
-    assert events(bench)[-1].text == "the disk takes the recording again; 11 sample(s) were not recorded"
+    assert events(bench)[-1].text == "the disk accepts the recording again; 11 sample(s) were not recorded"
     assert events(bench)[-1].data == {"code": "disk_back", "lost": 11}
     found = look(tmp_path / "rec")
     assert found.clean and found.samples == 29, summary(found)

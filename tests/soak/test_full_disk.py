@@ -36,14 +36,14 @@ def refused(control: Receiver, count: int) -> None:
 
 
 def ends_well(site: Site, control: Receiver, service: subprocess.Popen[str]) -> None:
-    control.wait(lambda: any("takes the recording again" in e["text"] for e in control.events), "the disk is back")
+    control.wait(lambda: any("accepts the recording again" in e["text"] for e in control.events), "the disk is back")
     known = len(control.offsets)
     control.wait(lambda: any(m["state"] == "ok" for m in control.messages[known:]), "ok again")
     service.terminate()
     assert service.wait(60) == 0
     said = [message for message in control.messages if "recording_failed" in message["reasons"]]
     assert said and all(m["state"] == "degraded" and m["y_offset_um"] is not None for m in said)
-    assert any(e["text"].startswith("the disk does not take the recording") for e in control.events)
+    assert any(e["text"].startswith("the disk does not accept the recording") for e in control.events)
     check_received(control.offsets, PERIOD_S)
     # Every sample is there, those that waited too, exactly as they were published (but for one that was being written).
     on_disk = site.on_disk()

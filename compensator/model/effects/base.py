@@ -162,7 +162,7 @@ class BankEffect:
         return run[-1](*self.inputs(signals, run))
 
     def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
-        """Return every input behind every lag."""
+        """Return every input through every lag."""
         bank: FilterBank = blocks[-1]
         return bank.columns(*self.inputs(record, filters(blocks)))
 
@@ -204,7 +204,7 @@ class EffectStream:
         return y
 
     def snapshot(self) -> tuple[float, ...]:
-        """Return everything that it must remember to go on with the same bits."""
+        """Return everything that it must remember to continue with the same bits."""
         return tuple(value for block in self._blocks for value in block.state)
 
     def restore(self, state: tuple[float, ...]) -> None:

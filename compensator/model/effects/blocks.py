@@ -25,7 +25,7 @@ Signal = Any
 class Block:
     """One input, one output, and a state of floats."""
 
-    #: Everything that it must remember to go on with the same bits.
+    #: Everything that it must remember to continue with the same bits.
     state: tuple[float, ...] = ()
 
     def step(self, u: float) -> float:
@@ -136,7 +136,7 @@ class FilterBank:
         return np.asarray(self.columns(*inputs) @ np.array([gain for row in self._rows for gain, _ in row]))
 
     def columns(self, *inputs: Vector) -> Matrix:
-        """Return each input behind each lag, unweighted, shape (n, inputs · lags)."""
+        """Return each input through each lag, unweighted, shape (n, inputs · lags)."""
         return np.column_stack([lag.filter(u) for u, row in zip(inputs, self._rows, strict=True) for _, lag in row])
 
 

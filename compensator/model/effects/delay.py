@@ -63,7 +63,7 @@ class DelayedSensor(DelayedPath):
     def law(self, signals: Any, run: Sequence[Run]) -> Signal:
         """Return what the share would have been with an immediate sensor, less what it is."""
         share, period_min = signals.share(self.path), signals.period_min
-        # Beyond the end of the record the path goes on with its drive as it is.
+        # Beyond the end of the record the path continues with its drive as it is.
         drive = signals.source(self.path)
         longer = signals.function(self.path).response(np.concatenate((drive, np.full(AHEAD, drive[-1]))))
         early = shifted(longer, -self.delay_min / period_min)

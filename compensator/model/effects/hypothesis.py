@@ -191,7 +191,7 @@ class Context:
 
 
 def proposals(context: Context, *, background: bool = False) -> list[Hypothesis]:
-    """Return every hypothesis of every kind for this data: those that stand for themselves, or background ones."""
+    """Return every hypothesis of every kind for this data: those that are named for themselves, or background ones."""
     return [h for form in forms() if form.background == background for h in form.propose(context)]
 
 

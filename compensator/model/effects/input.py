@@ -32,7 +32,7 @@ _POWERS = {"linear": "", "square": "2", "abs": "", "power 5/3": "_5_3"}
 
 @register
 class Input(BankEffect, Effect):
-    """A channel behind a curve, a delay and lags."""
+    """A channel through a curve, a delay and lags."""
 
     kind = "input"
     linear = ("gain",)
@@ -78,7 +78,7 @@ class Input(BankEffect, Effect):
 
 @register
 class InputBank(Input):
-    """A channel behind a filter bank of given lags: for a response whose form is not known."""
+    """A channel through a filter bank of given lags: for a response whose form is not known."""
 
     ridge = BANK_RIDGE
 
@@ -116,7 +116,7 @@ class InputBank(Input):
 
 
 def banks(context: Context) -> list[Hypothesis]:
-    """Return every channel behind a filter bank; one with a zero of its own also through the curves."""
+    """Return every channel through a filter bank; one with a zero of its own also through the curves."""
     taus = context.bank_min
     names, ones = numbered("gain", len(taus)), (1.0,) * len(taus)
     return [

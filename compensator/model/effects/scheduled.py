@@ -114,14 +114,14 @@ class SpeedScheduled(Scheduled):
         return (Lag(self.tau_min, period_min),)
 
     def law(self, signals: Any, run: Sequence[Run]) -> Signal:
-        """Return what the lag takes off the share, times the channel."""
+        """Return what the lag removes from the share, times the channel."""
         share = signals.share(self.path)
         return self.change * self.scale(signals, run) * (run[1](share) - share)
 
 
 @register
 class BankScheduled(BankEffect, Scheduled):
-    """Drive and share of the path, times the channel, behind a filter bank.
+    """Drive and share of the path, times the channel, through a filter bank.
 
     Parameters
     ----------

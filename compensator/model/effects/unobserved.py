@@ -2,8 +2,8 @@
 
     y += Σ_k size_k · L(τ) · H(t − t_k)
 
-A source behind a lag, switched on and off at times that no channel shows. It cannot be deployed: when it will be
-switched next is not known.
+A source that acts through a lag, switched on and off at times that no channel shows. It cannot be deployed: when it
+will be switched next is not known.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from compensator.model.effects.signals import RecordSignals
 
 @register
 class Unobserved(Effect):
-    """Steps behind a common lag; the diagnosis finds their times, because that needs the residual.
+    """Steps through a common lag; the diagnosis finds their times, because that needs the residual.
 
     Parameters
     ----------

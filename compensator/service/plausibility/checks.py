@@ -40,9 +40,9 @@ _USABLE = 0.5
 WINDOW = 72
 #: Shift, in standard deviations of the residual, that the CUSUM is designed for.
 _SHIFT = 5.0
-#: An innovation is clipped at this many of its standard deviations: a few wild minutes raise no alarm.
+#: An innovation is clipped at this many of its standard deviations: a few minutes of outliers raise no alarm.
 _CLIP = 3.0
-#: The alarm ends once so many blocks in a row have been within so many standard deviations.
+#: The alarm ends after this number of consecutive blocks within this number of standard deviations.
 CALM_BLOCKS = 6
 _CALM = 2.0
 #: Mean excess of a Gaussian random walk over a boundary, in its standard deviations (Siegmund).
@@ -364,7 +364,7 @@ class PlausibilityCheck:
 
 
 def cusum_threshold(allowance: float, std: float, blocks: float) -> float:
-    """Return the threshold that a two-sided CUSUM crosses by chance once in so many blocks.
+    """Return the threshold that a two-sided CUSUM crosses by chance once in a number of blocks.
 
     Siegmund's approximation of the mean time of one side, with increments e − k, e ~ N(0, s²):
     ``(exp(2 Δ b) − 2 Δ b − 1) / (2 Δ²)``, Δ = k / s, b = h / s + 1.166; both sides together cross twice as often.
