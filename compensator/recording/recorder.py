@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable, Iterator, Mapping
-from datetime import UTC, datetime
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from compensator.recording import chain
 from compensator.recording.container import Attachment
 from compensator.recording.finishing import Finisher, Retention
 from compensator.recording.live_file import RecordingFile, sync_folder
+from compensator.recording.naming import day_of, names
 from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 
@@ -91,7 +91,7 @@ class McapRecorder:
             If the disk refuses them. What was written since the last sync is cut off again, the file is given up, and
             the next call opens a new one.
         """
-        day = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%d")
+        day = day_of(time_utc_ns)
         try:
             if self._live is None or day != self._day:
                 self._finish("day")
@@ -171,8 +171,8 @@ class McapRecorder:
         before = self._last
         if previous and not before:
             before = last_value(previous[-1])
-        names = self._names(time_utc_ns, previous[-1] if previous else None)
-        live = self._live = RecordingFile(names, self._machine, before or chain.NOTHING, time_utc_ns)
+        paths = names(self._folder, self._machine, time_utc_ns, previous[-1] if previous else None)
+        live = self._live = RecordingFile(paths, self._machine, before or chain.NOTHING, time_utc_ns)
         self.path = live.path
         metadata = {
             "machine": self._machine,
@@ -198,19 +198,6 @@ class McapRecorder:
             # A kill leaves unfinished files: at a start it may be any of them, after a failure the last.
             for path in previous if self._reason == "start" else previous[-1:]:
                 self._finisher.enqueue(path, time_utc_ns)
-
-    def _names(self, time_utc_ns: int, newest: Path | None) -> Iterator[Path]:
-        """Yield names for a new file by machine and UTC time."""
-        stamp = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ")
-        number = 0
-        if newest is not None:
-            # Names are in the order in which files were opened, even if the clock was set back between them.
-            last, _, suffix = newest.stem.removeprefix(f"{self._machine}_").partition("-")
-            if last >= stamp:
-                stamp, number = last, int(suffix or 0) + 1
-        for count in range(number, number + 1000):
-            ending = f"-{count:03d}" if count else ""
-            yield self._folder / f"{self._machine}_{stamp}{ending}.mcap"
 
 
 def _attached(name: str, media_type: str, data: bytes, time_ns: int) -> Attachment:
