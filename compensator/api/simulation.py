@@ -13,7 +13,7 @@ import numpy as np
 
 from compensator.api.files import ModelLike, model_of
 from compensator.arrays import Vector
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.blas import one_thread
 from compensator.data.measurement import measurements
 from compensator.data.record import Record, require
@@ -81,7 +81,7 @@ class SimulationResult(Mapping[str, Vector]):
         OSError
             If it cannot be written there.
         """
-        with whole_file(Path(path)) as file:
+        with atomic_write(Path(path)) as file:
             csv.writer(file, lineterminator="\n").writerows(csv_rows(self.columns))
         return Path(path)
 

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
 from compensator.commands import Answer
@@ -70,7 +70,7 @@ def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) 
         from compensator.audit.pages import Curves
 
         curves = Curves()
-    with progress_bar("comparing") as progress, whole_file(out) if out else nullcontext() as file:
+    with progress_bar("comparing") as progress, atomic_write(out) if out else nullcontext() as file:
         row = None
         if file is not None:
             row = csv.writer(file, lineterminator="\n").writerow

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.errors import ModelError
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
@@ -51,7 +51,7 @@ def write_model(path: FilePath, model: ThermalModel) -> ThermalModel:
     text = dump_model(model)
     # Before the old file is replaced: the reader knows bounds that the model does not.
     parse_model(text.encode("utf-8"), source=str(path))
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(text)
     return load_model(path.absolute())  # a bare "quill" is the name of a built-in model
 

@@ -212,18 +212,3 @@ def _create(paths: Iterable[Path]) -> tuple[Path, int]:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path, descriptor
     raise OSError(f"{path}: it and every name before it is in use")
-
-
-def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to disk, so that a new file's name survives a power cut.
-
-    Raises
-    ------
-    OSError
-        If the disk refuses it.
-    """
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -17,11 +17,12 @@ from typing import Any
 import mcap
 
 from compensator import __version__
+from compensator.atomic_write import sync_folder
 from compensator.clock import NS
 from compensator.recording import chain
 from compensator.recording.container import Attachment
 from compensator.recording.finishing import Finisher, Retention
-from compensator.recording.live_file import RecordingFile, sync_folder
+from compensator.recording.live_file import RecordingFile
 from compensator.recording.naming import day_of, names
 from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer

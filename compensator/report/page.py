@@ -16,7 +16,7 @@ from itertools import chain, count, repeat
 from pathlib import Path
 from typing import Literal
 
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.reasons import Remark, explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
@@ -194,7 +194,7 @@ def write_page(path: Path, page: Page) -> Path:
     pathlib.Path
         The same path.
     """
-    with whole_file(path) as file:
+    with atomic_write(path) as file:
         file.write(html_of(page))
     return path
 

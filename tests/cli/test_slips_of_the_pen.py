@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensator.atomic_write import whole_file
+from compensator.atomic_write import atomic_write
 from compensator.cli import main
 
 HEADER = "t_s,t_q_degc,at_degc,y_um,heat_w\n"
@@ -167,13 +167,13 @@ def test_what_is_no_file_is_written_to_and_a_link_stays_one(tmp_path: Path) -> N
     os.mkfifo(pipe)
     reader = threading.Thread(target=lambda: read.append(pipe.read_text("utf-8")))
     reader.start()
-    with whole_file(pipe) as file:
+    with atomic_write(pipe) as file:
         file.write("t_s\n")
     reader.join()
     assert read == ["t_s\n"] and stat.S_ISFIFO(pipe.stat().st_mode)
     kept, link = tmp_path / "kept.csv", tmp_path / "link.csv"
     kept.write_text("before\n")
     link.symlink_to(kept)
-    with whole_file(link) as file:
+    with atomic_write(link) as file:
         file.write("after\n")
     assert link.is_symlink() and kept.read_text() == "after\n"
