@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
-from compensator.errors import DataError
+from compensator.errors import DataError, UsageError
 from compensator.messages import MESSAGES, Chain
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
@@ -224,8 +224,29 @@ def decode_with(decoder: msgspec.json.Decoder[_T], record: Record, file: str) ->
 
 def recordings(folder: Path, machine: str) -> list[Path]:
     """Return a machine's recordings in the order in which they were started."""
+    return _found(folder, f"{machine}_????????T??????Z*.mcap")
+
+
+def recordings_in(given: Iterable[Path]) -> list[Path]:
+    """Return the recordings given; a folder stands for those in it.
+
+    Raises
+    ------
+    UsageError
+        If there are none in a folder.
+    """
+    paths: list[Path] = []
+    for path in given:
+        inside = _found(path, "*.mcap") if path.is_dir() else [path]
+        if not inside:
+            raise UsageError(f"{path}: no recordings in it, expected FILE.mcap")
+        paths += inside
+    return paths
+
+
+def _found(folder: Path, pattern: str) -> list[Path]:
     # By stem: the second file of a second, "…Z-001.mcap", would sort before the first, "…Z.mcap".
-    return sorted(folder.glob(f"{machine}_????????T??????Z*.mcap"), key=lambda path: path.stem)
+    return sorted(folder.glob(pattern), key=lambda path: path.stem)
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
