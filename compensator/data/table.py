@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.config import ROLES
 from compensator.errors import DataError, UsageError
 from compensator.reasons import Remark
-
-ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 
 #: Columns of an exported recording that the service computed.
 EXPORTED = (
