@@ -1,9 +1,16 @@
-"""Array types that signatures share."""
+"""Array types that signatures share, and numbers that all rooms share."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
+
+#: A missing value.
+NAN = math.nan
+#: No measurement, coefficient, gain or noise is as large; powers of larger numbers would not be finite.
+LARGEST = 1e30
 
 #: One number for each sample or parameter, shape (n,).
 Vector = npt.NDArray[np.float64]

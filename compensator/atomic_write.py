@@ -1,9 +1,9 @@
-"""Atomic writes: under its name a file is complete or missing."""
+"""Atomic file writes."""
 
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,13 +12,13 @@ from typing import TextIO
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[TextIO]:
-    r"""Open a file for text; it replaces the old one once it is complete, and is removed where something fails.
+    r"""Open a text file that replaces another one when it is complete; after an error it is removed.
 
     Parameters
     ----------
     path : pathlib.Path
-        Where it is to go; its folder is made. What was there before stays until then. A link stays a link, and what is
-        no file (`/dev/null`, a pipe) is written to directly.
+        The file; its folder is created. The present file stays until it is replaced. A link stays a link, and what is
+        not a regular file (`/dev/null`, a pipe) is written to directly.
 
     Yields
     ------
@@ -27,6 +27,7 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
 
     Examples
     --------
+    >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     with atomic_write(Path(folder) / "a.csv") as file:
     ...         _ = file.write("t_s,y_um\n")
@@ -39,14 +40,68 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
         with path.open("w", newline="", encoding="utf-8") as file:
             yield file
         return
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "w", newline="", encoding="utf-8") as file:
-            yield file
+    with (
+        _replacement(path, 0o600) as descriptor,
+        os.fdopen(descriptor, "w", newline="", encoding="utf-8") as file,
+    ):
+        yield file
+        file.flush()
+        os.fsync(descriptor)
+        # Root's umask may be narrower, and then the service could not read its own model.
+        os.fchmod(descriptor, 0o644)
+
+
+def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = True) -> None:
+    """Replace a file by another one; a link is replaced, not followed.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file; its folder must exist.
+    data : bytes
+        Its contents.
+    mode : int
+        Its permissions, before the umask.
+    sync : bool
+        Whether to bring the file and its name to disk: a power cut then leaves the old file or the new one.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; the old file stays.
+    """
+    with _replacement(path, mode) as descriptor, os.fdopen(descriptor, "wb") as file:
+        file.write(data)
+        if sync:
             file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
+            os.fsync(descriptor)
+    if sync:
+        sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to disk, so that a new file's name survives a power cut.
+
+    Raises
+    ------
+    OSError
+        If the disk refuses it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _replacement(path: Path, mode: int) -> Iterator[int]:
+    """Open a new file in the same folder; at the end it takes the name, after an error it is removed."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    descriptor = os.open(temporary, flags, mode)
+    try:
+        yield descriptor
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

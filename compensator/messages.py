@@ -7,6 +7,7 @@ the two together.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from importlib import resources
 from typing import Any
@@ -14,8 +15,6 @@ from typing import Any
 import msgspec
 
 from compensator.reasons import SampleQuality, State
-
-NAN = float("nan")
 
 #: Version of the messages.
 SCHEMA = 1
@@ -315,7 +314,7 @@ def encode(message: msgspec.Struct) -> bytes:
 
 def number(value: float | None) -> float:
     """Return a decoded number, NaN where it is missing."""
-    return NAN if value is None else value
+    return math.nan if value is None else value
 
 
 def schemas() -> dict[str, dict[str, Any]]:

@@ -17,6 +17,7 @@ from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
 from compensator.model.model_file import load_model
+from compensator.recording.reading import recordings_in
 
 if TYPE_CHECKING:
     from compensator.report.page import Page
@@ -35,7 +36,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If something that was given cannot be read.
     """
-    paths, page = _files(arguments.recording), arguments.page
+    paths, page = recordings_in(arguments.recording), arguments.page
     if page is not None:
         from compensator.report.formats import checked
 
@@ -90,17 +91,3 @@ def _with_page(answer: Answer, path: Path, page: Page) -> Answer:
 
     write(path, page)
     return Answer(answer.result | {"report": str(path)}, f"{answer.text}\npage: {path}", answer.code)
-
-
-def _files(given: list[Path]) -> list[Path]:
-    """Return the recordings given; a folder means all in it."""
-    paths: list[Path] = []
-    for path in given:
-        if path.is_dir():
-            inside = sorted(path.glob("*.mcap"), key=lambda file: file.stem)
-            if not inside:
-                raise UsageError(f"{path}: no recordings in it, expected FILE.mcap")
-            paths += inside
-        else:
-            paths.append(path)
-    return paths

@@ -19,13 +19,14 @@ def run(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If there are neither recordings nor pages, or the page cannot be written.
     """
+    from compensator.recording.reading import recordings_in
     from compensator.report.formats import checked
 
     given: list[Path] = arguments.what
     out = checked(arguments.out or Path(f"{_name(given[0])}-report.html"), option="--out")
     if len(given) == 1 and given[0].is_dir() and not any(given[0].glob("*.mcap")):
         return _results(given[0], out)
-    return _recordings(_files(given), out)
+    return _recordings(recordings_in(given), out)
 
 
 def _recordings(paths: Sequence[Path], out: Path) -> Answer:
@@ -53,22 +54,6 @@ def _results(folder: Path, out: Path) -> Answer:
     }
     lines = [f"{page.path}\n  {page.verdict}" for page in pages]
     return Answer(result, "\n".join([*lines, f"page: {out}"]))
-
-
-def _files(given: Sequence[Path]) -> list[Path]:
-    """Return the recordings given; a folder means all in it."""
-    paths: list[Path] = []
-    for path in given:
-        if path.is_dir():
-            inside = sorted(path.glob("*.mcap"))
-            if not inside:
-                raise UsageError(f"{path}: no recordings, expected FILE.mcap")
-            paths += inside
-        elif path.suffix != ".mcap":
-            raise UsageError(f"{path}: expected a recording (FILE.mcap) or a folder")
-        else:
-            paths.append(path)
-    return paths
 
 
 def _name(path: Path) -> str:

@@ -14,7 +14,7 @@ import msgspec
 from compensator.atomic_write import atomic_write
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Sample
-from compensator.recording.reading import decode, machines_in, read_messages
+from compensator.recording.reading import machines_in, messages
 
 PathLike = str | os.PathLike[str]
 
@@ -52,9 +52,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     machines: dict[str, Path] = {}
     for recording in paths:
         before = len(rows)
-        for record in read_messages(recording, ("sample", "estimate", "offset"), prefix=machine):
-            message = decode(record, recording)
-            assert isinstance(message, (Sample, EstimateMessage, Offset))
+        for message in messages(recording, ("sample", "estimate", "offset"), prefix=machine):
             machines.setdefault(message.machine, recording)
             rows.setdefault(message.seq, {}).update(_cells(message))
         if len(rows) == before:

@@ -13,8 +13,8 @@ import numpy as np
 
 from compensator.data.table import Table, table_of
 from compensator.errors import DataError
-from compensator.messages import Sample, number
-from compensator.recording.reading import decode, read_messages
+from compensator.messages import number
+from compensator.recording.reading import messages
 
 #: How files begin that are mistaken for tables, and what to do with them.
 _OTHER_FILES = (
@@ -152,9 +152,7 @@ def _read_recording(path: Path) -> Table:
     """Return the samples of a recording; their time counts from 1970."""
     times: list[int] = []
     samples: list[dict[str, float]] = []
-    for record in read_messages(path, ("sample",)):
-        sample = decode(record, path)
-        assert isinstance(sample, Sample)
+    for sample in messages(path, ("sample",)):
         times.append(sample.time_utc_ns)
         samples.append(
             {name: number(channel.mean) if channel.is_good else math.nan for name, channel in sample.channels.items()}

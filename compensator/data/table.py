@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.config import ROLES
 from compensator.errors import DataError, UsageError
 from compensator.reasons import Remark
 from compensator.remarks import DataRemark
-
-ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 
 #: Columns of an exported recording that the service computed.
 EXPORTED = (

@@ -14,13 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import NAN, Vector
 from compensator.errors import ModelError
 from compensator.model.effects import EffectStream, Signals, effect_from, kinds
 from compensator.model.observer import Observer, ObserverState
 from compensator.model.thermal_model import ThermalModel
-
-NAN = float("nan")
 
 #: Longest run of incomplete samples that is repeated once both temperatures are back.
 BRIDGE_SAMPLES = 60

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from compensator.arrays import LARGEST
 from compensator.errors import ModelError
-
-#: No coefficient, gain or noise is as large: its powers would not be finite.
-LARGEST = 1e30
 
 
 class Table:

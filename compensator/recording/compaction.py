@@ -18,6 +18,7 @@ from mcap.exceptions import McapError
 from mcap.reader import McapReader, make_reader
 from mcap.writer import CompressionType, Writer
 
+from compensator.atomic_write import sync_folder
 from compensator.errors import DataError
 from compensator.recording import chain
 from compensator.recording.container import (
@@ -29,7 +30,7 @@ from compensator.recording.container import (
     Message,
     Torn,
 )
-from compensator.recording.live_file import Opening, sync_folder
+from compensator.recording.live_file import Opening
 
 #: Number of messages after which a patient copy yields to other threads, and for how long, s.
 TURN, MOMENT_S = 64, 0.0005

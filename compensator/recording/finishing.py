@@ -8,9 +8,8 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from compensator.messages import encode
 from compensator.recording import chain
 from compensator.recording.compaction import Copy, rewrite
 from compensator.recording.container import Contents, Message
+from compensator.recording.naming import began_ns
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
 from compensator.remarks import RecordingEnd
@@ -60,10 +60,21 @@ class Finisher:
         How much is kept.
     signer : Signer, optional
         Signs what is recovered.
+    compacted : callable, optional
+        Makes one file compact and returns a remark about it, empty for none; by default a machine's, see `compact`.
     """
 
-    def __init__(self, folder: Path, machine: str, retention: Retention, signer: Signer | None) -> None:
-        self._folder, self._machine, self._retention, self._signer = folder, machine, retention, signer
+    def __init__(
+        self,
+        folder: Path,
+        machine: str,
+        retention: Retention,
+        signer: Signer | None,
+        *,
+        compacted: Callable[[Path], str] | None = None,
+    ) -> None:
+        self._folder, self._machine, self._retention = folder, machine, retention
+        self._compact = compacted or (lambda path: compact(path, signer, patient=True))
         self._lock = threading.Lock()
         self._jobs: deque[tuple[Path | None, int]] = deque()
         #: What the disk did not let be made compact; tried again with the next file.
@@ -140,7 +151,7 @@ class Finisher:
     def _compacted(self, path: Path) -> Exception | None:
         """Make a file compact; return why it could not be."""
         try:
-            recovered = compact(path, self._signer, patient=True)
+            recovered = self._compact(path)
         except (OSError, DataError) as error:
             return error
         if recovered:
@@ -167,7 +178,7 @@ class Finisher:
             sizes = {path: path.stat().st_size for path in paths}
             for path in paths[:-2]:
                 too_much = limits.keep_mb is not None and sum(sizes.values()) > limits.keep_mb * 1e6
-                if not too_much and _began_ns(path, self._machine) >= oldest_ns:
+                if not too_much and began_ns(path, self._machine) >= oldest_ns:
                     break
                 path.unlink()
                 removed.append((path.name, sizes.pop(path)))
@@ -182,12 +193,6 @@ class Finisher:
             text = f"{len(names)} recording(s) removed by the limit of what is kept, up to {names[-1]}"
             self._remark(text, RecordingData(code=RecordingCode.REMOVED, removed=names, bytes=size))
         return bool(removed)
-
-
-def _began_ns(path: Path, machine: str) -> int:
-    """Return the time in a recording's name."""
-    stamp = path.name[len(machine) + 1 :][:16]
-    return int(datetime.strptime(stamp, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC).timestamp()) * NS
 
 
 def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) -> str:

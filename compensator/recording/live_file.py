@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
 from compensator import __version__
-from compensator.clock import NS
 from compensator.errors import DataError
 from compensator.messages import MESSAGES, encode, shipped_schema
 from compensator.recording import chain
@@ -40,29 +38,6 @@ class _Sink:
 
     def flush(self) -> None:
         return
-
-
-def new_names(folder: Path, begin: str, time_ns: int, newest: Path | None = None) -> Iterator[Path]:
-    """Yield names for a new file, the first without a number, in the order in which files are opened.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Its folder.
-    begin : str
-        Begin of the name; the UTC time follows.
-    time_ns : int
-        Now, ns since 1970 UTC.
-    newest : pathlib.Path, optional
-        The file before it: the new name sorts after it, even if the clock was set back between them.
-    """
-    stamp, number = datetime.fromtimestamp(time_ns / NS, UTC).strftime("%Y%m%dT%H%M%SZ"), 0
-    if newest is not None:
-        last, _, suffix = newest.stem.removeprefix(f"{begin}_").partition("-")
-        if last >= stamp:
-            stamp, number = last, int(suffix or 0) + 1
-    for count in range(number, number + 1000):
-        yield folder / f"{begin}_{stamp}{f'-{count:03d}' if count else ''}.mcap"
 
 
 class LiveFile:
@@ -237,18 +212,3 @@ def _create(paths: Iterable[Path]) -> tuple[Path, int]:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path, descriptor
     raise OSError(f"{path}: it and every name before it is in use")
-
-
-def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to disk, so that a new file's name survives a power cut.
-
-    Raises
-    ------
-    OSError
-        If the disk refuses it.
-    """
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
-from compensator.errors import DataError
-from compensator.messages import MESSAGES, Chain, Offset, Sample
+from compensator.errors import DataError, UsageError
+from compensator.messages import MESSAGES, Chain
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Container, Damaged
 
@@ -144,6 +144,33 @@ def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: 
                 yield record._replace(topic=topic) if prefix else record
 
 
+def messages(path: Path, topics: tuple[str, ...], *, prefix: str = "", since_ns: int = 0) -> Iterator[Any]:
+    """Yield the decoded messages of a file in the order in which they were written.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        A recording, finished or not.
+    topics : tuple of str
+        Only these.
+    prefix : str
+        See `read_messages`.
+    since_ns : int
+        Only messages written at this time or later, ns since 1970 UTC.
+
+    Raises
+    ------
+    DataError
+        If it is not an MCAP file, or a message does not follow its schema.
+    """
+    # A file is modified after its last message.
+    if since_ns and path.stat().st_mtime_ns < since_ns:
+        return
+    for record in read_messages(path, topics, prefix=prefix):
+        if record.log_time_ns >= since_ns:
+            yield decode(record, path)
+
+
 def machines_in(path: Path) -> list[str]:
     """Return the prefixes of the machines in a shop's recording; none in a recording of one machine.
 
@@ -158,8 +185,8 @@ def machines_in(path: Path) -> list[str]:
     return sorted(known - {""})
 
 
-def decode(record: Record, path: Path) -> msgspec.Struct:
-    """Decode a recorded message.
+def decode(record: Record, file: Path | str) -> Any:
+    """Decode a recorded message of any topic; `file` is for the error.
 
     Raises
     ------
@@ -168,8 +195,8 @@ def decode(record: Record, path: Path) -> msgspec.Struct:
     """
     decoder = _DECODERS.get(record.topic)
     if decoder is None:
-        raise DataError(f"{path}: unknown channel /{record.topic}, expected one of: {', '.join(MESSAGES)}")
-    return decode_with(decoder, record, str(path))
+        raise DataError(f"{file}: unknown channel /{record.topic}, expected one of: {', '.join(MESSAGES)}")
+    return decode_with(decoder, record, str(file))
 
 
 def decode_with(decoder: msgspec.json.Decoder[_T], record: Record, file: str) -> _T:
@@ -197,8 +224,29 @@ def decode_with(decoder: msgspec.json.Decoder[_T], record: Record, file: str) ->
 
 def recordings(folder: Path, machine: str) -> list[Path]:
     """Return a machine's recordings in the order in which they were started."""
+    return _found(folder, f"{machine}_????????T??????Z*.mcap")
+
+
+def recordings_in(given: Iterable[Path]) -> list[Path]:
+    """Return the recordings given; a folder stands for those in it.
+
+    Raises
+    ------
+    UsageError
+        If there are none in a folder.
+    """
+    paths: list[Path] = []
+    for path in given:
+        inside = _found(path, "*.mcap") if path.is_dir() else [path]
+        if not inside:
+            raise UsageError(f"{path}: no recordings in it, expected FILE.mcap")
+        paths += inside
+    return paths
+
+
+def _found(folder: Path, pattern: str) -> list[Path]:
     # By stem: the second file of a second, "…Z-001.mcap", would sort before the first, "…Z.mcap".
-    return sorted(folder.glob(f"{machine}_????????T??????Z*.mcap"), key=lambda path: path.stem)
+    return sorted(folder.glob(pattern), key=lambda path: path.stem)
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
@@ -271,11 +319,7 @@ def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> 
 def last_sequence(folder: Path, machine: str) -> int:
     """Return the highest sequence number that was ever published, −1 where there is none."""
     for path in reversed(recordings(folder, machine)):
-        highest = -1
-        for record in read_messages(path, ("sample", "offset")):
-            message = decode(record, path)
-            if isinstance(message, (Sample, Offset)):
-                highest = max(highest, message.seq)
+        highest = max((message.seq for message in messages(path, ("sample", "offset"))), default=-1)
         if highest >= 0:
             return highest
     return -1

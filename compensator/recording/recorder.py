@@ -11,18 +11,19 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterable, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import mcap
 
 from compensator import __version__
+from compensator.atomic_write import sync_folder
 from compensator.clock import NS
 from compensator.recording import chain
 from compensator.recording.container import Attachment
 from compensator.recording.finishing import Finisher, Retention
-from compensator.recording.live_file import RecordingFile, new_names, sync_folder
+from compensator.recording.live_file import RecordingFile
+from compensator.recording.naming import day_of, names
 from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
 
@@ -91,7 +92,7 @@ class McapRecorder:
             If the disk refuses them. What was written since the last sync is cut off again, the file is given up, and
             the next call opens a new one.
         """
-        day = datetime.fromtimestamp(time_utc_ns / NS, UTC).strftime("%Y%m%d")
+        day = day_of(time_utc_ns)
         try:
             if self._live is None or day != self._day:
                 self._finish("day")
@@ -171,8 +172,8 @@ class McapRecorder:
         before = self._last
         if previous and not before:
             before = last_value(previous[-1])
-        names = new_names(self._folder, self._machine, time_utc_ns, previous[-1] if previous else None)
-        live = self._live = RecordingFile(names, self._machine, before or chain.NOTHING, time_utc_ns)
+        paths = names(self._folder, self._machine, time_utc_ns, previous[-1] if previous else None)
+        live = self._live = RecordingFile(paths, self._machine, before or chain.NOTHING, time_utc_ns)
         self.path = live.path
         metadata = {
             "machine": self._machine,

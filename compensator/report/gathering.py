@@ -12,14 +12,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from compensator.errors import DataError
-from compensator.messages import MESSAGES, EstimateMessage, Event, Offset, Sample, number
+from compensator.messages import EstimateMessage, Event, Offset, Sample, number
 from compensator.reasons import State
-from compensator.recording.container import PAYLOAD, Container, Contents, Damaged, Torn
-from compensator.recording.reading import in_order
+from compensator.recording.container import Container, Contents, Damaged, Torn
+from compensator.recording.reading import decode, in_order, records_of
 from compensator.remarks import RecordingEnd
 from compensator.report.envelope import Envelope, Stretches
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, File, History, Missed, Period
@@ -30,12 +29,6 @@ _DAY_S = 86400.0
 _TOGETHER = 5000
 #: Samples farther apart than this number of periods have time without a recording between them.
 _GAP = 1.5
-_UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
-
-
-_DECODERS: dict[str, msgspec.json.Decoder[Any]] = {
-    name: msgspec.json.Decoder(MESSAGES[name]) for name in ("sample", "estimate", "offset", "event")
-}
 
 
 def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] | None = None) -> History:
@@ -91,22 +84,16 @@ class _Reader:
         """Add a file, message by message."""
         file = File(name)
         self.history.files.append(file)
-        topics: dict[int, str] = {}
         try:
-            for i, (channel, sequence, _, body) in enumerate(container.messages()):
-                topic = topics.get(channel)
-                if topic is None:
-                    topic = topics[channel] = container.contents.channels[channel].topic.lstrip("/")
+            for i, record in enumerate(records_of(container)):
+                if i == 0:
                     self._opening(container.contents)
-                decoder = _DECODERS.get(topic)
-                if decoder is not None:
-                    try:
-                        message = decoder.decode(body[PAYLOAD:])
-                    except _UNREADABLE as error:
-                        raise DataError(f"{name}: /{topic} record {sequence}: {error}") from error
-                    if topic == "sample":
+                add = self._add.get(record.topic)
+                if add is not None:
+                    message = decode(record, name)
+                    if record.topic == "sample":
                         file.add(message.time_utc_ns * _NS)
-                    self._add[topic](message)
+                    add(message)
                 yield i
             file.end = RecordingEnd.FINISHED if container.contents.ended else RecordingEnd.OPEN
         except Torn:

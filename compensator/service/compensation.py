@@ -11,6 +11,7 @@ import math
 
 import msgspec
 
+from compensator.arrays import NAN
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind, Note, ZeroData
@@ -33,8 +34,6 @@ from compensator.service.state import (
 )
 
 __all__ = ["Compensation", "Outcome", "slowest_min"]
-
-NAN = float("nan")
 
 #: Number of samples over which rate and heat are averaged before they decide anything.
 MEAN_SAMPLES = 5

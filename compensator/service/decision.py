@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from compensator.arrays import NAN
 from compensator.config import Config, Limits
 from compensator.messages import SCHEMA, Offset
 from compensator.model.engine import Estimate
@@ -14,8 +15,6 @@ from compensator.reasons import Reason, State
 from compensator.service.outcome import Values
 from compensator.service.plausibility import PlausibilityCheck
 from compensator.service.state import Memory
-
-NAN = float("nan")
 
 #: A published offset is valid for this many samples.
 VALID_SAMPLES = 2.5

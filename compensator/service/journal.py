@@ -14,14 +14,14 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from compensator.clock import NS, Clock
+from compensator.clock import Clock
 from compensator.events import EventKind, RecordingCode, RecordingData
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
 from compensator.reasons import Reason, Remark
+from compensator.recording.naming import day_of
 from compensator.remarks import ServiceWarning
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 
@@ -109,7 +109,7 @@ class Entry:
     @property
     def day(self) -> str:
         """Its day, UTC; a file holds one."""
-        return datetime.fromtimestamp(self.time_utc_ns / NS, UTC).strftime("%Y%m%d")
+        return day_of(self.time_utc_ns)
 
     def inherit(self, dropped: Entry) -> None:
         """Keep what must not be lost with a sample that is dropped."""

@@ -6,15 +6,14 @@ An adopted model is used until the configured model itself is changed: the confi
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 
+from compensator.atomic_write import replace_file
 from compensator.errors import ServiceError
-from compensator.recording.live_file import sync_folder
 
 _FILE = "adopted.json"
 
@@ -105,7 +104,7 @@ class ModelStore:
         entry = Adopted(sha256=sha256_of(data), name=name, time_utc_ns=time_utc_ns)
         contents.in_use.append(entry)
         contents.history.append(entry)
-        self._replace_file(f"{entry.sha256}.toml", data)
+        self._store(f"{entry.sha256}.toml", data)
         self._write(contents)
 
     def back(self, *, name: str, time_utc_ns: int) -> None:
@@ -134,19 +133,13 @@ class ModelStore:
         return contents
 
     def _write(self, contents: _Contents) -> None:
-        self._replace_file(_FILE, msgspec.json.format(msgspec.json.encode(contents)))
+        self._store(_FILE, msgspec.json.format(msgspec.json.encode(contents)))
 
-    def _replace_file(self, name: str, data: bytes) -> None:
-        """Write a file so that a power cut leaves the old one or the new one."""
-        path, part = self.folder / name, self.folder / f"{name}.part"
+    def _store(self, name: str, data: bytes) -> None:
+        path = self.folder / name
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with part.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(path)
-            sync_folder(self.folder)
+            replace_file(path, data)
         except OSError as error:
             raise ServiceError(f"{path}: {error.strerror or error}; the model is not stored") from error
 

@@ -12,11 +12,11 @@ import logging
 import math
 import os
 import stat
-from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 
+from compensator.atomic_write import replace_file
 from compensator.messages import Offset, number
 from compensator.reasons import Remark
 from compensator.remarks import ServiceWarning
@@ -70,20 +70,13 @@ class OffsetCheckpoint:
         if math.isnan(value):
             return
         checkpointed = CheckpointedOffset(seq=offset.seq, time_utc_ns=offset.time_utc_ns, y_offset_um=value)
-        part = self.path.with_suffix(".part")
         try:
-            part.unlink(missing_ok=True)
-            descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(msgspec.json.encode(checkpointed))
-            part.replace(self.path)
+            replace_file(self.path, msgspec.json.encode(checkpointed), mode=0o600, sync=False)
         except OSError as error:
             if self._written:
                 figures = f"{self.path}: a kill now would lose the offset: {error}."
                 log.warning("%s", Remark(ServiceWarning.NOTE_NOT_KEPT, figures).marked)
             self._written = False
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
         else:
             self._written = True
 

@@ -13,17 +13,16 @@ from typing import Any, Literal
 
 import msgspec
 
+from compensator.arrays import NAN
 from compensator.errors import DataError
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.plausibility import PlausibilityState
-
-NAN = float("nan")
 
 #: Version of the state. A state of another version is refused, never guessed at.
 STATE_SCHEMA = 1
 
 #: Covariances stay below this by far; the products of larger ones would not be finite.
-LARGEST = 1e60
+LARGEST_COVARIANCE = 1e60
 
 ZeroMode = Literal["auto", "rest", "warm"]
 
@@ -154,6 +153,6 @@ def decode_state(data: bytes) -> CompensationState:
         raise DataError(f"state: schema = {state.schema}, expected {STATE_SCHEMA}")
     nested = (state.engine, *([state.engine.gap.state] if state.engine.gap else []))
     numbers = [state.offset_um, *(value for engine in nested for value in (*engine.observer.x, *engine.observer.p))]
-    if not all(-LARGEST < value < LARGEST for value in numbers):
+    if not all(-LARGEST_COVARIANCE < value < LARGEST_COVARIANCE for value in numbers):
         raise DataError("state: a number of the offset or of the observer is not finite, or larger than any can be")
     return state

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Event, Offset, Sample
-from compensator.recording.reading import decode, read_messages, recordings
+from compensator.recording.reading import messages, recordings
 from compensator.watch.history import SPAN_NS
 
 _TOPICS = ("sample", "estimate", "offset", "event")
@@ -28,15 +29,6 @@ def last_day(folder: Path, machine: str, now_ns: int) -> Iterator[Sample | Estim
         Now, ns since 1970 UTC.
     """
     since_ns = now_ns - SPAN_NS
-    # A file is modified after its last message: one that was last modified before the interval is skipped.
     for path in recordings(folder, machine):
-        try:
-            if path.stat().st_mtime_ns < since_ns:
-                continue
-            for record in read_messages(path, _TOPICS):
-                if record.log_time_ns >= since_ns:
-                    message = decode(record, path)
-                    assert isinstance(message, (Sample, EstimateMessage, Offset, Event))
-                    yield message
-        except (DataError, OSError):
-            continue
+        with suppress(DataError, OSError):
+            yield from messages(path, _TOPICS, since_ns=since_ns)

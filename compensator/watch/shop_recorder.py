@@ -11,19 +11,19 @@ import json
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterable
-from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from compensator import __version__
-from compensator.clock import NS, Clock
-from compensator.errors import DataError
+from compensator.clock import Clock
 from compensator.events import EventKind
 from compensator.messages import MESSAGES, shipped_schema
 from compensator.recording.compaction import rewrite
-from compensator.recording.live_file import LiveFile, new_names
+from compensator.recording.finishing import Finisher, Retention
+from compensator.recording.live_file import LiveFile
+from compensator.recording.naming import day_of, names
+from compensator.recording.reading import recordings
 from compensator.watch.machine import KINDS, Malformed, decoded
 from compensator.watch.sequence import Sequence
 
@@ -35,6 +35,8 @@ SYNC_S = 2.0
 WAITING = 200_000
 #: Largest number of channels in one file: invented keys cannot fill the memory.
 CHANNELS = 20_000
+#: What the names of a shop's recordings begin with.
+NAME = "shop"
 #: Topic prefix of messages that follow no schema.
 OTHER = "other/"
 
@@ -66,7 +68,7 @@ class ShopRecorder:
         self._waiting: deque[_Arrival] = deque()
         self._wake, self._ended = threading.Event(), False
         self._thread: threading.Thread | None = None
-        self._finishers: list[threading.Thread] = []
+        self._finisher = Finisher(folder, NAME, Retention(), None, compacted=_compacted)
         self._file: _File | None = None
         self._day, self._failed = "", False
         self._numbers: dict[tuple[str, str], Sequence] = {}
@@ -91,7 +93,8 @@ class ShopRecorder:
 
     def __enter__(self) -> ShopRecorder:
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._finish_later(sorted(self._folder.glob("shop_*.mcap")))
+        for path in recordings(self._folder, NAME):
+            self._finisher.enqueue(path, self._clock.utc_ns())
         self._thread = threading.Thread(target=self._work, name="shop recorder")
         self._thread.start()
         return self
@@ -101,8 +104,7 @@ class ShopRecorder:
         self._wake.set()
         if self._thread is not None:
             self._thread.join()
-        for finisher in self._finishers:
-            finisher.join()
+        self._finisher.wait()
 
     def answer(self) -> tuple[dict[str, Any], str]:
         """Return what was recorded and lost, as JSON and as text."""
@@ -154,8 +156,8 @@ class ShopRecorder:
     def _write(self, batch: list[_Arrival]) -> None:
         """Write a batch, each day to its own file; remove from the batch what is on disk."""
         while batch:
-            day = _day(batch[0])
-            part = next(list(same) for _, same in groupby(batch, _day))
+            day, same = next(groupby(batch, lambda arrival: day_of(arrival.time_ns)))
+            part = list(same)
             if self._file is None or day != self._day:
                 self._finish()
                 self._file, self._day = _File(self._folder, part[0].time_ns, self._prefix), day
@@ -209,35 +211,23 @@ class ShopRecorder:
         if file is None:
             return
         file.end(self.messages, self.not_recorded, self.missed(), self._clock.utc_ns())
-        self._finish_later([file.path])
-
-    def _finish_later(self, paths: Iterable[Path]) -> None:
-        finisher = threading.Thread(target=_compact_all, args=(list(paths),), name="finish shop recordings")
-        self._finishers = [*(one for one in self._finishers if one.is_alive()), finisher]
-        finisher.start()
+        self._finisher.enqueue(file.path, self._clock.utc_ns())
 
 
-def _day(arrival: _Arrival) -> str:
-    return datetime.fromtimestamp(arrival.time_ns / NS, UTC).strftime("%Y%m%d")
-
-
-def _compact_all(paths: list[Path]) -> None:
-    for path in paths:
-        try:
-            copy = rewrite(path)
-        except (OSError, DataError) as error:
-            log.info("%s: could not be compacted and stays as it is: %s", path.name, error)
-            continue
-        if copy is not None:
-            end = "" if copy.contents.ended else "; it had no end, every complete message was kept"
-            log.info("%s: %d messages, compact%s", path.name, copy.messages, end)
+def _compacted(path: Path) -> str:
+    """Make a shop's recording compact and describe the copy; empty where it was compact."""
+    copy = rewrite(path)
+    if copy is None:
+        return ""
+    end = "" if copy.contents.ended else "; it had no end, every whole message was kept"
+    return f"{copy.messages} messages, compact{end}"
 
 
 class _File(LiveFile):
     """The file that is being written; channels are registered with their first message."""
 
     def __init__(self, folder: Path, time_ns: int, prefix: str) -> None:
-        super().__init__(new_names(folder, "shop", time_ns))
+        super().__init__(names(folder, NAME, time_ns))
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self.writer.start(profile="", library=f"compensator {__version__}")

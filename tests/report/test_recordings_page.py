@@ -181,13 +181,14 @@ def test_a_torn_and_a_damaged_file_are_shown_up_to_there(tmp_path: Path) -> None
 
 def test_the_command(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "x.csv").write_text("t_s,y_um\n0,1.5\n")
     assert main(["report", str(folder), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["report"] == "rec-report.html" and (tmp_path / "rec-report.html").stat().st_size > 10_000
     assert (found["machine"], found["samples"], found["minutes"]["hold"]) == (MACHINE, 1770, 90.0)
     for arguments, expected in (
         (["none.mcap"], "none.mcap: No such file"),
-        (["x.csv"], "x.csv: expected a recording"),
+        (["x.csv"], "x.csv: not an MCAP file, expected a recording"),
         ([str(folder), "--out", "page.txt"], "--out page.txt: expected a name that ends in .html, .pdf or .png"),
         ([str(folder), "--out", "none/page.html"], "--out none/page.html: no such folder"),
         ([str(tmp_path / "empty")], "empty: neither recordings (*.mcap) nor pages"),

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
-from compensator.arrays import Matrix
-from compensator.model.effects.blocks import NAN, Block, FilterBank, Signal
+from compensator.arrays import NAN, Matrix
+from compensator.model.effects.blocks import Block, FilterBank, Signal
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import Table
 

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from compensator.arrays import Matrix, Vector
+from compensator.arrays import NAN, Matrix, Vector
 from compensator.errors import ModelError
 from compensator.model.transfer_function import SampledTransferFunction
 
-NAN = float("nan")
 #: One sample (float) or a whole record (`Vector`): arithmetic of a law is the same for both.
 Signal = Any
 

@@ -17,8 +17,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
-from compensator.model.effects.blocks import NAN, FilterBank, FromStart, Function, Lag, Signal
+from compensator.model.effects.blocks import FilterBank, FromStart, Function, Lag, Signal
 from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered
 from compensator.model.transfer_function import SampledTransferFunction
 

@@ -1,0 +1,56 @@
+"""Names of recordings: of what they are, and the UTC time at which they were opened, `vmc-07_20260105T060000Z.mcap`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+from compensator.clock import NS
+
+_STAMP = "%Y%m%dT%H%M%SZ"
+
+
+def day_of(time_utc_ns: int) -> str:
+    """Return the UTC day of a time; a file holds one day.
+
+    Examples
+    --------
+    >>> day_of(1_767_600_000 * NS)
+    '20260105'
+    """
+    return _utc(time_utc_ns).strftime("%Y%m%d")
+
+
+def names(folder: Path, of: str, time_utc_ns: int, newest: Path | None = None) -> Iterator[Path]:
+    """Yield names for a new file.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Folder of the recordings.
+    of : str
+        Name of the machine; `shop` for a shop's recording.
+    time_utc_ns : int
+        Now, ns since 1970 UTC.
+    newest : pathlib.Path, optional
+        Recording that the names must follow in order, even if the clock was set back since it was opened.
+    """
+    stamp, number = _utc(time_utc_ns).strftime(_STAMP), 0
+    if newest is not None:
+        last, _, suffix = newest.stem.removeprefix(f"{of}_").partition("-")
+        if last >= stamp:
+            stamp, number = last, int(suffix or 0) + 1
+    for count in range(number, number + 1000):
+        ending = f"-{count:03d}" if count else ""
+        yield folder / f"{of}_{stamp}{ending}.mcap"
+
+
+def began_ns(path: Path, of: str) -> int:
+    """Return the time in a recording's name, ns since 1970 UTC."""
+    stamp = path.name[len(of) + 1 :][:16]
+    return int(datetime.strptime(stamp, _STAMP).replace(tzinfo=UTC).timestamp()) * NS
+
+
+def _utc(time_ns: int) -> datetime:
+    return datetime.fromtimestamp(time_ns / NS, UTC)
