@@ -18,10 +18,10 @@ from compensator.diagnose.outcome import (
     FOLDS,
     HELD_OUT,
     Diagnosis,
-    Effect,
+    FoundEffect,
+    described,
     rivals_of,
     rms_of,
-    table_of,
     warnings_of,
 )
 from compensator.diagnose.refit import Refit, refit
@@ -91,15 +91,14 @@ def _held_out(evidence: Evidence, progress: Progress, executor_map: ExecutorMap)
     return before, after
 
 
-def _effects(evidence: Evidence, whole: Refit) -> tuple[Effect, ...]:
+def _effects(evidence: Evidence, whole: Refit) -> tuple[FoundEffect, ...]:
     effects = []
     for i, (term, std) in enumerate(zip(whole.terms, whole.std, strict=True)):
         signal = response(evidence, term)
         effects.append(
-            Effect(
+            FoundEffect(
                 term=term,
-                std=std,
-                explanation=term.effect.explain(float(np.std(signal[evidence.used]))),
+                effect=described(term, std, signal[evidence.used]),
                 rms_before_um=whole.rms_um[i],
                 rms_after_um=whole.rms_um[i + 1],
                 signal=signal,
@@ -120,13 +119,13 @@ def _tried(whole: Refit) -> tuple[tuple[str, float], ...]:
     return tuple((c.hypothesis.label, c.rms_um) for c in whole.rivals[0][:12]) if whole.rivals else ()
 
 
-def _extended(model: ThermalModel, whole: Refit, effects: tuple[Effect, ...]) -> ThermalModel:
+def _extended(model: ThermalModel, whole: Refit, effects: tuple[FoundEffect, ...]) -> ThermalModel:
     error = whole.rms_um[-1]
     return dataclasses.replace(
         model,
         dtf=Path(sampled=whole.dtf, unit=model.dtf.unit),
         tdtf=Path(sampled=whole.tdtf, unit=model.tdtf.unit) if model.tdtf and whole.tdtf else model.tdtf,
-        effects=(*model.effects, *(table_of(effect) for effect in effects)),
+        effects=(*model.effects, *(found.effect for found in effects)),
         y_std_um=error,
         alternatives={},
         held_out_rms_um=error,

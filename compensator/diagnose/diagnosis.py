@@ -22,11 +22,11 @@ from compensator.diagnose.outcome import (
     FOLDS,
     HELD_OUT,
     Diagnosis,
-    Effect,
+    FoundEffect,
     Verdict,
+    described,
     rivals_of,
     rms_of,
-    table_of,
     warnings_of,
 )
 from compensator.diagnose.search import Search, Selection
@@ -87,7 +87,7 @@ def _by_search(model: ThermalModel, evidence: Evidence, progress: Progress, exec
     effects = tuple(effect for effect in everything if not effect.term.companion)
     # A companion is of no use where the effect itself cannot be deployed.
     deployed = [e for e in everything if e.deployable] if any(e.deployable for e in effects) and helps else []
-    extended = dataclasses.replace(model, effects=(*model.effects, *map(table_of, deployed)), sha256="")
+    extended = dataclasses.replace(model, effects=(*model.effects, *(e.effect for e in deployed)), sha256="")
     if deployed:
         kept_out = [e.signal[evidence.used] for e in everything if not e.deployable]
         stated = _stated(model, rms_of(after), evidence.noise.noise_um, kept_out)
@@ -145,7 +145,7 @@ def _found_in(seen: Evidence, *, unobserved: bool) -> Vector:
 # ---------------------------------------------------------------------------- what was found
 
 
-def _effects(evidence: Evidence, found: Selection) -> tuple[Effect, ...]:
+def _effects(evidence: Evidence, found: Selection) -> tuple[FoundEffect, ...]:
     fit, count = found.fit, evidence.count
     errors = standard_errors(evidence, fit, found.variance_inflation)
     after = float(np.sqrt(fit.cost / count))
@@ -155,10 +155,9 @@ def _effects(evidence: Evidence, found: Selection) -> tuple[Effect, ...]:
         without = fit.residual + evidence.without_nuisances(np.where(evidence.used, signal, 0.0))
         others = ((c.term, float(np.sqrt(c.fit.cost / count))) for c in found.rivals[i])
         effects.append(
-            Effect(
+            FoundEffect(
                 term=term,
-                std=std,
-                explanation=term.effect.explain(float(np.std(signal[evidence.used]))),
+                effect=described(term, std, signal[evidence.used]),
                 rms_before_um=float(np.sqrt(without @ without / count)),
                 rms_after_um=after,
                 signal=signal,
@@ -178,7 +177,7 @@ def _stated(model: ThermalModel, after_um: float, noise_um: float, kept_out: Seq
     return max(model.y_std_um, float(np.sqrt(left)))
 
 
-def _companions(everything: Sequence[Effect]) -> tuple[Remark, ...]:
+def _companions(everything: Sequence[FoundEffect]) -> tuple[Remark, ...]:
     """Return a warning for each effect that is deployed without being named."""
     return tuple(
         Remark(

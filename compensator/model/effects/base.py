@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 #: `step` or `filter` of a block.
 Run = Callable[..., Signal]
-#: Keys that every effect may have in the model file.
-_COMMON = ("form", "std", "explanation")
+#: Keys that a diagnosis gives every effect in the model file.
+_FOUND = ("std", "explanation")
 
 
 def number(low: float = -math.inf, high: float = math.inf) -> Any:
@@ -64,6 +64,10 @@ class Effect:
     path, channel : str
         Where it acts, if the kind needs it. Further parameters are fields of the subclass, those of the model file made
         by `number`, `numbers` and `text`.
+    std : mapping of str to float
+        Standard error of each parameter, where a diagnosis found it.
+    explanation : str
+        For an engineer; empty where no diagnosis found it.
     """
 
     #: Kind in the model file and in `diagnosis.json`.
@@ -87,6 +91,14 @@ class Effect:
 
     path: str = ""
     channel: str = ""
+    std: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
+    explanation: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name for people: its kind with the path and channel that it acts on."""
+        table = self.to_table()
+        return " ".join(part for part in (self.kind, table.get("path"), table.get("channel")) if part)
 
     # ------------------------------------------------------------------ law
 
@@ -145,7 +157,8 @@ class Effect:
     def to_table(self) -> dict[str, Any]:
         """Return its `[[effect]]` table, without the kind."""
         table = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if "read" in f.metadata}
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
+        found = {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
+        return found | {key: value for key in _FOUND if (value := getattr(self, key))}
 
 
 class BankEffect:
@@ -260,11 +273,12 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
         Naming key and value where the table is wrong.
     """
     candidates = kinds()[kind]
-    known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + list(_COMMON))
+    known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + ["form", *_FOUND])
     keys = Table(f"effect {kind}", table, tuple(known))
     choices = {choice: form for form in candidates for choice in _choices(form)}
     form = choices[keys.text("form", tuple(choices))] if choices else candidates[0]
-    return form(**{f.name: f.metadata["read"](keys, f.name) for f in _read(form)})
+    found = {key: table[key] for key in _FOUND if key in table}
+    return form(**{f.name: f.metadata["read"](keys, f.name) for f in _read(form)}, **found)
 
 
 def _read(form: type[Effect]) -> list[dataclasses.Field[Any]]:
