@@ -1,8 +1,9 @@
 """The streaming engine: a thermal model and its effects, one sample at a time.
 
-The service, `simulate`, `identify`, `diagnose` and `replay` all run this class. `run` is `step` over a whole record, so
-both give the same bits. A step takes constant time, except the one that ends a gap: it returns to the last complete
-sample and repeats the missing ones with interpolated inputs, at most `bridge_samples` of them.
+The service, `simulate`, `identify` and `replay` all run this class, `diagnose` for the effects that a model already
+has. `run` is `step` over a whole record, so both give the same bits. A step takes constant time, except the one that
+ends a gap: it returns to the last complete sample and repeats the missing ones with interpolated inputs, at most
+`bridge_samples` of them.
 """
 
 from __future__ import annotations
