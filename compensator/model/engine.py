@@ -410,7 +410,7 @@ class Engine:
         signals = self._signals(dtf, tdtf)
         return tuple(effect.step(signals) for effect in self._effects)
 
-    def _signals(self, dtf: float, tdtf: float) -> Signals:
+    def _signals(self, dtf: float, tdtf: float) -> Signals[float]:
         observer = self._observer
         return Signals(
             drive=observer.drive, ambient_k=observer.ambient_k, y_dtf_um=dtf, y_tdtf_um=tdtf, channels=self._held

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
-from compensator.arrays import Matrix
-from compensator.model.effects.blocks import NAN, Block, FilterBank, Signal
+from compensator.arrays import Matrix, Vector
+from compensator.model.effects.blocks import NAN, Block, FilterBank, S
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import Table
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from compensator.model.effects.hypothesis import Context, Hypothesis
 
 #: `step` or `filter` of a block.
-Run = Callable[..., Signal]
+Run = Callable[..., S]
 #: Keys that a diagnosis gives every effect in the model file.
 _FOUND = ("std", "explanation")
 
@@ -102,11 +102,11 @@ class Effect:
 
     # ------------------------------------------------------------------ law
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         """Return the blocks of the law, at rest, in the order of the snapshot."""
         return ()
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the addition to y, µm.
 
         Parameters
@@ -118,7 +118,7 @@ class Effect:
         """
         raise NotImplementedError
 
-    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+    def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
         """Return one column for each linear parameter (one in all where there is none), µm."""
         return np.asarray(self.law(record, filters(blocks)))[:, None]
 
@@ -166,21 +166,22 @@ class BankEffect:
 
     __slots__ = ()
 
-    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+    def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         """Return the inputs of the filter bank."""
         raise NotImplementedError
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the weighted sum of the bank."""
         return run[-1](*self.inputs(signals, run))
 
-    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+    def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
         """Return every input behind every lag."""
-        bank: FilterBank = blocks[-1]
+        bank = blocks[-1]
+        assert isinstance(bank, FilterBank)
         return bank.columns(*self.inputs(record, filters(blocks)))
 
 
-def filters(blocks: Sequence[Any]) -> list[Run]:
+def filters(blocks: Sequence[Block]) -> list[Run[Vector]]:
     """Return what blocks do with a whole record."""
     return [block.filter for block in blocks]
 
@@ -201,14 +202,14 @@ class EffectStream:
         self._blocks: tuple[Block, ...] = effect.blocks(period_min)
         self._steps = [block.step for block in self._blocks]
 
-    def step(self, signals: Signals) -> float:
+    def step(self, signals: Signals[float]) -> float:
         """Advance by one sample and return the addition to y, µm; 0 before its channels were seen."""
         for channel in self.channels:
             if math.isnan(signals.channels.get(channel, NAN)):
                 return 0.0
         return float(self.effect.law(signals, self._steps))
 
-    def peek(self, signals: Signals) -> float:
+    def peek(self, signals: Signals[float]) -> float:
         """Return what `step` would, and stay where it is."""
         states = [block.state for block in self._blocks]
         y = self.step(signals)
