@@ -20,7 +20,7 @@ from compensator.blas import in_one_thread, one_thread
 from compensator.data.measurement import Measurement, measurements, runs_in
 from compensator.data.screening import screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
-from compensator.diagnose.outcome import Diagnosis
+from compensator.diagnose.outcome import Diagnosis, FoundEffect
 from compensator.diagnose.summary import figures, text, verdict
 from compensator.display import html_table
 from compensator.identify.summary import with_std
@@ -34,38 +34,6 @@ if TYPE_CHECKING:
 
 #: What `save` writes into a folder.
 FILES = ("model.toml", "diagnosis.json", "report.html")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FoundEffect:
-    """An effect that the model lacks; the fields are those of `diagnosis.json`, also by `effect["kind"]`.
-
-    Parameters
-    ----------
-    kind, path, channel, form : str or None
-        What it is, and on which path and channel.
-    parameters : dict of str to dict
-        `value` and standard error `std` of each.
-    deployable : bool
-        Whether the service can run it.
-    explanation : str
-        For an engineer.
-    rms_before_um, rms_after_um : float
-        Residual without it and with it, the others in place, µm.
-    """
-
-    kind: str
-    path: str | None
-    channel: str | None
-    form: str | None
-    parameters: dict[str, dict[str, float]]
-    deployable: bool
-    explanation: str
-    rms_before_um: float
-    rms_after_um: float
-
-    def __getitem__(self, key: str) -> Any:
-        return getattr(self, key)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -94,7 +62,7 @@ class DiagnosisResult:
     @property
     def effects(self) -> tuple[FoundEffect, ...]:
         """What the model lacks, in order of the error removed."""
-        return tuple(FoundEffect(**effect) for effect in self.to_dict()["effects"])
+        return self.diagnosis.effects
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `diagnosis.json` holds."""

@@ -6,30 +6,18 @@ it, and what that finds is applied to the block.
 
 from __future__ import annotations
 
-import dataclasses
+from collections import defaultdict
 from collections.abc import Sequence
-from functools import partial
-from itertools import repeat
 
 import numpy as np
 
 from compensator.arrays import Vector
 from compensator.data.runs import Run
-from compensator.diagnose.base_refit import FAR_OFF, diagnose_by_refit, is_far_off
+from compensator.diagnose.base_refit import FAR_OFF, BaseRefit, is_far_off
+from compensator.diagnose.estimate import Estimate
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.fit import response, standard_errors, summed
-from compensator.diagnose.outcome import (
-    FOLDS,
-    HELD_OUT,
-    Diagnosis,
-    Effect,
-    Verdict,
-    rivals_of,
-    rms_of,
-    table_of,
-    warnings_of,
-)
-from compensator.diagnose.search import Search, Selection
+from compensator.diagnose.outcome import FOLDS, Diagnosis, FoundEffect, Verdict, rms_of, warnings_of
+from compensator.diagnose.residual_search import ResidualSearch
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
 from compensator.reasons import Remark
@@ -63,12 +51,12 @@ def diagnose(
     evidence = evidence_of(model, runs)
     progress(0, FOLDS + 1)
     if is_far_off(model, evidence):
-        return diagnose_by_refit(model, evidence, progress, executor_map)
-    searched = _by_search(model, evidence, progress, executor_map)
+        return _diagnosed(model, BaseRefit(evidence), progress, executor_map)
+    searched = _diagnosed(model, ResidualSearch(evidence), progress, executor_map)
     if not _doubtful(searched, evidence):
         return searched
     # What was found in the residual holds nowhere else, or nothing was: perhaps the paths themselves are bent.
-    refitted = diagnose_by_refit(model, evidence, progress, executor_map)
+    refitted = _diagnosed(model, BaseRefit(evidence), progress, executor_map)
     better = rms_of(refitted.held_out_after) < REFIT_LEAVES * rms_of(searched.held_out_before)
     return refitted if refitted.effects and better else searched
 
@@ -80,106 +68,52 @@ def _doubtful(searched: Diagnosis, evidence: Evidence) -> bool:
     return searched.verdict == "unexplained" and rms_of(searched.held_out_before) > FAR_OFF * evidence.spread_um
 
 
-def _by_search(model: ThermalModel, evidence: Evidence, progress: Progress, executor_map: ExecutorMap) -> Diagnosis:
-    found = Search(evidence).run()
-    before, after = _held_out(evidence, found, progress, executor_map)
-    helps = rms_of(after) <= rms_of(before)
-    everything = _effects(evidence, found)
-    effects = tuple(effect for effect in everything if not effect.term.companion)
+def _diagnosed(model: ThermalModel, estimate: Estimate, progress: Progress, executor_map: ExecutorMap) -> Diagnosis:
+    """Return the diagnosis of an estimate, checked on held-out blocks."""
+    evidence = estimate.evidence
+    before, after = _held_out(estimate, progress, executor_map)
+    errors = rms_of(before), rms_of(after)
+    effects = tuple(effect for effect in estimate.effects if not effect.term.companion)
     # A companion is of no use where the effect itself cannot be deployed.
-    deployed = [e for e in everything if e.deployable] if any(e.deployable for e in effects) and helps else []
-    extended = dataclasses.replace(model, effects=(*model.effects, *map(table_of, deployed)), sha256="")
-    if deployed:
-        kept_out = [e.signal[evidence.used] for e in everything if not e.deployable]
-        stated = _stated(model, rms_of(after), evidence.noise.noise_um, kept_out)
-        extended = dataclasses.replace(extended, y_std_um=stated)
+    helps = any(effect.deployable for effect in effects) and errors[1] <= errors[0]
+    deployed = [effect for effect in estimate.effects if effect.deployable] if helps else []
+    extended, remarks = estimate.extended(model, deployed, errors[1]) if deployed else (model, ())
     return Diagnosis(
-        verdict=_verdict(evidence, found, helps=helps),
+        verdict=_verdict(estimate.effects, is_explained=estimate.is_explained(*errors)),
         effects=effects,
-        held_out=HELD_OUT,
+        held_out=estimate.held_out,
         model=extended,
         evidence=evidence,
-        residual_before=np.where(evidence.used, found.before.residual, np.nan),
-        residual_after=np.where(evidence.used, found.fit.residual, np.nan),
+        residual_before=np.where(evidence.used, estimate.residual_before, np.nan),
+        residual_after=np.where(evidence.used, estimate.residual_after, np.nan),
         held_out_before=before,
         held_out_after=after,
-        tried=_tried(found, evidence),
-        warnings=(*warnings_of(effects, before, after), *_companions(everything)),
+        tried=estimate.tried,
+        warnings=(*remarks, *warnings_of(effects, before, after), *_companions(estimate.effects)),
     )
 
 
-# ---------------------------------------------------------------------------- held out
+def _held_out(estimate: Estimate, progress: Progress, executor_map: ExecutorMap) -> tuple[Vector, Vector]:
+    """Return the residual before and after on every sample, each block by an estimate that did not see it.
 
-
-def _held_out(
-    evidence: Evidence, found: Selection, progress: Progress, executor_map: ExecutorMap
-) -> tuple[Vector, Vector]:
-    """Return the residual before and after on every sample, each block by a search that did not see it.
-
-    Only the zero of each run counts as unknown, or its initial state too: whichever leaves less before.
+    Of several choices of nuisances, the one that leaves less before.
     """
-    raw, nothing = evidence.residual, np.zeros(evidence.used.size)
-    observed = [term.hypothesis.effect.observed for term in found.fit.terms]
-    before = {rest: np.full(raw.size, np.nan) for rest in (True, False)}
-    after = {rest: np.full(raw.size, np.nan) for rest in (True, False)}
+    evidence = estimate.evidence
     progress(1, FOLDS + 1)
     blocks = list(evidence.blocks(FOLDS))
     views = [evidence.without(block) for block in blocks]
-    # What an unobserved source does in a held-out block is not known.
-    unknown = bool(observed) and not any(observed)
-    search = partial(_found_in, unobserved=not all(observed))
-    found_without = repeat(nothing) if unknown else executor_map(search, views)
-    for done, (block, seen, effects) in enumerate(zip(blocks, views, found_without, strict=False), start=2):
+    before, after = (defaultdict[int, Vector](lambda: np.full(evidence.used.size, np.nan)) for _ in range(2))
+    predictions = estimate.predictions(views, executor_map)
+    for done, (block, seen, predicted) in enumerate(zip(blocks, views, predictions, strict=True), start=2):
         progress(done, FOLDS + 1)
-        for rest in (True, False):
-            before[rest][block] = seen.left(raw, nothing, at_rest=rest)[block]
-            after[rest][block] = seen.left(raw, effects, at_rest=rest)[block]
-    best = min((True, False), key=lambda rest: rms_of(before[rest]))
+        for residuals, one in zip((before, after), predicted, strict=True):
+            for choice, residual in enumerate(estimate.left(seen, one)):
+                residuals[choice][block] = residual[block]
+    best = min(before, key=lambda choice: rms_of(before[choice]))
     return before[best], after[best]
 
 
-def _found_in(seen: Evidence, *, unobserved: bool) -> Vector:
-    """Search in a part of the data; return what is found there on every sample of all, µm."""
-    return summed(seen, Search(seen).run(unobserved=unobserved).fit.terms)
-
-
-# ---------------------------------------------------------------------------- what was found
-
-
-def _effects(evidence: Evidence, found: Selection) -> tuple[Effect, ...]:
-    fit, count = found.fit, evidence.count
-    errors = standard_errors(evidence, fit, found.variance_inflation)
-    after = float(np.sqrt(fit.cost / count))
-    effects = []
-    for i, (term, std) in enumerate(zip(fit.terms, errors, strict=True)):
-        signal = response(evidence, term)
-        without = fit.residual + evidence.without_nuisances(np.where(evidence.used, signal, 0.0))
-        others = ((c.term, float(np.sqrt(c.fit.cost / count))) for c in found.rivals[i])
-        effects.append(
-            Effect(
-                term=term,
-                std=std,
-                explanation=term.effect.explain(float(np.std(signal[evidence.used]))),
-                rms_before_um=float(np.sqrt(without @ without / count)),
-                rms_after_um=after,
-                signal=signal,
-                rivals=rivals_of(term, others, after),
-            )
-        )
-    return tuple(sorted(effects, key=lambda e: -e.rms_before_um))
-
-
-def _stated(model: ThermalModel, after_um: float, noise_um: float, kept_out: Sequence[Vector]) -> float:
-    """Return the standard deviation that an extended model states, µm: what it leaves where nothing was fitted.
-
-    Without it, a service would still publish that of the calibration, on a machine without the effect. What was
-    found and cannot be deployed (`kept_out`) still acts.
-    """
-    left = max(after_um**2 - noise_um**2, 0.0) + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
-    return max(model.y_std_um, float(np.sqrt(left)))
-
-
-def _companions(everything: Sequence[Effect]) -> tuple[Remark, ...]:
+def _companions(everything: Sequence[FoundEffect]) -> tuple[Remark, ...]:
     """Return a warning for each effect that is deployed without being named."""
     return tuple(
         Remark(
@@ -192,22 +126,10 @@ def _companions(everything: Sequence[Effect]) -> tuple[Remark, ...]:
     )
 
 
-def _tried(found: Selection, evidence: Evidence) -> tuple[tuple[str, float], ...]:
-    if not found.rivals:
-        return ()
-    best: dict[str, float] = {}
-    for candidate in found.rivals[0]:
-        label, rms = candidate.term.hypothesis.label, float(np.sqrt(candidate.fit.cost / evidence.count))
-        best[label] = min(rms, best.get(label, np.inf))
-    return tuple(sorted(best.items(), key=lambda item: item[1]))
-
-
-def _verdict(evidence: Evidence, found: Selection, *, helps: bool) -> Verdict:
-    """Return how far the residual is explained; what does not hold on held-out data explains part at most."""
-    observed = [term.hypothesis.effect.observed for term in found.fit.terms]
-    clean = evidence.noise.is_explained(found.fit.cost)
+def _verdict(everything: Sequence[FoundEffect], *, is_explained: bool) -> Verdict:
+    observed = [found.effect.observed for found in everything]
     if not observed:
-        return "adequate" if clean else "unexplained"
+        return "adequate" if is_explained else "unexplained"
     if not any(observed):
         return "unexplained"
-    return "explained" if clean and helps and all(observed) else "partly_explained"
+    return "explained" if is_explained and all(observed) else "partly_explained"

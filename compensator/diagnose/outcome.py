@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
+from compensator.model.effects import Effect
 from compensator.model.simulation import Scores, scores
-from compensator.model.thermal_model import EffectTable, ThermalModel
+from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Remark
 from compensator.remarks import ModelWarning
 
@@ -28,18 +30,16 @@ HELD_OUT = (
 RIVAL_TIMES = 1.2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Effect:
-    """An effect that was found.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FoundEffect:
+    """An effect that the model lacks; what `diagnosis.json` says of it also by `effect["kind"]`.
 
     Parameters
     ----------
     term : Term
         Hypothesis and values.
-    std : dict of str to float
-        Standard errors.
-    explanation : str
-        For an engineer.
+    effect : Effect
+        What the extended model gets, with standard errors and explanation.
     rms_before_um, rms_after_um : float
         Residual without it and with it, the others in place, µm.
     signal : numpy.ndarray, shape (n,)
@@ -48,13 +48,15 @@ class Effect:
         What explains it nearly as well.
     """
 
-    term: Term
-    std: dict[str, float]
-    explanation: str
+    term: Term = field(repr=False)
+    effect: Effect
     rms_before_um: float
     rms_after_um: float
-    signal: Vector
-    rivals: tuple[Rival, ...]
+    signal: Vector = field(repr=False)
+    rivals: tuple[Rival, ...] = field(repr=False)
+
+    def __getitem__(self, key: str) -> Any:
+        return getattr(self, key)
 
     @property
     def place(self) -> tuple[str, str, str]:
@@ -62,14 +64,49 @@ class Effect:
         return self.term.hypothesis.place
 
     @property
+    def kind(self) -> str:
+        """What it is."""
+        return self.place[0]
+
+    @property
+    def path(self) -> str | None:
+        """Path that it acts on."""
+        return self.place[1] or None
+
+    @property
+    def channel(self) -> str | None:
+        """Channel that it acts by."""
+        return self.place[2] or None
+
+    @property
+    def form(self) -> str:
+        """Which variant of its kind."""
+        return self.term.hypothesis.form
+
+    @property
     def named(self) -> dict[str, float]:
         """Every parameter by name."""
         return self.term.named
 
     @property
+    def std(self) -> Mapping[str, float]:
+        """Standard error of each parameter."""
+        return self.effect.std
+
+    @property
+    def parameters(self) -> dict[str, dict[str, float]]:
+        """`value` and standard error `std` of each parameter."""
+        return {name: {"value": value, "std": self.std[name]} for name, value in self.named.items()}
+
+    @property
+    def explanation(self) -> str:
+        """For an engineer."""
+        return self.effect.explanation
+
+    @property
     def deployable(self) -> bool:
         """Whether the service can run it."""
-        return self.term.hypothesis.effect.deployable
+        return self.effect.deployable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +131,7 @@ class Diagnosis:
     ----------
     verdict : Verdict
         In one word.
-    effects : tuple of Effect
+    effects : tuple of FoundEffect
         In order of the error that they remove.
     held_out : str
         How the errors before and after were measured.
@@ -113,7 +150,7 @@ class Diagnosis:
     """
 
     verdict: Verdict
-    effects: tuple[Effect, ...]
+    effects: tuple[FoundEffect, ...]
     held_out: str
     model: ThermalModel
     evidence: Evidence
@@ -147,6 +184,12 @@ class Diagnosis:
 def rms_of(values: Vector) -> float:
     """Return the root mean square of the values that are not missing."""
     return float(np.sqrt(np.nanmean(values**2)))
+
+
+def described(term: Term, std: Mapping[str, float], signal: Vector) -> Effect:
+    """Return the effect of a term with its standard errors and, from what it adds to y, an explanation."""
+    effect = term.effect
+    return dataclasses.replace(effect, std=std, explanation=effect.explain(float(np.std(signal))))
 
 
 def rivals_of(term: Term, others: Iterable[tuple[Term, float]], after_um: float) -> tuple[Rival, ...]:
@@ -191,7 +234,7 @@ def _stimulus(term: Term) -> str:
     return "leave the machine at rest"
 
 
-def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tuple[Remark, ...]:
+def warnings_of(effects: Sequence[FoundEffect], before: Vector, after: Vector) -> tuple[Remark, ...]:
     """Return what to know before relying on the effects that were found."""
     warnings = []
     rms_before, rms_after = rms_of(before), rms_of(after)
@@ -211,10 +254,3 @@ def warnings_of(effects: Sequence[Effect], before: Vector, after: Vector) -> tup
             names = ", ".join(rival.label for rival in effect.rivals)
             warnings.append(Remark(ModelWarning.NEARLY_AS_GOOD, f"{kind}: {names} would explain it nearly as well."))
     return tuple(warnings)
-
-
-def table_of(effect: Effect) -> EffectTable:
-    """Return an effect as the model file holds it."""
-    found = effect.term.effect
-    table = {**found.to_table(), "std": effect.std, "explanation": effect.explanation}
-    return EffectTable(kind=found.kind, table=table)

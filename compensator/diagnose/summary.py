@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from compensator.diagnose.fit import Term
-from compensator.diagnose.outcome import Diagnosis, Effect
+from compensator.diagnose.outcome import Diagnosis, FoundEffect
 from compensator.identify.summary import with_std
 from compensator.model.simulation import Scores
 from compensator.remarks import ModelWarning
@@ -24,6 +24,9 @@ _DOES_NOT_HOLD = (
     "as it was."
 )
 
+#: What `diagnosis.json` says of an effect, after its place.
+_FIGURES = ("parameters", "deployable", "explanation", "rms_before_um", "rms_after_um")
+
 
 def figures(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the diagnosis as `diagnosis.json` holds it."""
@@ -32,11 +35,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
         "effects": [
             {
                 **_place(effect.term),
-                "parameters": {name: {"value": value, "std": effect.std[name]} for name, value in effect.named.items()},
-                "deployable": effect.deployable,
-                "explanation": effect.explanation,
-                "rms_before_um": effect.rms_before_um,
-                "rms_after_um": effect.rms_after_um,
+                **{key: effect[key] for key in _FIGURES},
             }
             for effect in diagnosis.effects
         ],
@@ -78,7 +77,7 @@ def verdict(diagnosis: Diagnosis) -> str:
     )
 
 
-def _names(effects: Sequence[Effect]) -> str:
+def _names(effects: Sequence[FoundEffect]) -> str:
     """Return kinds and places of all effects, those of one kind together."""
     places: dict[str, list[str]] = {}
     for effect in effects:
@@ -87,7 +86,7 @@ def _names(effects: Sequence[Effect]) -> str:
     return "; ".join(": ".join(filter(None, (kind, ", ".join(filter(None, where))))) for kind, where in places.items())
 
 
-def name(effect: Effect) -> str:
+def name(effect: FoundEffect) -> str:
     """Return an effect's kind and place."""
     kind, *where = effect.place
     return ": ".join(part for part in (kind.capitalize(), " ".join(word for word in where if word)) if part)

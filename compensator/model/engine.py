@@ -1,8 +1,9 @@
 """The streaming engine: a thermal model and its effects, one sample at a time.
 
-The service, `simulate`, `identify`, `diagnose` and `replay` all run this class. `run` is `step` over a whole record, so
-both give the same bits. A step takes constant time, except the one that ends a gap: it returns to the last complete
-sample and repeats the missing ones with interpolated inputs, at most `bridge_samples` of them.
+The service, `simulate`, `identify` and `replay` all run this class, `diagnose` for the effects that a model already
+has. `run` is `step` over a whole record, so both give the same bits. A step takes constant time, except the one that
+ends a gap: it returns to the last complete sample and repeats the missing ones with interpolated inputs, at most
+`bridge_samples` of them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from compensator.arrays import NAN, Vector
 from compensator.errors import ModelError
-from compensator.model.effects import EffectStream, Signals, effect_from, kinds
+from compensator.model.effects import EffectStream, Signals
 from compensator.model.observer import Observer, ObserverState
 from compensator.model.thermal_model import ThermalModel
 
@@ -159,7 +160,7 @@ class Engine:
     Raises
     ------
     ModelError
-        If the model has an effect of an unknown kind.
+        If a filter bank of an effect has not as many gains as time constants.
 
     Examples
     --------
@@ -174,7 +175,7 @@ class Engine:
         self.model = model
         self.bridge_samples = bridge_samples
         self._observer = Observer(model)
-        self._effects = [_make_effect(model, i) for i in range(len(model.effects))]
+        self._effects = self._at_rest()
         self.channels = tuple(dict.fromkeys(c for effect in self._effects for c in effect.channels))
         self._period_min = model.period_s / 60.0
         absolute = model.inputs == "absolute"
@@ -208,9 +209,12 @@ class Engine:
         if self.model.inputs == "changes":
             self._reference = Reference(t_q_degc, at_degc)
         self._observer.reset()
-        self._effects = [_make_effect(self.model, i) for i in range(len(self.model.effects))]
+        self._effects = self._at_rest()
         self._held = {}
         self._last_complete = self._gap = None
+
+    def _at_rest(self) -> list[EffectStream]:
+        return [EffectStream(effect, self.model.period_s / 60.0) for effect in self.model.effects]
 
     def snapshot(self) -> EngineState:
         """Return the state after the last sample."""
@@ -404,7 +408,7 @@ class Engine:
         signals = self._signals(dtf, tdtf)
         return tuple(effect.step(signals) for effect in self._effects)
 
-    def _signals(self, dtf: float, tdtf: float) -> Signals:
+    def _signals(self, dtf: float, tdtf: float) -> Signals[float]:
         observer = self._observer
         return Signals(
             drive=observer.drive, ambient_k=observer.ambient_k, y_dtf_um=dtf, y_tdtf_um=tdtf, channels=self._held
@@ -459,11 +463,3 @@ def _interpolated(value: float, before: float, after: float, part: float) -> tup
     if not math.isnan(value):
         return value, False
     return before + part * (after - before), True
-
-
-def _make_effect(model: ThermalModel, index: int) -> EffectStream:
-    entry = model.effects[index]
-    if entry.kind not in kinds():
-        known = ", ".join(sorted(kinds()))
-        raise ModelError(f"model {model.name}: effect {index + 1} has kind {entry.kind!r}, expected one of: {known}")
-    return EffectStream(effect_from(entry.kind, entry.table), model.period_s / 60.0)

@@ -14,8 +14,9 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from compensator.errors import CompensatorError, ModelError
+from compensator.model.effects import Effect, effect_from, kinds
 from compensator.model.table import Table, shown
-from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
+from compensator.model.thermal_model import Estimator, Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
 
 #: Models that ship with the package.
@@ -133,7 +134,7 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
         inputs=top.text("inputs", ("changes", "absolute"), "changes"),  # type: ignore[arg-type]
         validity=_validity(table.get("validity", {})),
         **_uncertainty(table),
-        effects=_effects(table.get("effect", [])),
+        effects=_effects(top.text("name"), table.get("effect", [])),
         alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
         provenance=dict(Table("provenance", table.get("provenance", {})).table),
         sha256=sha256,
@@ -200,13 +201,17 @@ def _validity(value: object) -> dict[str, tuple[float, float]]:
     return ranges
 
 
-def _effects(value: object) -> tuple[EffectTable, ...]:
+def _effects(model_name: str, value: object) -> tuple[Effect, ...]:
     if not isinstance(value, list):
         raise ModelError("effect: expected a list of tables, [[effect]]")
     result = []
     for i, entry in enumerate(value, start=1):
         table = Table(f"effect {i}", entry)
-        result.append(EffectTable(kind=table.text("kind"), table={k: v for k, v in table.table.items() if k != "kind"}))
+        kind = table.text("kind")
+        if kind not in kinds():
+            known = ", ".join(sorted(kinds()))
+            raise ModelError(f"model {model_name}: effect {i} has kind {kind!r}, expected one of: {known}")
+        result.append(effect_from(kind, {key: value for key, value in table.table.items() if key != "kind"}))
     return tuple(result)
 
 

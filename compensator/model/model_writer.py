@@ -14,8 +14,9 @@ import numpy as np
 
 from compensator.atomic_write import atomic_write
 from compensator.errors import ModelError
+from compensator.model.effects import Effect
 from compensator.model.model_file import load_model, parse_model
-from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
+from compensator.model.thermal_model import Estimator, Path, ThermalModel
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -190,10 +191,8 @@ def _estimator(kind: str, estimator: Estimator) -> Iterator[str]:
     )
 
 
-def _effect(where: str, effect: EffectTable) -> Iterator[str]:
-    if "kind" in effect.table:
-        raise ModelError(f"{where}: kind = {effect.table['kind']!r} in the table of an effect of kind {effect.kind!r}")
-    yield from ("", "# Added to the base.", "[[effect]]", *_pairs(where, {"kind": effect.kind, **effect.table}))
+def _effect(where: str, effect: Effect) -> Iterator[str]:
+    yield from ("", "# Added to the base.", "[[effect]]", *_pairs(where, {"kind": effect.kind, **effect.to_table()}))
 
 
 def _comment(text: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any, TypeGuard
 
 from compensator.arrays import LARGEST
 from compensator.errors import ModelError
@@ -30,7 +31,8 @@ class Table:
     def __init__(self, where: str, table: object, known: Sequence[str] | None = None) -> None:
         if not isinstance(table, Mapping):
             raise ModelError(f"{where}: expected a table, got {table!r}")
-        self.where, self.table = where, table
+        self.where = where
+        self.table: Mapping[str, Any] = table
         unknown = [key for key in table if known is not None and key not in known]
         if unknown:
             raise ModelError(f"{where}: unknown key {unknown[0]!r}, expected one of: {', '.join(known or ())}")
@@ -40,19 +42,19 @@ class Table:
         value = self.table.get(key)
         if not _is_number(value, low, high):
             raise ModelError(f"{self.where}: {key} = {shown(value)}, expected a number{_bounds(low, high)}")
-        return float(value)  # type: ignore[arg-type]
+        return float(value)
 
     def numbers(
         self, key: str, low: float = -math.inf, high: float = math.inf, *, length: int | None = None
     ) -> tuple[float, ...]:
         """Return a list of finite numbers between two bounds (inclusive)."""
-        values = self.table.get(key)
+        values: Any = self.table.get(key)
         ok = isinstance(values, list) and values and all(_is_number(v, low, high) for v in values)
-        if not ok or (length is not None and len(values) != length):  # type: ignore[arg-type]
+        if not ok or (length is not None and len(values) != length):
             count = f"{length} " if length else ""
             expected = f"a list of {count}numbers{_bounds(low, high)}"
             raise ModelError(f"{self.where}: {key} = {shown(values)}, expected {expected}")
-        return tuple(float(v) for v in values)  # type: ignore[union-attr]
+        return tuple(float(v) for v in values)
 
     def text(self, key: str, choices: Sequence[str] = (), default: str | None = None) -> str:
         """Return a string, one of the choices where there are any."""
@@ -68,9 +70,10 @@ def shown(value: object) -> str:
     return "missing" if value is None else repr(value)[:60]
 
 
-def _is_number(value: object, low: float, high: float) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and -LARGEST < value < LARGEST and low <= value <= high  # type: ignore[operator]
+def _is_number(value: object, low: float, high: float) -> TypeGuard[float]:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return -LARGEST < value < LARGEST and low <= value <= high
 
 
 def _bounds(low: float, high: float) -> str:

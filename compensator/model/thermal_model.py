@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from compensator.errors import ModelError
+from compensator.model.effects import Effect
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction, continuous_image
 
 Kind = Literal["heat", "direct"]
@@ -99,27 +100,6 @@ class Estimator:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EffectTable:
-    """One `[[effect]]` of the model file, not yet read by its kind.
-
-    Parameters
-    ----------
-    kind : str
-        One of the registered kinds of `compensator.model.effects`.
-    table : mapping
-        Its other keys, as in the file.
-    """
-
-    kind: str
-    table: Mapping[str, Any]
-
-    @property
-    def label(self) -> str:
-        """Name for people: its kind with the path and channel that it acts on."""
-        return " ".join(str(part) for part in (self.kind, self.table.get("path"), self.table.get("channel")) if part)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ThermalModel:
     """A thermal model that the engine can run.
 
@@ -145,7 +125,7 @@ class ThermalModel:
         Standard deviation of the model's own error in y, µm, over and above sensor noise.
     held_out_rms_um : float, optional
         Free-run error of the calibration on held-out data, µm; None for a model that no calibration on a machine made.
-    effects : tuple of EffectTable
+    effects : tuple of Effect
         Effects added to the base.
     alternatives : mapping of str to (str, Path)
         Other published versions of a path, by name: the path that it replaces, and itself.
@@ -166,7 +146,7 @@ class ThermalModel:
     validity: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     y_std_um: float = 0.0
     held_out_rms_um: float | None = None
-    effects: tuple[EffectTable, ...] = ()
+    effects: tuple[Effect, ...] = ()
     alternatives: Mapping[str, tuple[str, Path]] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
     sha256: str = ""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.diagnose.outcome import Diagnosis, Effect
+from compensator.diagnose.outcome import Diagnosis, FoundEffect
 from compensator.diagnose.summary import name, verdict
 from compensator.identify.summary import with_std
 from compensator.model.thermal_model import ThermalModel
@@ -113,7 +113,7 @@ def _errors(diagnosis: Diagnosis) -> Table:
     )
 
 
-def _effect(t: Vector, effect: Effect) -> Section:
+def _effect(t: Vector, effect: FoundEffect) -> Section:
     parameters = [[in_words(key), with_std(value, effect.std[key])] for key, value in effect.named.items()]
     rows = parameters[:SHOWN]
     rows.append(["residual of the fit without the effect, µm rms", f"{effect.rms_before_um:.2f}"])

@@ -16,7 +16,6 @@ from compensator.config import Config
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind, Note, ZeroData
 from compensator.messages import Offset, Sample, number
-from compensator.model.effects import effect_from
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Reason, SampleQuality, State
@@ -401,5 +400,5 @@ def slowest_min(model: ThermalModel) -> float:
     paths = [path for path in (model.ttf, model.dtf, model.tdtf) if path is not None]
     times = [tau for path in paths for tau in path.sampled.time_constants_min() if math.isfinite(tau)]
     for effect in model.effects:
-        times += effect_from(effect.kind, effect.table).time_constants_min
+        times += effect.time_constants_min
     return max(times, default=model.period_s / 60.0)

@@ -16,8 +16,8 @@ from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Sample, number
+from compensator.model.effects import effect_from
 from compensator.model.model_file import parse_model
-from compensator.model.thermal_model import EffectTable
 from compensator.recording.reading import read_messages, recordings
 from compensator.service.compensation import Compensation
 from tests.audit.made import CONFIG, MACHINE, MINUTE_NS, QUILL, Service, other_model, readings
@@ -115,11 +115,8 @@ def test_a_time_without_samples_is_a_pause(tmp_path: Path) -> None:
 
 def test_a_model_that_needs_another_channel_is_refused(tmp_path: Path) -> None:
     Service(tmp_path).run(5).stop()
-    effect = EffectTable(
-        kind="input",
-        table={"channel": "jacket_degc", "curve": "linear", "tau_min": [10.0], "gain": [1.0], "delay_min": 0.0},
-    )
-    model = dataclasses.replace(OTHER, effects=(effect,))
+    table = {"channel": "jacket_degc", "curve": "linear", "tau_min": [10.0], "gain": [1.0], "delay_min": 0.0}
+    model = dataclasses.replace(OTHER, effects=(effect_from("input", table),))
     with pytest.raises(DataError, match="jacket_degc"):
         compare(recordings(tmp_path, MACHINE), model)
 

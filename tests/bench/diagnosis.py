@@ -14,7 +14,6 @@ from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.search import Search
 from compensator.identify.calibration import predict
 from compensator.model.model_file import load_model
-from compensator.model.thermal_model import EffectTable
 from tests.bench.figures import Figure, rows, told
 from tests.diagnose.scenarios import KINDS, draw, record
 from tests.identify.quill_runs import runs_from
@@ -34,7 +33,7 @@ def one(kinds, seed):
     terms = Search(evidence_of(QUILL, runs_from(columns))).run().fit.terms
     seconds = time.perf_counter() - began
     named = sorted(t.hypothesis.place for t in terms) == sorted(s.place for s in scenarios if s.place)
-    tables = tuple(EffectTable(kind=t.effect.kind, table=t.effect.to_table()) for t in terms if t.effect.deployable)
+    tables = tuple(t.effect for t in terms if t.effect.deployable)
     # What passes with time alone is no error that a model could remove on another day.
     lasting = [s for s in scenarios if s.place and s.place[0] not in ("drift", "step", "periodic", "unobserved")]
     fresh, true, effect = record(lasting, 5000 + seed, 24.0, **noise)

@@ -14,7 +14,6 @@ from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.search import Search
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
-from compensator.model.thermal_model import EffectTable
 from sim_hardware.physics import Duty, QuillMachine, World, draw_effect, usual_sensors
 from tests.bench.figures import Figure, told
 from tests.identify.quill_runs import runs_from
@@ -54,7 +53,7 @@ def one(model, own_um, seed, size_um):
     deployed = [term for term in terms if term.effect.deployable]
     if all(term.companion for term in deployed):
         deployed = []
-    tables = [EffectTable(kind=term.effect.kind, table=term.effect.to_table()) for term in deployed]
+    tables = [term.effect for term in deployed]
     fresh = runs(Duty.working_day(700 + seed, hours=24.0), 800 + seed, effects)[0]
 
     def error(candidate):

@@ -87,5 +87,7 @@ def test_nothing_acts_before_a_channel_was_seen():
     table = {"channel": "c", "curve": "linear", "tau_min": [5.0], "gain": [1.0], "delay_min": 0.0}
     stream = EffectStream(effect_from("input", table), 1.0)
     before = stream.snapshot()
-    assert stream.step(Signals()) == stream.step(Signals(channels={"c": math.nan})) == 0.0
+    for channels in ({}, {"c": math.nan}):
+        signals = Signals(drive=0.0, ambient_k=0.0, y_dtf_um=0.0, y_tdtf_um=0.0, channels=channels)
+        assert stream.step(signals) == 0.0
     assert repr(stream.snapshot()) == repr(before)

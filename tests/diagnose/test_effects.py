@@ -8,12 +8,11 @@ import pytest
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.fit import Term, response
 from compensator.errors import ModelError
-from compensator.model.effects import kinds
+from compensator.model.effects import effect_from, kinds
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
-from compensator.model.thermal_model import EffectTable
 from tests.diagnose.scenarios import record
 from tests.identify.quill_runs import runs_from
 
@@ -40,8 +39,7 @@ def forms(evidence):
 
 
 def table_of(hypothesis, values, amplitudes):
-    effect = hypothesis.with_values(values, amplitudes)
-    return EffectTable(kind=effect.kind, table=effect.to_table())
+    return hypothesis.with_values(values, amplitudes)
 
 
 def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
@@ -97,12 +95,12 @@ def test_a_restart_in_between_changes_no_bit(day, evidence):
 )
 def test_a_wrong_table_names_kind_key_and_value(kind, table, words):
     with pytest.raises(ModelError, match=f"effect {kind}: .*{words}"):
-        Engine(dataclasses.replace(QUILL, effects=(EffectTable(kind=kind, table=table),)))
+        effect_from(kind, table)
 
 
 def test_a_channel_that_is_missing_at_first_starts_the_effect_when_it_comes():
     table = {"channel": "c", "curve": "linear", "tau_min": [0.5], "gain": [2.0], "delay_min": 0.0}
-    engine = Engine(dataclasses.replace(QUILL, effects=(EffectTable(kind="input", table=table),)))
+    engine = Engine(dataclasses.replace(QUILL, effects=(effect_from("input", table),)))
     engine.set_reference(20.0, 20.0)
     assert engine.step(20.0, 20.0, {"c": float("nan")}).y_effects_um == (0.0,)
     assert engine.step(20.0, 20.0, {"c": 30.0}).y_effects_um == (0.0,)

@@ -11,11 +11,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from compensator.model.effects import base, kinds
+from compensator.model.effects import base, effect_from, kinds
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
-from compensator.model.thermal_model import EffectTable
 
 PAGE = Path(__file__).resolve().parents[2] / "compensator/model/effects/README.md"
 BLOCKS = dict(re.findall(r"```python\n# ([\w/]+\.py)\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL))
@@ -43,7 +42,7 @@ def test_the_pages_test_passes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("stop")
 def test_it_runs_from_a_model_file() -> None:
-    table = EffectTable(kind="stop", table={"path": "DTF", "limit_um": 5.0})
+    table = effect_from("stop", {"path": "DTF", "limit_um": 5.0})
     model = parse_model(dump_model(dataclasses.replace(load_model("quill"), effects=(table,))).encode(), source="stop")
     engine = Engine(model)
     engine.set_reference(20.0, 20.0)

@@ -13,12 +13,12 @@ import pytest
 from scipy import linalg, signal
 
 from compensator.errors import ModelError
-from compensator.model.effects import Effect, kinds, register
+from compensator.model.effects import Effect, effect_from, kinds, register
 from compensator.model.effects.base import number, text
 from compensator.model.effects.blocks import Block
 from compensator.model.engine import Engine, Estimate
 from compensator.model.model_file import load_model, parse_model
-from compensator.model.thermal_model import EffectTable, ThermalModel
+from compensator.model.thermal_model import ThermalModel
 
 QUILL = load_model("quill")
 RANDOM = np.random.default_rng(7)
@@ -230,7 +230,7 @@ def lag_kind(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("lag_kind")
 def test_effects_run_hold_a_missing_channel_and_survive_gaps() -> None:
-    table = EffectTable(kind="test-channel", table={"channel": "coolant_degc", "gain_um_per_k": 2.0})
+    table = effect_from("test-channel", {"channel": "coolant_degc", "gain_um_per_k": 2.0})
     model = dataclasses.replace(with_method("inverse"), effects=(table,))
     t_q, at = np.full(100, 20.0), np.full(100, 20.0)
     coolant = np.where(np.arange(100) >= 10, 5.0, 0.0)
@@ -250,9 +250,8 @@ def test_effects_run_hold_a_missing_channel_and_survive_gaps() -> None:
 
 
 def test_unknown_effect_is_named() -> None:
-    model = dataclasses.replace(QUILL, effects=(EffectTable(kind="magic", table={}),))
-    with pytest.raises(ModelError, match="effect 1 has kind 'magic'"):
-        Engine(model)
+    with pytest.raises(ModelError, match=r"effect 1 has kind 'magic', expected one of: .*gain"):
+        parse_model(f'{TEXT}\n[[effect]]\nkind = "magic"\n'.encode(), source="written")
 
 
 TEXT = load_model.__globals__["read_model_bytes"]("quill").decode()

@@ -13,9 +13,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from compensator.errors import ModelError
+from compensator.model.effects import effect_from
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model, write_model
-from compensator.model.thermal_model import EffectTable, Estimator, Path, ThermalModel
+from compensator.model.thermal_model import Estimator, Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
 
 SAMPLED = Path(
@@ -23,6 +24,9 @@ SAMPLED = Path(
     unit="um/K",
     covariance=((1e-6, 0.0, 1e-9), (0.0, 2e-6, 0.0), (1e-9, 0.0, 3e-8)),
 )
+
+INPUT = {"channel": "coolant_degc", "curve": "linear", "tau_min": [5.0], "gain": [4.0], "delay_min": 0.0}
+GAIN = {"path": "DTF", "change": 0.1}
 
 
 def direct_model(**changes):
@@ -58,13 +62,16 @@ def test_sampled_paths_keep_every_bit_and_their_covariance():
 def test_effects_and_nested_provenance_survive():
     model = direct_model(
         effects=(
-            EffectTable(kind="input", table={"channel": "coolant_degc", "gain": 4.0, "curve": [1.0, 2.0], "on": True}),
-            EffectTable(kind="gain", table={"path": "DTF", "std": {"gain": 0.5, "parts": [[1.0, 2.0], [3.0, 4.0]]}}),
+            effect_from("input", INPUT),
+            effect_from("gain", GAIN | {"std": {"gain": 0.5, "parts": [[1.0, 2.0], [3.0, 4.0]], "on": True}}),
+            effect_from("gain", GAIN | {"form": "ignored", "explanation": "Too low: µm."}),
         ),
         provenance={"data": [{"file": "a b.csv", "rows": 7}], "odd key": {"x y": "z"}, "empty": []},
     )
     assert read_back(model) == model
-    assert read_back(model).effects[0].table["on"] is True  # 1 == True
+    assert read_back(model).effects[1].std["on"] is True  # 1 == True
+    assert read_back(model).effects[2].explanation == "Too low: µm."
+    assert read_back(model).effects[0].to_table() == INPUT
 
 
 @given(st.text(max_size=40))
@@ -94,7 +101,7 @@ def test_dates_that_an_engineer_wrote_survive():
         ({"provenance": {"noise": {"std": math.nan}}}, r"provenance\.noise\.std = nan"),
         ({"validity": {"at_degc": (15.0, math.inf)}}, r"validity\.at_degc = inf"),
         ({"y_std_um": math.nan}, r"uncertainty\.y_std_um = nan"),
-        ({"effects": (EffectTable(kind="gain", table={"parts": [[1.0, -math.inf]]}),)}, r"effect 1\.parts = -inf"),
+        ({"effects": (effect_from("gain", GAIN | {"std": {"parts": [[-math.inf]]}}),)}, r"effect 1\.std\.parts = -inf"),
         ({"dtf": dataclasses.replace(SAMPLED, covariance=((math.nan,) * 3,) * 3)}, r"paths\.DTF\.covariance = nan"),
     ],
 )
@@ -107,7 +114,6 @@ def test_a_number_that_is_not_finite_is_refused_by_name(changes, message):
     ("changes", "message"),
     [
         ({"provenance": {"who": None}}, r"provenance\.who = None"),
-        ({"effects": (EffectTable(kind="gain", table={"kind": "input"}),)}, "effect 1: kind = 'input'"),
         (
             {"dtf": dataclasses.replace(SAMPLED, covariance=((1.0, 1.0, 1.0),))},
             r"paths\.DTF\.covariance: expected 3 rows",

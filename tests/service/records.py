@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from compensator.messages import ChannelSample, Sample
+from compensator.model.effects import effect_from
 from compensator.model.model_file import load_model
-from compensator.model.thermal_model import EffectTable, Path, ThermalModel
+from compensator.model.thermal_model import Path, ThermalModel
 from compensator.model.transfer_function import TransferFunction
 from tests.service.simulated import START_NS
 
@@ -69,7 +70,7 @@ def with_method(method: str) -> ThermalModel:
 
 def with_effects(base: ThermalModel = QUILL) -> ThermalModel:
     """The published model with an effect of every kind that streams."""
-    effects = tuple(EffectTable(kind=kind, table=table) for kind, table in EFFECTS)
+    effects = tuple(effect_from(kind, table) for kind, table in EFFECTS)
     return dataclasses.replace(base, effects=effects, sha256="e" * 64)
 
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
-from compensator.arrays import NAN, Matrix
-from compensator.model.effects.blocks import Block, FilterBank, Signal
+from compensator.arrays import Matrix, Vector
+from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import Table
 
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from compensator.model.effects.hypothesis import Context, Hypothesis
 
 #: `step` or `filter` of a block.
-Run = Callable[..., Signal]
-#: Keys that every effect may have in the model file.
-_COMMON = ("form", "std", "explanation")
+Run = Callable[..., S]
+#: Keys that a diagnosis gives every effect in the model file.
+_FOUND = ("std", "explanation")
 
 
 def number(low: float = -math.inf, high: float = math.inf) -> Any:
@@ -64,6 +64,10 @@ class Effect:
     path, channel : str
         Where it acts, if the kind needs it. Further parameters are fields of the subclass, those of the model file made
         by `number`, `numbers` and `text`.
+    std : mapping of str to float
+        Standard error of each parameter, where a diagnosis found it.
+    explanation : str
+        For an engineer; empty where no diagnosis found it.
     """
 
     #: Kind in the model file and in `diagnosis.json`.
@@ -87,14 +91,22 @@ class Effect:
 
     path: str = ""
     channel: str = ""
+    std: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
+    explanation: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name for people: its kind with the path and channel that it acts on."""
+        table = self.to_table()
+        return " ".join(part for part in (self.kind, table.get("path"), table.get("channel")) if part)
 
     # ------------------------------------------------------------------ law
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         """Return the blocks of the law, at rest, in the order of the snapshot."""
         return ()
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the addition to y, µm.
 
         Parameters
@@ -106,7 +118,7 @@ class Effect:
         """
         raise NotImplementedError
 
-    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+    def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
         """Return one column for each linear parameter (one in all where there is none), µm."""
         return np.asarray(self.law(record, filters(blocks)))[:, None]
 
@@ -145,7 +157,8 @@ class Effect:
     def to_table(self) -> dict[str, Any]:
         """Return its `[[effect]]` table, without the kind."""
         table = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if "read" in f.metadata}
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
+        found = {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
+        return found | {key: value for key in _FOUND if (value := getattr(self, key))}
 
 
 class BankEffect:
@@ -153,21 +166,22 @@ class BankEffect:
 
     __slots__ = ()
 
-    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+    def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         """Return the inputs of the filter bank."""
         raise NotImplementedError
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the weighted sum of the bank."""
         return run[-1](*self.inputs(signals, run))
 
-    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
-        """Return every input through every lag."""
-        bank: FilterBank = blocks[-1]
+    def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
+        """Return every input behind every lag."""
+        bank = blocks[-1]
+        assert isinstance(bank, FilterBank)
         return bank.columns(*self.inputs(record, filters(blocks)))
 
 
-def filters(blocks: Sequence[Any]) -> list[Run]:
+def filters(blocks: Sequence[Block]) -> list[Run[Vector]]:
     """Return what blocks do with a whole record."""
     return [block.filter for block in blocks]
 
@@ -188,14 +202,14 @@ class EffectStream:
         self._blocks: tuple[Block, ...] = effect.blocks(period_min)
         self._steps = [block.step for block in self._blocks]
 
-    def step(self, signals: Signals) -> float:
+    def step(self, signals: Signals[float]) -> float:
         """Advance by one sample and return the addition to y, µm; 0 before its channels were seen."""
         for channel in self.channels:
             if math.isnan(signals.channels.get(channel, NAN)):
                 return 0.0
         return float(self.effect.law(signals, self._steps))
 
-    def peek(self, signals: Signals) -> float:
+    def peek(self, signals: Signals[float]) -> float:
         """Return what `step` would, and stay where it is."""
         states = [block.state for block in self._blocks]
         y = self.step(signals)
@@ -260,11 +274,12 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
         Naming key and value where the table is wrong.
     """
     candidates = kinds()[kind]
-    known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + list(_COMMON))
+    known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + ["form", *_FOUND])
     keys = Table(f"effect {kind}", table, tuple(known))
     choices = {choice: form for form in candidates for choice in _choices(form)}
     form = choices[keys.text("form", tuple(choices))] if choices else candidates[0]
-    return form(**{f.name: f.metadata["read"](keys, f.name) for f in _read(form)})
+    found = {key: table[key] for key in _FOUND if key in table}
+    return form(**{f.name: f.metadata["read"](keys, f.name) for f in _read(form)}, **found)
 
 
 def _read(form: type[Effect]) -> list[dataclasses.Field[Any]]:

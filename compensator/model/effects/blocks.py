@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from compensator.arrays import NAN, Matrix, Vector
 from compensator.errors import ModelError
 from compensator.model.transfer_function import SampledTransferFunction
 
-#: One sample (float) or a whole record (`Vector`): arithmetic of a law is the same for both.
-Signal = Any
+#: One sample or a whole record: the arithmetic of a law is the same for both.
+S = TypeVar("S", float, Vector)
 
 
 class Block:
@@ -82,7 +82,7 @@ class Lag(Block):
         return np.asarray(lfilter([self._half, self._half], [1.0, -self.pole], u - u[0]) + u[0])
 
 
-class FilterBank:
+class FilterBank(Block):
     """First-order lags of one or more inputs, weighted and summed.
 
     Parameters

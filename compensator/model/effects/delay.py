@@ -7,13 +7,14 @@ sensor   y += y_path(t + d) + lag · dy_path/dt (t + d) − y_path(t): the machi
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
+from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Run, number, register, text
-from compensator.model.effects.blocks import Delay, Lag, Signal, shifted
+from compensator.model.effects.blocks import Block, Delay, Lag, S, shifted
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
+from compensator.model.effects.signals import RecordSignals, Signals
 
 #: Samples that a path is run on beyond a record's end.
 AHEAD = 64
@@ -30,10 +31,10 @@ class DelayedPath(Effect):
     delay_min: float = number(0.0, 1440.0)
     lag_min: float = number(0.0, 1440.0)
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         return Lag(self.lag_min, period_min), Delay(self.delay_min, period_min)
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the difference that the delay makes."""
         lag, delay = run
         share = signals.share(self.path)
@@ -60,15 +61,15 @@ class DelayedSensor(DelayedPath):
 
     deployable = False
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
         """Return what the share would have been with an immediate sensor, less what it is."""
-        share, period_min = signals.share(self.path), signals.period_min
-        # Beyond the end of the record the path continues with its drive as it is.
-        drive = signals.source(self.path)
-        longer = signals.function(self.path).response(np.concatenate((drive, np.full(AHEAD, drive[-1]))))
+        share, period_min = record.share(self.path), record.period_min
+        # Beyond the end of the record the path goes on with its drive as it is.
+        drive = record.source(self.path)
+        longer = record.function(self.path).response(np.concatenate((drive, np.full(AHEAD, drive[-1]))))
         early = shifted(longer, -self.delay_min / period_min)
         early = early + self.lag_min * np.gradient(early, period_min)
-        return np.asarray(early[: share.size] - share)
+        return np.asarray(early[: share.size] - share)[:, None]
 
     def explain(self, rms_um: float) -> str:
         sensor = "T_Q" if self.path == "TTF" else "AT"

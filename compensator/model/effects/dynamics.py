@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
-from compensator.model.effects.blocks import FilterBank, Lag, Signal
+from compensator.model.effects.blocks import Block, FilterBank, Lag, S
 from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered
+from compensator.model.effects.signals import Signals
 
 
 @register
@@ -30,10 +30,10 @@ class MissingMode(Effect):
     tau_min: float = number(0.0, 1e5)
     gain: float = number()
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         return (Lag(self.tau_min, period_min),)
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the response of the mode."""
         return self.gain * run[0](signals.source(self.path))
 
@@ -62,10 +62,10 @@ class MistimedMode(Effect):
     tau_min: float = number(1e-9, 1e5)
     instead_of_min: float = number(0.0, 1e5)
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         return (Lag(self.tau_min, period_min),)
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the difference that the other time constant makes."""
         share = signals.share(self.path)
         # (1 + τ₀ s) / (1 + τ s) − 1 = (τ₀/τ − 1) (1 − L(τ))
@@ -102,10 +102,10 @@ class ChangedPaths(BankEffect, Effect):
     gain: tuple[float, ...] = numbers()
     gain_ambient: tuple[float, ...] = numbers()
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         return (FilterBank(self.tau_min, (self.gain, self.gain_ambient), period_min),)
 
-    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+    def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         return signals.drive, signals.ambient_k
 
     def effective_parameters(self, count: int) -> int:

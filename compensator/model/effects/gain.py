@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from compensator.model.effects.base import Effect, Run, number, register, text
-from compensator.model.effects.blocks import Signal
+from compensator.model.effects.blocks import S
 from compensator.model.effects.hypothesis import Context, Hypothesis, digits
+from compensator.model.effects.signals import Signals
 
 
 @register
@@ -20,7 +20,7 @@ class Gain(Effect):
     path: str = text("DTF", "TDTF")
     change: float = number(-10.0, 10.0)
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the part of the path's share that is missing."""
         return self.change * signals.share(self.path)
 

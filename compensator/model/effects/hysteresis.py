@@ -7,13 +7,13 @@ stick   the same, but it jumps all the way once it is off by more than w
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
 from compensator.model.effects.base import Effect, Run, number, register, text
-from compensator.model.effects.blocks import Play, Signal, Stick
+from compensator.model.effects.blocks import Block, Play, S, Stick
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
+from compensator.model.effects.signals import Signals
 
 FORMS = ("play", "stick")
 
@@ -27,10 +27,10 @@ class Hysteresis(Effect):
     form: str = text(*FORMS)
     half_width_um: float = number(0.0, 1e4)
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         return ((Play if self.form == "play" else Stick)(self.half_width_um),)
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return how far it lags behind."""
         share = signals.share(self.path)
         return run[0](share) - share

@@ -16,11 +16,12 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
-from compensator.model.effects.blocks import Delay, FilterBank, FromStart, Signal
+from compensator.model.effects.blocks import Block, Delay, FilterBank, FromStart, S
 from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, digits, numbered
+from compensator.model.effects.signals import Signals
 
 #: Curves by name: of one sample, or of a record.
-CURVES: Mapping[str, Callable[[Signal], Signal]] = {
+CURVES: Mapping[str, Callable[[Any], Any]] = {
     "linear": lambda c: c,
     "square": lambda c: c * c,
     "abs": abs,
@@ -42,11 +43,11 @@ class Input(BankEffect, Effect):
     gain: tuple[float, ...] = numbers()
     delay_min: float = number(0.0, 1440.0)
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         bank = FilterBank(self.tau_min, (self.gain,), period_min)
         return FromStart(), Delay(self.delay_min, period_min), bank
 
-    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+    def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         from_start, delay, _ = run
         return (delay(from_start(CURVES[self.curve](signals.channels[self.channel]))),)
 

@@ -9,11 +9,11 @@ drive        y += change · G · (drive · |drive|) / 100, the size of what driv
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from compensator.model.effects.base import Effect, Run, number, numbers, only, register, text
-from compensator.model.effects.blocks import Function, Signal
+from compensator.model.effects.blocks import Block, Function, S
 from compensator.model.effects.hypothesis import Context, Hypothesis, digits
+from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
 FORMS = ("square", "odd square", "cube")
@@ -29,7 +29,7 @@ class Nonlinear(Effect):
     form: str = text(*FORMS)
     change: float = number()
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the curve of the share."""
         share = signals.share(self.path)
         part = share / 100.0
@@ -61,10 +61,10 @@ class NonlinearDrive(Nonlinear):
     b: tuple[float, ...] = numbers()
     a: tuple[float, ...] = numbers()
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the response to the curved drive."""
         drive = signals.source(self.path)
         return self.change * run[0](drive * abs(drive) / 100.0)

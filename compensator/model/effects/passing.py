@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from compensator.arrays import Matrix
-from compensator.model.effects.base import Effect, Run, register
-from compensator.model.effects.blocks import Signal
+from compensator.arrays import Matrix, Vector
+from compensator.model.effects.base import Effect, register
+from compensator.model.effects.blocks import Block
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
 from compensator.model.effects.signals import RecordSignals
 
@@ -26,6 +25,13 @@ class Passing(Effect):
     deployable = False
     worth_beside = 0.75
 
+    def course(self, record: RecordSignals) -> Vector:
+        """Return the addition to y over a record, µm, shape (n,)."""
+        raise NotImplementedError
+
+    def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
+        return np.asarray(self.course(record))[:, None]
+
 
 @register
 class Drift(Passing):
@@ -35,9 +41,9 @@ class Drift(Passing):
     linear = ("um_per_h",)
     um_per_h: float = 1.0
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def course(self, record: RecordSignals) -> Vector:
         """Return the ramp."""
-        return self.um_per_h * (signals.minutes / 60.0)
+        return self.um_per_h * (record.minutes / 60.0)
 
     def explain(self, rms_um: float) -> str:
         return (
@@ -60,9 +66,9 @@ class Settling(Passing):
     size_um: float = 1.0
     tau_min: float = 1.0
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def course(self, record: RecordSignals) -> Vector:
         """Return 1 − exp(−t/τ), scaled."""
-        return self.size_um * (1.0 - np.exp(-signals.minutes / self.tau_min))
+        return self.size_um * (1.0 - np.exp(-record.minutes / self.tau_min))
 
     def explain(self, rms_um: float) -> str:
         return (
@@ -88,9 +94,9 @@ class Step(Passing):
     jump_um: float = 1.0
     at_min: float = 0.0
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def course(self, record: RecordSignals) -> Vector:
         """Return the jump, over one sample."""
-        return self.jump_um * np.clip((signals.minutes - self.at_min) / signals.period_min + 1.0, 0.0, 1.0)
+        return self.jump_um * np.clip((record.minutes - self.at_min) / record.period_min + 1.0, 0.0, 1.0)
 
     def explain(self, rms_um: float) -> str:
         return (
@@ -117,7 +123,7 @@ class Periodic(Passing):
     cosine_um: float = 1.0
     period_min: float = 1.0
 
-    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+    def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
         angle = 2.0 * np.pi * record.minutes / self.period_min
         return np.column_stack((np.sin(angle), np.cos(angle)))
 

@@ -19,8 +19,9 @@ from typing import Any, ClassVar
 
 from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
-from compensator.model.effects.blocks import FilterBank, FromStart, Function, Lag, Signal
+from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S
 from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered
+from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
 
@@ -37,13 +38,13 @@ class Scheduled(Effect):
     origin: str = text("start", "zero")
     span: float = number(1e-12)
 
-    def blocks(self, period_min: float) -> tuple[Any, ...]:
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
         return FromStart(0.0 if self.origin == "zero" else NAN), *self.inner(period_min)
 
-    def inner(self, period_min: float) -> tuple[Any, ...]:
+    def inner(self, period_min: float) -> tuple[Block, ...]:
         return ()
 
-    def scale(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def scale(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the channel in units of its span."""
         return run[0](signals.channels[self.channel]) / self.span
 
@@ -62,7 +63,7 @@ class ShareScheduled(Scheduled):
     form: str = only(default="share")
     change: float = number()
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the share times the channel."""
         return self.change * self.scale(signals, run) * signals.share(self.path)
 
@@ -94,10 +95,10 @@ class DriveScheduled(Scheduled):
     b: tuple[float, ...] = numbers()
     a: tuple[float, ...] = numbers()
 
-    def inner(self, period_min: float) -> tuple[Any, ...]:
+    def inner(self, period_min: float) -> tuple[Block, ...]:
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         """Return the response to the drive times the channel."""
         return self.change * run[1](self.scale(signals, run) * signals.source(self.path))
 
@@ -111,11 +112,11 @@ class SpeedScheduled(Scheduled):
     change: float = number()
     tau_min: float = number(0.0, 1e5)
 
-    def inner(self, period_min: float) -> tuple[Any, ...]:
+    def inner(self, period_min: float) -> tuple[Block, ...]:
         return (Lag(self.tau_min, period_min),)
 
-    def law(self, signals: Any, run: Sequence[Run]) -> Signal:
-        """Return what the lag removes from the share, times the channel."""
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
+        """Return what the lag takes off the share, times the channel."""
         share = signals.share(self.path)
         return self.change * self.scale(signals, run) * (run[1](share) - share)
 
@@ -138,10 +139,10 @@ class BankScheduled(BankEffect, Scheduled):
     gain_share: tuple[float, ...] = numbers()
     dc_gain: float = 1.0
 
-    def inner(self, period_min: float) -> tuple[Any, ...]:
+    def inner(self, period_min: float) -> tuple[Block, ...]:
         return (FilterBank(self.tau_min, (self.gain, self.gain_share), period_min),)
 
-    def inputs(self, signals: Any, run: Sequence[Run]) -> tuple[Signal, ...]:
+    def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         c = self.scale(signals, run)
         return c * signals.source(self.path), c * signals.share(self.path)
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Generic
 
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.model.effects.blocks import Signal
+from compensator.model.effects.blocks import S
 from compensator.model.transfer_function import SampledTransferFunction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Signals:
+class Signals(Generic[S]):
     """Signals of one sample.
 
     Parameters
@@ -28,25 +29,25 @@ class Signals:
         Auxiliary channels, in their own units; the last good value where one is missing.
     """
 
-    drive: Signal = 0.0
-    ambient_k: Signal = 0.0
-    y_dtf_um: Signal = 0.0
-    y_tdtf_um: Signal = 0.0
-    channels: Mapping[str, Signal] = field(default_factory=dict)
+    drive: S
+    ambient_k: S
+    y_dtf_um: S
+    y_tdtf_um: S
+    channels: Mapping[str, S] = field(default_factory=dict)
 
-    def share(self, path: str) -> Signal:
+    def share(self, path: str) -> S:
         """Return the share of a path in y, µm (`all`: of both); the TTF's is the DTF's, which it drives."""
         if path == "all":
             return self.y_dtf_um + self.y_tdtf_um
         return self.y_tdtf_um if path == "TDTF" else self.y_dtf_um
 
-    def source(self, path: str) -> Signal:
+    def source(self, path: str) -> S:
         """Return what drives a path: heat, W (or T_Q − AT, K), or the change of the ambient, K."""
         return self.ambient_k if path == "TDTF" else self.drive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RecordSignals(Signals):
+class RecordSignals(Signals[Vector]):
     """Signals over a whole record: each an array, shape (n,), channels with gaps bridged.
 
     Parameters

@@ -9,13 +9,12 @@ will be switched next is not known.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, register
-from compensator.model.effects.blocks import Lag
+from compensator.model.effects.blocks import Block, Lag
 from compensator.model.effects.hypothesis import digits
 from compensator.model.effects.signals import RecordSignals
 
@@ -44,7 +43,7 @@ class Unobserved(Effect):
     times: tuple[tuple[int, float], ...] = ()
     sizes_um: tuple[float, ...] = ()
 
-    def columns(self, record: RecordSignals, blocks: Sequence[Any]) -> Matrix:
+    def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
         columns = []
         for number, at in self.times:
             step = np.clip((record.minutes - at) / record.period_min + 1.0, 0.0, 1.0)
