@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import warnings
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ _OTHER_FILES = (
     (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
 )
 #: How to save what only MATLAB can read.
+#: What scipy raises for a damaged MAT file, beside its own error.
+_DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
 _AS_CSV = "in MATLAB, writetable(T, 'run.csv') saves a table T as CSV"
 
 
@@ -97,17 +100,7 @@ def read_mat(path: Path) -> Table:
         raise DataError(
             f"{path}: a MAT file of version 7.3 (HDF5), expected version 7: save(FILE, ..., '-v7'), or a CSV; {_AS_CSV}"
         ) from error
-    except (
-        MatReadError,
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        EOFError,
-        OverflowError,
-        MemoryError,
-        OSError,
-    ) as error:
+    except (MatReadError, *_DAMAGED) as error:
         raise DataError(f"{path}: not a MAT file that can be read ({str(error)[:80]}); {_AS_CSV}") from error
     columns: Mapping[str, Any] = {name: value for name, value in content.items() if not name.startswith("__")}
     while len(columns) == 1 and (fields := _fields(next(iter(columns.values())))):

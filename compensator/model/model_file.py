@@ -19,6 +19,8 @@ from compensator.model.table import Table, shown
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
 
+#: Key of `ThermalModel.held_out_rms_um` in the provenance, where version 0.1.0 accepts any key.
+HELD_OUT_KEY = "folds_rms_um"
 #: Models that ship with the package.
 BUILT_IN = ("quill",)
 
@@ -133,10 +135,10 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
         estimator=_estimator(table.get("estimator"), kind),
         inputs=top.text("inputs", ("changes", "absolute"), "changes"),  # type: ignore[arg-type]
         validity=_validity(table.get("validity", {})),
-        **_uncertainty(table),
+        y_std_um=_uncertainty(table.get("uncertainty", {"y_std_um": 0.0})),
         effects=_effects(top.text("name"), table.get("effect", [])),
         alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
-        provenance=dict(Table("provenance", table.get("provenance", {})).table),
+        **_provenance(table.get("provenance", {})),
         sha256=sha256,
     )
 
@@ -178,16 +180,18 @@ def _estimator(value: object, kind: str) -> Estimator:
     )
 
 
-def _uncertainty(top: Mapping[str, Any]) -> dict[str, float]:
-    table = Table("uncertainty", top.get("uncertainty", {"y_std_um": 0.0}), ("y_std_um", "held_out_rms_um"))
-    found = {"y_std_um": table.number("y_std_um", low=0.0)}
-    # Version 0.1.0 wrote this figure into the provenance.
-    before = top.get("provenance", {})
-    if "held_out_rms_um" in table.table:
-        found["held_out_rms_um"] = table.number("held_out_rms_um", low=0.0)
-    elif isinstance(before, Mapping) and isinstance(before.get("folds_rms_um"), float):
-        found["held_out_rms_um"] = before["folds_rms_um"]
-    return found
+def _uncertainty(value: object) -> float:
+    return Table("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0)
+
+
+def _provenance(value: object) -> dict[str, Any]:
+    """Return the provenance, and the calibration's error, which the file keeps among it."""
+    provenance = dict(Table("provenance", value).table)
+    held_out = provenance.get(HELD_OUT_KEY)
+    if not isinstance(held_out, float):
+        return {"provenance": provenance}
+    del provenance[HELD_OUT_KEY]
+    return {"provenance": provenance, "held_out_rms_um": held_out}
 
 
 def _validity(value: object) -> dict[str, tuple[float, float]]:

@@ -15,7 +15,7 @@ import numpy as np
 from compensator.atomic_write import atomic_write
 from compensator.errors import ModelError
 from compensator.model.effects import Effect
-from compensator.model.model_file import load_model, parse_model
+from compensator.model.model_file import HELD_OUT_KEY, load_model, parse_model
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
@@ -118,13 +118,11 @@ def _lines(model: ThermalModel) -> Iterator[str]:
         yield from ("[validity]", *_pairs("validity", {key: list(bounds) for key, bounds in model.validity.items()}))
     yield from ("", "# Standard deviation of the model's own error in y, um.", "[uncertainty]")
     yield from _pairs("uncertainty", {"y_std_um": model.y_std_um})
-    if model.held_out_rms_um is not None:
-        yield "# Free-run error of the calibration on held-out data, um."
-        yield from _pairs("uncertainty", {"held_out_rms_um": model.held_out_rms_um})
     for number, effect in enumerate(model.effects, start=1):
         yield from _effect(f"effect {number}", effect)
-    if model.provenance:
-        yield from ("", "# Where the model comes from.", "[provenance]", *_pairs("provenance", model.provenance))
+    held_out = {} if model.held_out_rms_um is None else {HELD_OUT_KEY: model.held_out_rms_um}
+    if provenance := {**held_out, **model.provenance}:
+        yield from ("", "# Where the model comes from.", "[provenance]", *_pairs("provenance", provenance))
 
 
 def _path(where: str, path: Path, purpose: str, extra: Mapping[str, Any]) -> Iterator[str]:

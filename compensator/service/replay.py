@@ -274,6 +274,9 @@ class FreeRun:
             if self.seq >= 0:
                 self._pass_pause(step, sample)
             self._before_torn_um = compensation.offset_um if "offset" not in step.records else None
+        elif self.seq >= 0 and step.offset is not None:
+            # The first sample of a start failed: its group holds the pause and a held offset.
+            self._pass_noted_pause(step, step.offset.seq)
         result = apply(compensation, step, commands=commands, since=self.seq + 1 if self.seq >= 0 else None)
         self._file = step.run.get("file", step.file)
         if isinstance(result, Outcome):
@@ -286,13 +289,18 @@ class FreeRun:
         if self._file not in (step.run.get("file", step.file), step.run.get("previous_file")):
             self.compensation.pause(round((sample.time_utc_ns - self.time_ns) / (sample.period_s * NS)) - 1)
             return
+        if not self._pass_noted_pause(step, sample.seq):
+            self.compensation.pause(sample.seq - self.seq - 1)
+
+    def _pass_noted_pause(self, step: Step, seq: int) -> bool:
+        """Pass the pause that a start has noted, and return whether there is one."""
         for event in step.events:
             pause = data_of(event, PauseData) if event.kind == EventKind.RESTART else None
             if pause is not None and pause.missing is None:
                 self.compensation.pause_of_unknown_length()
-                return
+                return True
             if pause is not None:
                 # Noted with the first sample of that start; what a full disk never accepted is added.
-                self.compensation.pause((pause.missing or 0) + sample.seq - event.seq)
-                return
-        self.compensation.pause(sample.seq - self.seq - 1)
+                self.compensation.pause((pause.missing or 0) + seq - event.seq)
+                return True
+        return False

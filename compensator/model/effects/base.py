@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
-from compensator.arrays import Matrix, Vector
+from compensator.arrays import NAN, Matrix, Vector
 from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import Table
