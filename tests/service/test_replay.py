@@ -122,3 +122,22 @@ async def test_where_files_between_were_not_given_their_time_is_the_pause(tmp_pa
         outcome = free.run(step)
         wanted = apply(by_hand, step)
         assert isinstance(outcome, Outcome) and isinstance(wanted, Outcome) and outcome.offset == wanted.offset
+
+
+async def test_a_start_whose_first_sample_failed_keeps_its_pause(tmp_path: Path, monkeypatch: Any) -> None:
+    """The pause is noted with the offset that was held, in a group without a sample."""
+    machine = machine_with(tmp_path, {65: lambda one: one.command("resume")})
+    await machine.run(60)
+    await machine.sleep(40.0)
+    last, process, defects = machine.outcomes[-1].sample.seq, Compensation.process, [ZeroDivisionError("a defect")]
+
+    def fail_once(compensation: Compensation, raw: Any) -> Outcome:
+        if raw.seq > last and defects:
+            raise defects.pop()
+        return process(compensation, raw)
+
+    monkeypatch.setattr(Compensation, "process", fail_once)
+    await machine.run(120)
+    assert not defects
+    found = compare(recordings(machine.recordings, MACHINE), MODEL)
+    assert abs(found.offsets.peak) == 0.0 and machine.offsets()[-1] != machine.offsets()[64]

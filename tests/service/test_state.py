@@ -45,6 +45,9 @@ LOST = {
     "coolant_degc": [range(40, 43), range(93, 110)],
 }
 
+#: Where the effects of each kind stand in the state; the last one of a kind.
+PLACE = {kind: i for i, (kind, _) in enumerate(EFFECTS)}
+
 
 def bits(outcome: Outcome) -> list[bytes]:
     return [encode(outcome.sample), encode(outcome.estimate), encode(outcome.offset), repr(outcome.notes).encode()]
@@ -164,7 +167,7 @@ def changed(state: dict[str, Any], value: Any, *keys: Any) -> dict[str, Any]:
         (changed(at_work(), "inf", "offset_um"), "not finite"),
         (changed(at_work(), [0.0], "engine", "gap", "state", "observer", "x"), "snapshot of 1 states"),
         (changed(at_work(), {"x": 1.0}, "engine", "gap", "before", "channels"), "channels"),
-        (changed(at_work(with_effects()), [1.0, 2.0], "engine", "effects", 10), "hysteresis"),
+        (changed(at_work(with_effects()), [1.0, 2.0], "engine", "effects", PLACE["hysteresis"]), "hysteresis"),
         (changed(at_work(with_effects()), {}, "engine", "gap", "samples", 0, "channels"), "channels"),
         (changed(at_work(with_effects()), [1.0], "memory", "estimate", "y_effects_um"), "effects"),
     ],
