@@ -28,7 +28,7 @@ class Shop:
     >>> from compensator.clock import SystemClock
     >>> shop = Shop(SystemClock())
     >>> shop.receive("shop/vmc-07/thermal/y/offset", b"nonsense")
-    >>> shop.overview()[0]["malformed"], shop.overview()[0]["shown"]
+    >>> shop.overview()[0]["malformed"], str(shop.overview()[0]["shown"])
     (1, 'unknown')
     """
 

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import compensator as tc
-from compensator.reasons import Remark
+from compensator.reasons import Remark, SampleQuality
 from tests.api.tables import frame, write_run
 from tests.identify.quill_runs import VALIDATION_W
 
@@ -67,7 +67,7 @@ def test_a_result_stands_for_its_model(table: pd.DataFrame) -> None:
 
 
 def test_a_remark_survives_a_copy() -> None:
-    remark = Remark("stuck", "t_q_degc = 20 in every row.")
+    remark = Remark(SampleQuality.STUCK, "t_q_degc = 20 in every row.")
     again = pickle.loads(pickle.dumps(remark))
     assert (again, again.code, again.marked) == (remark, remark.code, remark.marked)
 

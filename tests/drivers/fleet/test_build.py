@@ -173,7 +173,7 @@ DEVICE_MISTAKES = [
     ),
     (
         device("modbus-map", "bus", [{**RPM, "bad_values": {"x": "invalid"}}]),
-        "expected a number as it stands",
+        "expected a number as in the registers",
     ),
     (device("modbus-map", "bus", [{**RPM, "function": 1}]), "key 'function' is 1"),
     (device("capancdt-6200", "cap", [{"input": 0, "couple": "K"}]), "inputs[0]: key 'couple' is not known"),
