@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,9 @@ from compensator.recording.container import Container, Contents
 from compensator.recording.reading import in_order
 from compensator.remarks import AuditRemark
 from compensator.report.history import Spread
-from compensator.service.compensation import Compensation, Outcome
+from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import FreeRun, Step, setup_of, steps_in
+from compensator.service.status import Zero
 
 #: Columns of the table of both offsets.
 COLUMNS = (
@@ -190,15 +191,11 @@ class _Run:
         zero = any(event.kind == EventKind.ZERO for event in step.events)
         if estimate.t_q_ref_degc is None or estimate.at_ref_degc is None or zero:
             return
-        compensation.begin(
-            t_q_ref_degc=estimate.t_q_ref_degc,
-            at_ref_degc=estimate.at_ref_degc,
-            y_ref_um=math.nan if estimate.y_base_um != 0.0 else number(estimate.y_ref_um),
-            y_base_um=0.0,
-        )
+        y_ref_um = math.nan if estimate.y_base_um != 0.0 else number(estimate.y_ref_um)
+        compensation.begin(replace(Zero.of_estimate(estimate), y_ref_um=y_ref_um, y_base_um=0.0))
         figures = (
             f"{step.file}: begins on a running machine, of which the other model knows no more than the zero; "
-            f"its first {3 * compensation.slowest_min / 60.0:.0f} h are uncertain."
+            f"its first {3 * slowest_min(compensation.model) / 60.0:.0f} h are uncertain."
         )
         self._result.remarks.append(Remark(AuditRemark.BEGINS_RUNNING, figures))
 

@@ -10,12 +10,12 @@ import msgspec
 
 from compensator.errors import ServiceError
 from compensator.events import CommandName, EventKind
-from compensator.service.adoption import LONGEST_MODEL, Wanted
 from compensator.service.compensation import Compensation
 from compensator.service.journal import Journal
-from compensator.service.publisher import COMMANDS, Reply, Sender
+from compensator.service.publisher import COMMANDS, Reply, Sender, refusal
 from compensator.service.replay import execute
-from compensator.service.takeover import Takeover, refusal, sent_by
+from compensator.service.transfer.adoption import LONGEST_MODEL, ModelRequest
+from compensator.service.transfer.swap import ModelSwap
 
 #: Longest payload of a command without a model, bytes.
 LONGEST_COMMAND = 10_000
@@ -32,15 +32,15 @@ class Commands:
     ----------
     journal : Journal
         Notes each command.
-    takeover : Takeover
+    swap : ModelSwap
         Carries out `adopt` and `back`.
     unproven : bool
         Whether commands are accepted whose sender is not authenticated.
     """
 
-    def __init__(self, journal: Journal, takeover: Takeover, *, unproven: bool) -> None:
+    def __init__(self, journal: Journal, swap: ModelSwap, *, unproven: bool) -> None:
         self._journal = journal
-        self._takeover = takeover
+        self._swap = swap
         self._unproven = unproven
         self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
         self._refused = 0
@@ -62,9 +62,9 @@ class Commands:
             if loop is None or self._waiting.full():
                 raise ServiceError("the service cannot accept a command now")
             if name in (CommandName.ADOPT, CommandName.BACK):
-                wanted = Wanted.of(name, arguments)
+                request = ModelRequest.of(name, arguments)
                 reply: Future[dict[str, Any]] = Future()
-                loop.call_soon_threadsafe(self._takeover.begin, wanted, reply, sender)
+                loop.call_soon_threadsafe(self._swap.begin, name, request, reply, sender)
                 return reply
         except ServiceError as error:
             if loop is not None:
@@ -78,7 +78,7 @@ class Commands:
         self._refused = 0
         while not self._waiting.empty():
             name, arguments, sender = self._waiting.get_nowait()
-            self._journal.note(EventKind.COMMAND, name, arguments | {"command": name} | sent_by(sender))
+            self._journal.note(EventKind.COMMAND, name, arguments | {"command": name} | sender.data())
             execute(compensation, name, arguments)
 
     def _checked(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
@@ -110,4 +110,4 @@ class Commands:
     def _note_refusal(self, name: str, why: str, sender: Sender) -> None:
         self._refused += 1
         if self._refused <= NOTED_REFUSALS:
-            self._journal.note(EventKind.COMMAND_REFUSED, why, {"name": name, "ok": False} | sent_by(sender))
+            self._journal.note(EventKind.COMMAND_REFUSED, why, {"name": name, "ok": False} | sender.data())

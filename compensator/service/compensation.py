@@ -31,6 +31,7 @@ from compensator.service.state import (
     decode_state,
     encode_state,
 )
+from compensator.service.status import CompensationStatus, Handover, Zero
 
 __all__ = ["Compensation", "Outcome", "slowest_min"]
 
@@ -69,8 +70,7 @@ class Compensation:
         self._limiter = self._decision.limiter
         self._zero = ZeroState(wanted=config.zero.at_start)
         self._memory = Memory()
-        #: The model's slowest time constant, min.
-        self.slowest_min = slowest_min(model)
+        self._slowest_min = slowest_min(model)
 
     # ------------------------------------------------------------------ commands
 
@@ -116,62 +116,30 @@ class Compensation:
     # ------------------------------------------------------------------ state
 
     @property
-    def has_reference(self) -> bool:
-        """Whether the inputs have a reference yet."""
-        return self._engine.has_reference
-
-    @property
-    def last(self) -> tuple[int, int]:
-        """Number and time, ns since 1970 UTC, of the last sample; −1 and 0 before the first."""
-        return self._memory.seq, self._memory.time_utc_ns
-
-    @property
-    def offset_um(self) -> float:
-        """The last offset, µm."""
-        return self._limiter.offset_um
-
-    @property
-    def target_um(self) -> float:
-        """The offset that the model asks for, µm; NaN while there is no estimate."""
-        estimate = self._memory.estimate
-        return self._zero.y_base - estimate.y_um if estimate is not None else NAN
-
-    @property
-    def std_um(self) -> float:
-        """Standard deviation of the prediction, µm; NaN while there is none."""
-        return self._memory.estimate.y_std_um if self._memory.estimate is not None else NAN
-
-    @property
-    def is_under_way(self) -> bool:
-        """Whether the offset is still moving to that of another model."""
-        return self._memory.model_changed
-
-    @property
-    def operator_hold(self) -> bool:
-        """Whether an operator has frozen the offset."""
-        return self._memory.operator_hold
-
-    @property
-    def zero_that_stands(self) -> dict[str, float]:
-        """The current zero, as arguments of `begin`."""
-        reference = self._engine.reference
-        return {
-            "t_q_ref_degc": reference.t_q_degc,
-            "at_ref_degc": reference.at_degc,
-            "y_ref_um": self._zero.y_ref,
-            "y_base_um": self._zero.y_base,
-        }
-
-    @property
-    def is_cold(self) -> bool:
-        """Whether the state started unknown and is not known yet."""
-        return self._memory.cold_min > 0.0
+    def status(self) -> CompensationStatus:
+        """What holds after the last sample."""
+        memory, zero, estimate = self._memory, self._zero, self._memory.estimate
+        return CompensationStatus(
+            seq=memory.seq,
+            time_utc_ns=memory.time_utc_ns,
+            zero=Zero.of_references(self._engine.reference, zero) if self._engine.has_reference else None,
+            is_known=memory.cold_min <= 0.0,
+            target_um=zero.y_base - estimate.y_um if estimate is not None else NAN,
+            std_um=estimate.y_std_um if estimate is not None else NAN,
+            handover=Handover(
+                offset_um=self._limiter.offset_um,
+                operator_hold=memory.operator_hold,
+                internal_error=memory.internal_error,
+                waiting_zero=zero.mode if zero.wanted else None,
+                model_changed=memory.model_changed,
+            ),
+        )
 
     @property
     def bridge_max_min(self) -> float:
         """Longest pause that is interpolated, min."""
         wanted = self._config.restart.bridge_max_min
-        return min(self.slowest_min if wanted is None else wanted, MOST_BRIDGED * self._period_min)
+        return min(self._slowest_min if wanted is None else wanted, MOST_BRIDGED * self._period_min)
 
     def state(self) -> bytes:
         """Return everything that decides the next outcome, as JSON that keeps every bit."""
@@ -220,7 +188,7 @@ class Compensation:
         # A state from a version without these checks has none of theirs.
         self.plausibility.state = whole.plausibility or PlausibilityState()
 
-    def pause(self, samples: int) -> None:
+    def pause(self, samples: int | None) -> None:
         """Pass over samples that were not measured, such as those while the service did not run.
 
         They count as missing: the prediction continues and its standard deviation grows, and the next sample with both
@@ -229,9 +197,12 @@ class Compensation:
 
         Parameters
         ----------
-        samples : int
-            Their number; nothing is done for none.
+        samples : int or None
+            Their number; nothing is done for none. None if it is unknown, which counts as too long to be bridged.
         """
+        if samples is None:
+            longest = max(KNOWN_AFTER * self._slowest_min, self.bridge_max_min)
+            samples = math.floor(longest / self._period_min) + 1
         if samples <= 0:
             return
         minutes = samples * self._period_min
@@ -245,63 +216,37 @@ class Compensation:
         else:
             self._memory.estimate = self._engine.skip(samples)
 
-    def pause_of_unknown_length(self) -> None:
-        """Pass over a pause of unknown length, as over one that is too long to be bridged."""
-        longest = max(KNOWN_AFTER * self.slowest_min, self.bridge_max_min)
-        self.pause(math.floor(longest / self._period_min) + 1)
-
     @property
     def _cold_samples(self) -> int:
         """Samples after which a state that started unknown counts as known."""
-        return min(math.ceil(KNOWN_AFTER * self.slowest_min / self._period_min), MOST_BRIDGED)
+        return min(math.ceil(KNOWN_AFTER * self._slowest_min / self._period_min), MOST_BRIDGED)
 
     def _pass_cold(self, samples: int) -> None:
         self._memory.estimate = self._engine.skip(samples, held=True)
-        self._memory.cold_min = KNOWN_AFTER * self.slowest_min
+        self._memory.cold_min = KNOWN_AFTER * self._slowest_min
 
-    def begin(self, *, t_q_ref_degc: float, at_ref_degc: float, y_ref_um: float, y_base_um: float) -> None:
+    def begin(self, zero: Zero | None) -> None:
         """Start with a zero that was set before the record, and with an unknown state.
 
         Parameters
         ----------
-        t_q_ref_degc, at_ref_degc, y_ref_um : float
-            The zero: temperatures, °C, and measured deformation, µm (NaN if unknown).
-        y_base_um : float
-            Predicted deformation at the last zero on a warm machine, µm.
+        zero : Zero or None
+            None to wait for the zero of the record, whatever the configuration requests for the start.
         """
-        self._engine.set_reference(t_q_ref_degc, at_ref_degc)
-        self._zero = ZeroState(y_ref=y_ref_um, y_base=y_base_um)
+        if zero is None:
+            self._zero = ZeroState()
+            return
+        self._engine.set_reference(zero.t_q_ref_degc, zero.at_ref_degc)
+        self._zero = ZeroState(y_ref=zero.y_ref_um, y_base=zero.y_base_um)
         self._pass_cold(self._cold_samples)
 
-    def begin_at_zero(self) -> None:
-        """Wait for the zero of a record, whatever the configuration requests for the start."""
-        self._zero = ZeroState()
-
-    def continue_from(self, offset_um: float, *, model_changed: bool = False) -> None:
-        """Continue from an offset; from there it moves at the permitted rate.
-
-        Parameters
-        ----------
-        offset_um : float
-            The last published offset, µm.
-        model_changed : bool
-            Whether it is another model's; the reason stays until the offset has reached its new value.
-        """
-        self._limiter.offset_um = offset_um
-        self._memory.model_changed = model_changed
-
-    def succeed(self, other: Compensation) -> None:
-        """Replace a compensation with another model; its offset, holds and waiting zero are kept.
-
-        Parameters
-        ----------
-        other : Compensation
-            The previous one.
-        """
-        memory = other._memory
-        self._memory.operator_hold, self._memory.internal_error = memory.operator_hold, memory.internal_error
-        self._zero.wanted, self._zero.mode = other._zero.wanted, other._zero.mode
-        self.continue_from(other.offset_um, model_changed=memory.estimate is not None)
+    def continue_from(self, handover: Handover) -> None:
+        """Continue where another compensation ended: its offset moves on at the permitted rate, its holds stay."""
+        self._limiter.offset_um = handover.offset_um
+        memory, zero = self._memory, self._zero
+        memory.operator_hold, memory.internal_error = handover.operator_hold, handover.internal_error
+        memory.model_changed = handover.model_changed
+        zero.wanted, zero.mode = handover.waiting_zero is not None, handover.waiting_zero or zero.mode
 
     # ------------------------------------------------------------------ one sample
 

@@ -13,14 +13,14 @@ from compensator.events import EventKind, Note
 from compensator.recording.finishing import Retention
 from compensator.recording.reading import first_sequence
 from compensator.recording.recorder import McapRecorder
-from compensator.service.adoption import Adoption
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.loading import Setup
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.presence import sole_user
 from compensator.service.publisher import Publisher, Reply, Sender
-from compensator.service.restart import resume
+from compensator.service.transfer.adoption import Adoption
+from compensator.service.transfer.restart import resume
 from drivers.errors import DriverError
 from drivers.reading import Reading
 

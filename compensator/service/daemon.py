@@ -16,14 +16,14 @@ from compensator.clock import NS, Clock
 from compensator.config import Config
 from compensator.events import EventKind, Note, PauseData
 from compensator.messages import SCHEMA, Offset, Sample, Status, encode
-from compensator.service.adoption import Adoption
 from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.journal import Entry, Journal, Recorder
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.publisher import UNNAMED, Reply, Sender
 from compensator.service.sampling import Grid, Sampler
-from compensator.service.takeover import Takeover
+from compensator.service.transfer.adoption import Adoption
+from compensator.service.transfer.swap import ModelSwap
 from drivers.reading import Device
 
 log = logging.getLogger("compensator")
@@ -113,8 +113,8 @@ class Daemon:
             checkpoint=checkpoint,
         )
         self._sampler = Sampler(config, devices, clock, self._journal.note)
-        self._takeover = Takeover(adoption, self._journal, clock, lambda: self._compensation)
-        self._commands = Commands(self._journal, self._takeover, unproven=config.zenoh.accepts_unproven())
+        self._swap = ModelSwap(adoption, self._journal, clock, lambda: self._compensation)
+        self._commands = Commands(self._journal, self._swap, unproven=config.zenoh.accepts_unproven())
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
@@ -210,7 +210,7 @@ class Daemon:
         self.stop()
         self._commands.close()
         await self._await_pending()
-        await self._takeover.end()
+        await self._swap.end()
         await self._journal.close(self._compensation.state())
         await self._sampler.close()
 
@@ -221,7 +221,7 @@ class Daemon:
         await self._await_pending()
         began = time.perf_counter()
         self._pass_pause(label_ns)
-        self._compensation = self._takeover.swap()
+        self._compensation = self._swap.swap()
         state, broke_off = self._compensation.state(), self._broken_off
         self._broken_off = True
         self._commands.apply(self._compensation)
@@ -271,13 +271,13 @@ class Daemon:
         self._publish("estimate", entry.estimate)
         self._publish("status", encode(self._status(outcome)))
         self._journal.sequence += 1
-        self._takeover.follow(outcome)
+        self._swap.follow(outcome)
         self._unreported.append(outcome)
 
     def _pass_pause(self, label_ns: int) -> None:
         """Account, before the first sample, for the time without measurements."""
         first, self._first = self._first, False
-        _, last_ns = self._compensation.last
+        last_ns = self._compensation.status.time_utc_ns
         if not first or last_ns == 0:
             return
         period_s = self._compensation.model.period_s
@@ -287,7 +287,7 @@ class Daemon:
         text = f"{missing} sample(s) are missing between the last recording and now; "
         if label_ns <= last_ns:
             text = "the wall clock is before the end of the last recording: how long the service was away is unknown"
-            self._compensation.pause_of_unknown_length()
+            self._compensation.pause(None)
         else:
             self._compensation.pause(missing)
             text += (
@@ -295,7 +295,7 @@ class Daemon:
                 if minutes <= bridged
                 else f"{minutes / 60.0:.1f} h cannot be bridged (restart.bridge_max_min, here {bridged:.0f} min)"
             )
-        known, std = label_ns > last_ns, self._compensation.std_um
+        known, std = label_ns > last_ns, self._compensation.status.std_um
         data = PauseData(
             missing=missing if known else None,
             minutes=minutes if known else None,

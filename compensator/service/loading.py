@@ -19,9 +19,9 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Remark
 from compensator.recording.signature import Signer
 from compensator.remarks import ServiceWarning
-from compensator.service.adoption import check_model
-from compensator.service.model_store import ModelStore
 from compensator.service.session import tls_files
+from compensator.service.transfer.adoption import check_model
+from compensator.service.transfer.model_store import ModelStore
 from drivers.errors import DriverConfigError
 
 log = logging.getLogger("compensator")

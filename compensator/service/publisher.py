@@ -46,6 +46,11 @@ _KEYS = {
 Reply = dict[str, Any] | Future[dict[str, Any]]
 
 
+def refusal(text: str) -> dict[str, Any]:
+    """Return the answer to a command that is refused."""
+    return {"ok": False, "text": text}
+
+
 class Sender(NamedTuple):
     """Who sent a command.
 
@@ -63,6 +68,10 @@ class Sender(NamedTuple):
 
     name: str = "unnamed"
     proof: Literal["certificate", "none"] = "none"
+
+    def data(self) -> dict[str, Any]:
+        """Return the sender for an event; it replaces what the payload claims."""
+        return {"by": self.name, "by_proof": self.proof}
 
 
 #: Sender of a command without a name.

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -230,8 +230,8 @@ def _as_measured(sample: Sample) -> Sample:
             break
     else:
         return sample
-    replace = msgspec.structs.replace
-    return replace(sample, channels={k: replace(c, quality=c.device_quality) for k, c in channels.items()})
+    measured = {k: msgspec.structs.replace(c, quality=c.device_quality) for k, c in channels.items()}
+    return msgspec.structs.replace(sample, channels=measured)
 
 
 # ---------------------------------------------------------------------- another model
@@ -270,10 +270,11 @@ class FreeRun:
                     f"{step.file}: samples of {sample.period_s:g} s, expected those of the model, {period_s:g} s"
                 )
             if self._before_torn_um is not None:
-                compensation.continue_from(self._before_torn_um, model_changed=compensation.is_under_way)
+                own = compensation.status.handover
+                compensation.continue_from(replace(own, offset_um=self._before_torn_um))
             if self.seq >= 0:
                 self._pass_pause(step, sample)
-            self._before_torn_um = compensation.offset_um if "offset" not in step.records else None
+            self._before_torn_um = compensation.status.handover.offset_um if "offset" not in step.records else None
         elif self.seq >= 0 and step.offset is not None:
             # The first sample of a start failed: its group holds the pause and a held offset.
             self._pass_noted_pause(step, step.offset.seq)
@@ -294,13 +295,12 @@ class FreeRun:
 
     def _pass_noted_pause(self, step: Step, seq: int) -> bool:
         """Pass the pause that a start has noted, and return whether there is one."""
-        for event in step.events:
-            pause = data_of(event, PauseData) if event.kind == EventKind.RESTART else None
-            if pause is not None and pause.missing is None:
-                self.compensation.pause_of_unknown_length()
-                return True
-            if pause is not None:
-                # Noted with the first sample of that start; what a full disk never accepted is added.
-                self.compensation.pause((pause.missing or 0) + seq - event.seq)
-                return True
+        pauses = ((event, data_of(event, PauseData)) for event in step.events if event.kind == EventKind.RESTART)
+        for event, pause in pauses:
+            if pause is None:
+                continue
+            # Noted with the first sample of that start; what a full disk never accepted is added.
+            missing = None if pause.missing is None else pause.missing + seq - event.seq
+            self.compensation.pause(missing)
+            return True
         return False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -135,8 +136,10 @@ class Service:
 
     def adopt(self, model: bytes) -> None:
         new = Compensation(self.config, parse_model(model, source="test"))
-        new.begin(**self.compensation.zero_that_stands)
-        new.succeed(self.compensation)
+        status = self.compensation.status
+        new.begin(status.zero)
+        changed = not math.isnan(status.target_um)
+        new.continue_from(replace(status.handover, model_changed=changed))
         self.compensation = new
         self.recorder.attachments = {**self.recorder.attachments, "model.toml": model}
         self.recorder.start_new()

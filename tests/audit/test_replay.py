@@ -20,7 +20,7 @@ from compensator.recording import recorder as recorder_module
 from compensator.recording.reading import first_sequence, read_messages, recordings
 from compensator.recording.recorder import McapRecorder
 from compensator.service.daemon import Daemon
-from compensator.service.restart import resume
+from compensator.service.transfer.restart import resume
 from drivers.errors import DeviceTimeout
 from drivers.reading import Quality, Reading
 from tests.audit.made import CONFIG, MACHINE, MINUTE_NS, QUILL, Service, other_model, readings

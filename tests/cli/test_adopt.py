@@ -18,7 +18,7 @@ import zenoh
 from compensator.cli import main
 from compensator.demo.machine import configuration, hardware
 from compensator.recording.reading import read_messages, recordings
-from compensator.service.model_store import sha256_of
+from compensator.service.transfer.model_store import sha256_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.cli.test_commands import load_fast_model
 

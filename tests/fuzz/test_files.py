@@ -19,7 +19,7 @@ from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation
-from compensator.service.model_store import ModelStore
+from compensator.service.transfer.model_store import ModelStore
 from tests.audit.made import CONFIG, Service
 from tests.fuzz.mutation import mutated
 from tests.service.records import QUILL, day

@@ -11,20 +11,20 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+from compensator.service.adoption import Adoption, check_model
 from compensator.service.early import EarlyNote
 from compensator.service.finishing import Finisher
+from compensator.service.model_store import ModelStore
 from compensator.service.recorder import Recorder
+from compensator.service.restart import resume
 from compensator.signature import Signer
 
 from compensator.clock import NS, VirtualClock
 from compensator.config import LoadedConfig, parse_config
 from compensator.recording import first_sequence, recordings
 from compensator.service import recorder as recorder_module
-from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
-from compensator.service.model_store import ModelStore
-from compensator.service.restart import resume
 from drivers.errors import DriverError
 from drivers.reading import Quality, Reading
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors

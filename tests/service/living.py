@@ -20,13 +20,13 @@ from compensator.messages import Event, encode, number
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.recording.reading import first_sequence, recordings
 from compensator.recording.recorder import McapRecorder
-from compensator.service.adoption import Adoption, check_model
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
-from compensator.service.model_store import ModelStore
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.replay import apply, opening_of, steps_of
-from compensator.service.restart import resume
+from compensator.service.transfer.adoption import Adoption, check_model
+from compensator.service.transfer.model_store import ModelStore
+from compensator.service.transfer.restart import resume
 from sim_hardware.physics import Duty, PublishedQuill, World
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
 

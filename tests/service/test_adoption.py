@@ -15,10 +15,10 @@ import pytest
 from compensator.errors import ServiceError
 from compensator.messages import number
 from compensator.recording.reading import recordings
-from compensator.service.adoption import Adoption
 from compensator.service.compensation import Outcome
-from compensator.service.model_store import ModelStore, sha256_of
 from compensator.service.replay import opening_of
+from compensator.service.transfer.adoption import Adoption
+from compensator.service.transfer.model_store import ModelStore, sha256_of
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 from tests.service.test_restart import QUILL, STRONGER
 
@@ -162,14 +162,14 @@ async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
 ) -> None:
     machine = Machine(tmp_path / "a")
     held = threading.Event()
-    prepare = Adoption._warmed
+    prepare = Adoption._candidate
 
     def slow(self: Adoption, *arguments: Any) -> Any:
         warmed = prepare(self, *arguments)
         assert held.wait(30.0)
         return warmed
 
-    monkeypatch.setattr(Adoption, "_warmed", slow)
+    monkeypatch.setattr(Adoption, "_candidate", slow)
     asked = machine.at_sample[150] = Asked(machine, "adopt", payload(STRONGER))
     second = machine.at_sample[160] = Asked(machine, "back")
     machine.at_sample[200] = held.set

@@ -115,7 +115,7 @@ async def test_where_files_between_were_not_given_their_time_is_the_pause(tmp_pa
     for step in steps_of(first):
         free.run(step)
         apply(by_hand, step)
-    before, samples = by_hand.last[1], [step for step in steps_of(last) if step.sample is not None]
+    before, samples = by_hand.status.time_utc_ns, [step for step in steps_of(last) if step.sample is not None]
     assert samples[0].sample is not None
     by_hand.pause(round((samples[0].sample.time_utc_ns - before) / 60e9) - 1)
     for step in samples:

@@ -15,7 +15,7 @@ from compensator.messages import number
 from compensator.model.model_file import load_model, read_model_bytes
 from compensator.recording.reading import decode, read_messages, recordings
 from compensator.recording.recorder import McapRecorder
-from compensator.service.restart import resume
+from compensator.service.transfer.restart import resume
 from drivers.reading import Quality, Reading
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
 
@@ -140,6 +140,45 @@ async def test_an_operator_hold_and_the_guards_survive_a_kill(tmp_path: Path) ->
     assert check_files(machine) == 171
 
 
+def break_next_sample(machine: Machine) -> None:
+    """Let the next sample fail in a defect that is gone after it."""
+    compensation = machine.daemon._compensation  # type: ignore[union-attr]
+    original = compensation._decision.decide
+
+    def broken(*_: Any) -> Any:
+        compensation._decision.decide = original  # type: ignore[method-assign]
+        raise ZeroDivisionError("a defect")
+
+    compensation._decision.decide = broken  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("changed", ["nothing", "configuration", "model", "state lost", "no zero on record"])
+async def test_the_hold_of_an_internal_error_survives_a_restart_whatever_has_changed(
+    tmp_path: Path, changed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    zero = {"rest_rate_um_per_min": 0.2, "at_start": changed != "no zero on record"}
+    machine = Machine(tmp_path, settings(zero=zero))
+    write = McapRecorder.write
+    with monkeypatch.context() as patch:
+        if changed == "state lost":
+            patch.setattr(McapRecorder, "write", lambda self, records, ns, **_: write(self, records, ns))
+        machine.at_sample[60] = lambda: break_next_sample(machine)
+        await machine.run(81)  # one sample of them fails
+    if changed == "model":
+        machine.configured = STRONGER
+    elif changed != "nothing":
+        machine.config_bytes = b"changed"
+    machine.at_sample[100] = lambda: machine.command("resume")
+    if changed == "no zero on record":
+        machine.at_sample[90] = lambda: machine.command("zero")
+    await machine.run(40)
+    held = machine.outcomes[90 if changed == "no zero on record" else 60 : 100]
+    assert all(o.offset.state == "hold" and "internal_error" in o.offset.reasons for o in held)
+    assert len({o.offset.y_offset_um for o in held}) == 1
+    assert not any("internal_error" in o.offset.reasons for o in machine.outcomes[101:])
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+
+
 async def test_a_temperature_that_is_lost_across_the_restart_is_not_predicted_for_ever(tmp_path: Path) -> None:
     machine = Machine(tmp_path)
     await machine.run_and_kill(200)
@@ -238,8 +277,10 @@ async def test_cut_anywhere_every_whole_record_counts(tmp_path: Path) -> None:
         samples = [decode(r, path) for r in read_messages(path, ("sample",))]
         offsets = [decode(r, path) for r in read_messages(path, ("offset",))]
         compensation = resume(loaded, model).compensation
-        assert compensation.last[0] == (samples[-1].seq if samples else -1)  # type: ignore[attr-defined]
-        assert compensation.offset_um == (number(offsets[-1].y_offset_um) if offsets else 0.0)  # type: ignore[attr-defined]
+        status = compensation.status
+        assert status.seq == (samples[-1].seq if samples else -1)  # type: ignore[attr-defined]
+        last_um = number(offsets[-1].y_offset_um) if offsets else 0.0  # type: ignore[attr-defined]
+        assert status.handover.offset_um == last_um
 
 
 @pytest.mark.parametrize("state", [b"{}", b"not JSON", b'{"schema": 99}'])
@@ -277,20 +318,10 @@ async def test_every_file_works_out_from_what_travels_in_it(tmp_path: Path, monk
             raise OSError(28, "No space left on device")
         write(self, records, time_utc_ns, **rest)
 
-    def break_off() -> None:
-        compensation = machine.daemon._compensation  # type: ignore[union-attr]
-        original = compensation._decision.decide
-
-        def broken(*_: Any) -> Any:
-            compensation._decision.decide = original  # type: ignore[method-assign]
-            raise ZeroDivisionError("a defect")
-
-        compensation._decision.decide = broken  # type: ignore[method-assign]
-
     monkeypatch.setattr(McapRecorder, "write", failing)
     machine.at_sample[165] = lambda: (full.__setitem__(0, True), machine.command("zero", b'{"mode": "warm"}'))
     machine.at_sample[175] = lambda: full.__setitem__(0, False)
-    machine.at_sample[230] = break_off
+    machine.at_sample[230] = lambda: break_next_sample(machine)
     machine.at_sample[240] = lambda: machine.command("resume")
     await machine.run(120)
     kinds = {reason for o in machine.outcomes for reason in o.offset.reasons}

@@ -27,7 +27,7 @@ from compensator.recording.reading import decode, first_sequence, read_messages,
 from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
-from compensator.service.restart import resume
+from compensator.service.transfer.restart import resume
 from drivers.errors import DeviceDisconnected, DeviceTimeout
 from drivers.reading import Quality, Reading
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors

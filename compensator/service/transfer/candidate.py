@@ -1,6 +1,6 @@
-"""Warm-up: a model that did not run gets the state that it would have had, from the recordings.
+"""A compensation that did not run gets the state that it would have had: from the recordings, then from live samples.
 
-A restart with another configuration or model begins with it, and a model that is adopted.
+A restart with another configuration or model begins with one, and a model that is adopted.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,46 +17,63 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Config
 from compensator.errors import DataError
-from compensator.messages import EstimateMessage, number
+from compensator.events import EventKind
+from compensator.messages import EstimateMessage
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import decode, read_messages, recordings
-from compensator.service.compensation import Compensation, Outcome
+from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import FreeRun, Step, opening_of, steps_of
-from compensator.service.state import CompensationState, decode_state
+from compensator.service.state import decode_state
+from compensator.service.status import Zero
 
 #: Length of a warm-up at most, in slowest time constants: 0.03 % of what was before is left then.
 WARM_UP = 8.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WarmUp:
-    """A compensation that was brought to the present by the recordings.
+@dataclass(slots=True, kw_only=True)
+class ModelCandidate:
+    """A compensation that is ready to succeed another one.
 
     Parameters
     ----------
     compensation : Compensation
-        Its state after the last recorded sample.
+        Its state after the last sample that it got.
     samples : int
-        Number of samples that were run.
+        Number of recorded samples that it was warmed up on.
     minutes : float
         Time that they span, min.
-    known : bool
-        Whether they determine the state: they begin at a zero at rest, or reach back far enough.
     """
 
     compensation: Compensation
-    samples: int
-    minutes: float
-    known: bool
+    samples: int = 0
+    minutes: float = 0.0
+    #: Whether the recordings determine its state: they begin at a zero at rest, or reach back far enough.
+    is_known: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.is_known = self.compensation.status.is_known
+
+    def update(self, outcome: Outcome) -> None:
+        """Process a live sample, with the zero that was set with it; one from the recordings is left out."""
+        sample, last = outcome.sample, self.compensation.status.seq
+        if sample.seq <= last:
+            return
+        if last >= 0:
+            # Numbers between were not on disk in time for the warm-up.
+            self.compensation.pause(sample.seq - last - 1)
+        for note in outcome.notes:
+            if note.kind == EventKind.ZERO:
+                self.compensation.zero(note.data["mode"])
+        self.compensation.process(sample)
 
     def figures(self) -> dict[str, Any]:
-        """Return its extent for events and answers."""
-        return {"warm_up_min": self.minutes, "warm_up_samples": self.samples, "state_known": self.known}
+        """Return the extent of its warm-up for events and answers."""
+        return {"warm_up_min": self.minutes, "warm_up_samples": self.samples, "state_known": self.is_known}
 
 
 def warm_up(
-    folder: Path, config: Config, model: ThermalModel, *, let_others: Callable[[], None] = lambda: None
-) -> WarmUp:
+    folder: Path, config: Config, model: ThermalModel, *, between_samples: Callable[[], None] = lambda: None
+) -> ModelCandidate:
     """Bring a new compensation to the end of the recordings, with the zero that is in force there.
 
     It begins at the last zero at rest, or, where that is longer ago, `WARM_UP` of the model's slowest time constants
@@ -70,8 +87,8 @@ def warm_up(
         Settings of the service.
     model : ThermalModel
         The new model.
-    let_others : callable
-        Called after each sample; a thread lets the service go first there.
+    between_samples : callable
+        Called after each sample, where a thread gives way to the service.
 
     Raises
     ------
@@ -79,14 +96,14 @@ def warm_up(
         If there is no recording, or one of another sample period.
     """
     compensation = Compensation(config, model)
-    compensation.begin_at_zero()
-    window = _window(folder, config.machine.name, compensation.slowest_min, let_others)
-    last, free = window.last, FreeRun(compensation)
+    compensation.begin(None)
+    window = _window(folder, config.machine.name, slowest_min(model), between_samples)
+    zero, free = window.zero, FreeRun(compensation)
     names = {channel.name for channel in config.channel}
-    first_ns, samples, made = 0, 0, None
+    first_ns, samples, newest = 0, 0, zero
 
     def run(step: Step) -> None:
-        nonlocal first_ns, samples, made
+        nonlocal first_ns, samples, newest
         if step.sample is not None:
             if step.zero is not None:
                 compensation.zero(step.zero)
@@ -94,61 +111,55 @@ def warm_up(
             step = replace(step, sample=msgspec.structs.replace(step.sample, channels=channels))
         result = free.run(step, commands=False)
         if isinstance(result, Outcome):
-            first_ns, samples, made = first_ns or free.time_ns, samples + 1, result.estimate
+            first_ns, samples = first_ns or free.time_ns, samples + 1
+            newest = Zero.of_estimate(result.estimate)
 
-    absolute = number(last.t_q_ref_degc) == number(last.at_ref_degc) == 0.0
     if window.at_rest is not None:
         run(window.at_rest)
-    elif absolute and model.inputs == "changes":
+    elif zero.is_absolute and model.inputs == "changes":
         raise DataError(f"{folder}: no zero on record, and the previous model used the temperatures as they are")
     else:
-        compensation.begin(
-            t_q_ref_degc=number(last.t_q_ref_degc),
-            at_ref_degc=number(last.at_ref_degc),
-            y_ref_um=number(last.y_ref_um),
-            y_base_um=last.y_base_um,
-        )
+        compensation.begin(zero)
     for path in window.files:
         for step in steps_of(path):
             sample = step.sample
             if sample is None or (sample.seq > free.seq and sample.time_utc_ns >= window.from_ns):
                 run(step)
-            let_others()
-    if made is None:
+            between_samples()
+    if not samples:
         raise DataError(f"{folder}: no recorded sample to warm the model up with")
-    same = (last.t_q_ref_degc, last.at_ref_degc) == (made.t_q_ref_degc, made.at_ref_degc)
-    if not same and model.inputs == "changes" and not absolute:
+    same = (zero.t_q_ref_degc, zero.at_ref_degc) == (newest.t_q_ref_degc, newest.at_ref_degc)
+    if not same and model.inputs == "changes" and not zero.is_absolute:
         raise DataError(f"{folder}: the recordings do not lead to the zero in force")
-    minutes = (free.time_ns - first_ns) / (60.0 * NS)
-    return WarmUp(compensation=compensation, samples=samples, minutes=minutes, known=not compensation.is_cold)
+    return ModelCandidate(compensation=compensation, samples=samples, minutes=(free.time_ns - first_ns) / (60.0 * NS))
 
 
 @dataclass(slots=True)
 class _Window:
-    """The part of the recordings that a warm-up uses."""
+    """The part of the recordings that a warm-up uses, and the zero in force at their end."""
 
-    last: EstimateMessage
+    zero: Zero
     files: list[Path]
     from_ns: int
     at_rest: Step | None = None
 
 
-def _window(folder: Path, machine: str, slowest_min: float, let_others: Callable[[], None]) -> _Window:
+def _window(folder: Path, machine: str, slowest: float, between_samples: Callable[[], None]) -> _Window:
     """Look for the zero in force and for how far back the warm-up must begin."""
     files = recordings(folder, machine)
     last = _last_estimate(files)
-    if last is None or math.isnan(number(last.t_q_ref_degc)):
+    if last is None or math.isnan((zero := Zero.of_estimate(last)).t_q_ref_degc):
         raise DataError(f"{folder}: no zero on record")
-    span_ns = round(WARM_UP * slowest_min * 60 * NS)
-    window = _Window(last=last, files=files, from_ns=last.time_utc_ns - span_ns)
+    span_ns = round(WARM_UP * slowest * 60 * NS)
+    window = _Window(zero=zero, files=files, from_ns=last.time_utc_ns - span_ns)
     for path in reversed(files):
-        if _opens_with_zero(path, last):
+        if _opens_with(path, zero):
             continue  # the zero was set before this file
         zeros = []
         for step in steps_of(path):
             if step.zero is not None:
                 zeros.append(step)
-            let_others()
+            between_samples()
         for step in reversed(zeros):
             assert step.sample is not None
             if step.zero == "rest":
@@ -181,23 +192,10 @@ def _last_estimate(files: list[Path]) -> EstimateMessage | None:
     return None
 
 
-def _opens_with_zero(path: Path, last: EstimateMessage) -> bool:
-    """Return whether a recording opens with the zero in force at the end."""
-    state = _state_of(path)
-    if state is None:
-        return False
-    reference = state.engine.reference
-    pairs = (
-        (reference.t_q_degc, last.t_q_ref_degc),
-        (reference.at_degc, last.at_ref_degc),
-        (state.zero.y_ref, last.y_ref_um),
-        (state.zero.y_base, last.y_base_um),
-    )
-    return all(a == number(b) or (math.isnan(a) and math.isnan(number(b))) for a, b in pairs)
-
-
-def _state_of(path: Path) -> CompensationState | None:
+def _opens_with(path: Path, zero: Zero) -> bool:
+    """Return whether a zero was in force already where a recording opens."""
     try:
-        return decode_state(opening_of(path).get("state.json", b""))
+        state = decode_state(opening_of(path).get("state.json", b""))
     except DataError:
-        return None
+        return False
+    return Zero.of_references(state.engine.reference, state.zero).equals(zero)

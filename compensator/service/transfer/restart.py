@@ -8,21 +8,23 @@ configuration or the model has changed since, the recordings warm the new one up
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from compensator.config import Config, LoadedConfig
+from compensator.config import LoadedConfig
 from compensator.errors import CompensatorError, DataError
 from compensator.events import CommandName, EventKind, Note, command_of
 from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
+from compensator.reasons import Reason
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.offset_checkpoint import CheckpointedOffset
 from compensator.service.replay import Step, apply, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
-from compensator.service.warm_up import warm_up
+from compensator.service.status import Handover
+from compensator.service.transfer.candidate import warm_up
 
 
 @dataclass(slots=True)
@@ -44,6 +46,10 @@ class Resumed:
         """Add an event."""
         self.notes.append(Note(EventKind.RESTART, text, data))
 
+    def continue_from(self, offset_um: float) -> None:
+        """Continue from another offset than the compensation's own, µm."""
+        self.compensation.continue_from(replace(self.compensation.status.handover, offset_um=offset_um))
+
 
 @dataclass(slots=True)
 class _LastFile:
@@ -51,23 +57,41 @@ class _LastFile:
 
     path: Path
     opening: dict[str, bytes]
-    state: CompensationState | None
+    state: CompensationState | None = None
     samples: int = 0
-    #: Last published offset, µm; a control that never got one applies none.
-    offset_um: float = 0.0
-    operator_hold: bool = False
+    handover: Handover = field(default_factory=Handover)
+
+    def read_state(self, resumed: Resumed) -> None:
+        """Read the state that the file opens with; note where it cannot be used."""
+        try:
+            state = decode_state(self.opening["state.json"])
+        except DataError as error:
+            resumed.note(f"{self.path.name}: {error}")
+            return
+        self.state = state
+        self.handover = Handover(
+            offset_um=state.offset_um,
+            operator_hold=state.memory.operator_hold,
+            internal_error=state.memory.internal_error,
+        )
 
     def add(self, step: Step) -> float:
         """Follow one group; return the offset that was published with it, µm, NaN where none was."""
         self.samples += step.sample is not None
+        offset_um, held, failed = self.handover.offset_um, self.handover.operator_hold, self.handover.internal_error
+        for event in step.events:
+            command = command_of(event) if event.kind == EventKind.COMMAND else ""
+            held = command == CommandName.HOLD or (held and command != CommandName.RESUME)
+            failed = event.kind == EventKind.ERROR or (failed and command != CommandName.RESUME)
         offset = step.offset
         published = number(offset.y_offset_um) if offset is not None else math.nan
-        if not math.isnan(published):
-            self.offset_um = published
-        for event in step.events:
-            if event.kind == EventKind.COMMAND:
-                name = command_of(event)
-                self.operator_hold = name == CommandName.HOLD or (self.operator_hold and name != CommandName.RESUME)
+        # Without a state only the offsets show a hold from an earlier file.
+        reasons = offset.reasons if offset is not None else []
+        self.handover = Handover(
+            offset_um=offset_um if math.isnan(published) else published,
+            operator_hold=held or Reason.OPERATOR_HOLD in reasons,
+            internal_error=failed or Reason.INTERNAL_ERROR in reasons,
+        )
         return published
 
 
@@ -89,9 +113,8 @@ def resume(loaded: LoadedConfig, model: ThermalModel, checkpointed: Checkpointed
         The state before the pause since then; the first sample shows how long that is.
     """
     resumed = _from_disk(loaded, model)
-    compensation = resumed.compensation
-    if checkpointed is not None and checkpointed.seq > compensation.last[0]:
-        compensation.continue_from(checkpointed.y_offset_um, model_changed=compensation.is_under_way)
+    if checkpointed is not None and checkpointed.seq > resumed.compensation.status.seq:
+        resumed.continue_from(checkpointed.y_offset_um)
         resumed.note(
             f"continues from the offset {checkpointed.y_offset_um:.3f} µm of sample {checkpointed.seq}, "
             "which was published while the disk failed",
@@ -104,12 +127,11 @@ def resume(loaded: LoadedConfig, model: ThermalModel, checkpointed: Checkpointed
 def _from_disk(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
     config = loaded.config
     resumed = Resumed(Compensation(config, model))
-    folder = loaded.resolve(config.recording.folder)
-    for path in reversed(recordings(folder, config.machine.name)):
+    for path in reversed(recordings(loaded.resolve(config.recording.folder), config.machine.name)):
         try:
-            last = _LastFile(path, opening_of(path), None)
+            last = _LastFile(path, opening_of(path))
             if "state.json" in last.opening:
-                last.state = _state(last, resumed)
+                last.read_state(resumed)
             changes = _changes(last, loaded, model)
             compensation = Compensation(config, model)
             differing, why = _run_again(last, compensation, restore=not changes)
@@ -119,21 +141,11 @@ def _from_disk(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
         if last.state is None and not last.samples:
             continue
         if changes or why:
-            _warm(resumed, last, folder, config, model, changes or [why])
+            _warm(resumed, last, loaded, model, " and ".join(changes or [why]))
         else:
             _go_on(resumed, last, compensation, differing)
         break
     return resumed
-
-
-def _state(last: _LastFile, resumed: Resumed) -> CompensationState | None:
-    try:
-        state = decode_state(last.opening["state.json"])
-    except DataError as error:
-        resumed.note(f"{last.path.name}: {error}")
-        return None
-    last.offset_um, last.operator_hold = state.offset_um, state.memory.operator_hold
-    return state
 
 
 def _changes(last: _LastFile, loaded: LoadedConfig, model: ThermalModel) -> list[str]:
@@ -175,8 +187,8 @@ def _run_again(last: _LastFile, compensation: Compensation, *, restore: bool) ->
             continue
         if isinstance(result, Outcome) and "offset" in step.records:
             # The daemon adds to the reasons when the disk fails; the numbers are the compensation's alone.
-            made = number(result.offset.y_offset_um)
-            differing += made != published and not (math.isnan(made) and math.isnan(published))
+            computed = number(result.offset.y_offset_um)
+            differing += computed != published and not (math.isnan(computed) and math.isnan(published))
     return differing, why
 
 
@@ -188,44 +200,43 @@ def _go_on(resumed: Resumed, last: _LastFile, compensation: Compensation, differ
             file=last.path.name,
             differing=differing,
         )
+    resumed.compensation = compensation
     if last.samples:
         # Not from the offset of a torn last sample, which was not published.
-        compensation.continue_from(last.offset_um, model_changed=compensation.is_under_way)
-    seq, _ = compensation.last
-    resumed.compensation = compensation
+        resumed.continue_from(last.handover.offset_um)
+    status = compensation.status
     resumed.note(
-        f"continues from {last.path.name}: {last.samples} sample(s) run again, the last one {seq}",
+        f"continues from {last.path.name}: {last.samples} sample(s) run again, the last one {status.seq}",
         file=last.path.name,
         samples=last.samples,
-        last_seq=seq,
-        offset_um=compensation.offset_um,
+        last_seq=status.seq,
+        offset_um=status.handover.offset_um,
     )
 
 
-def _warm(
-    resumed: Resumed, last: _LastFile, folder: Path, config: Config, model: ThermalModel, changes: list[str]
-) -> None:
-    why = " and ".join(changes)
-    model_changed = last.state is None or last.state.model_sha256 != model.sha256
+def _warm(resumed: Resumed, last: _LastFile, loaded: LoadedConfig, model: ThermalModel, why: str) -> None:
+    """Warm a new compensation up on the recordings; where that fails it begins as at a first start."""
+    config = loaded.config
     try:
-        warm = warm_up(folder, config, model)
+        candidate = warm_up(loaded.resolve(config.recording.folder), config, model)
     except DataError as error:
-        resumed.compensation.continue_from(last.offset_um, model_changed=model_changed)
-        if last.operator_hold:
-            resumed.compensation.hold()
         resumed.note(
             f"{why}; the state cannot be carried over ({error}): it begins as at a first start", begun_anew=True
         )
-        return
-    resumed.compensation = warm.compensation
-    resumed.compensation.continue_from(last.offset_um, model_changed=model_changed)
-    if last.operator_hold:
-        resumed.compensation.hold()
-    resumed.note(
-        f"{why}; warmed up on {warm.samples} sample(s) of {warm.minutes / 60.0:.1f} h"
-        + ("" if warm.known else ", which is too short to know the state"),
-        samples=warm.samples,
-        warm_up_min=warm.minutes,
-        known=warm.known,
-        std_um=warm.compensation.std_um,
+    else:
+        resumed.compensation = candidate.compensation
+        resumed.note(
+            f"{why}; warmed up on {candidate.samples} sample(s) of {candidate.minutes / 60.0:.1f} h"
+            + ("" if candidate.is_known else ", which is too short to know the state"),
+            samples=candidate.samples,
+            warm_up_min=candidate.minutes,
+            known=candidate.is_known,
+            std_um=candidate.compensation.status.std_um,
+        )
+    resumed.compensation.continue_from(
+        replace(
+            last.handover,
+            waiting_zero=resumed.compensation.status.handover.waiting_zero,
+            model_changed=last.state is None or last.state.model_sha256 != model.sha256,
+        )
     )

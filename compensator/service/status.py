@@ -1,0 +1,110 @@
+"""What a compensation is like between two samples: its zero, its target, and what a successor continues with."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, dataclass
+
+from compensator.messages import EstimateMessage, number
+from compensator.model.engine import Reference
+from compensator.service.state import ZeroMode, ZeroState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Zero:
+    """The values from which temperatures and deformation count; NaN where one is unknown.
+
+    Parameters
+    ----------
+    t_q_ref_degc, at_ref_degc : float
+        Temperatures, °C.
+    y_ref_um : float
+        Measured deformation, µm.
+    y_base_um : float
+        Predicted deformation at the last zero on a warm machine, µm.
+    """
+
+    t_q_ref_degc: float
+    at_ref_degc: float
+    y_ref_um: float
+    y_base_um: float
+
+    @classmethod
+    def of_estimate(cls, estimate: EstimateMessage) -> Zero:
+        """Return the zero of a recorded estimate."""
+        return cls(
+            t_q_ref_degc=number(estimate.t_q_ref_degc),
+            at_ref_degc=number(estimate.at_ref_degc),
+            y_ref_um=number(estimate.y_ref_um),
+            y_base_um=estimate.y_base_um,
+        )
+
+    @classmethod
+    def of_references(cls, reference: Reference, zero: ZeroState) -> Zero:
+        """Return the zero that a state consists of: the reference of the engine, and those of Y."""
+        return cls(
+            t_q_ref_degc=reference.t_q_degc,
+            at_ref_degc=reference.at_degc,
+            y_ref_um=zero.y_ref,
+            y_base_um=zero.y_base,
+        )
+
+    @property
+    def is_absolute(self) -> bool:
+        """Whether the model used the temperatures as they are."""
+        return self.t_q_ref_degc == self.at_ref_degc == 0.0
+
+    def equals(self, other: Zero) -> bool:
+        """Return whether all values are equal, where unknown equals unknown."""
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Handover:
+    """What a compensation passes on to its successor, so that the published offset does not jump.
+
+    Parameters
+    ----------
+    offset_um : float
+        The last published offset, µm; a control that never received one applies none.
+    operator_hold, internal_error : bool
+        Why the offset is held until `resume`.
+    waiting_zero : {"auto", "rest", "warm"} or None
+        A zero that waits for both temperatures.
+    model_changed : bool
+        Whether the offset is still moving to that of another model.
+    """
+
+    offset_um: float = 0.0
+    operator_hold: bool = False
+    internal_error: bool = False
+    waiting_zero: ZeroMode | None = None
+    model_changed: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CompensationStatus:
+    """A compensation after its last sample.
+
+    Parameters
+    ----------
+    seq, time_utc_ns : int
+        Number and time, ns since 1970 UTC, of the last sample; −1 and 0 before the first.
+    zero : Zero or None
+        The zero in force, None before the first.
+    is_known : bool
+        Whether the thermal state is known: it did not start unknown, or long enough ago.
+    target_um, std_um : float
+        The offset that the model asks for and its standard deviation, µm; NaN while there is no estimate.
+    handover : Handover
+        What a successor continues with.
+    """
+
+    seq: int
+    time_utc_ns: int
+    zero: Zero | None
+    is_known: bool
+    target_um: float
+    std_um: float
+    handover: Handover
