@@ -13,7 +13,7 @@ from compensator.events import CommandName
 from compensator.model.model_file import read_model_bytes
 from compensator.service.command_client import NotReached, ask, operator_of_file
 from compensator.service.loading import Setup, load
-from compensator.service.transfer.adoption import check_model
+from compensator.service.transfer.model_store import check_model
 
 NOT_REACHED = "The service was not reached; it will use the model from its next start on."
 

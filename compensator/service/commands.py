@@ -14,8 +14,7 @@ from compensator.service.compensation import Compensation
 from compensator.service.journal import Journal
 from compensator.service.publisher import COMMANDS, Reply, Sender, refusal
 from compensator.service.replay import execute
-from compensator.service.transfer.adoption import LONGEST_MODEL, ModelRequest
-from compensator.service.transfer.swap import ModelSwap
+from compensator.service.transfer.adoption import LONGEST_MODEL, Adoption, ModelRequest
 
 #: Longest payload of a command without a model, bytes.
 LONGEST_COMMAND = 10_000
@@ -32,15 +31,15 @@ class Commands:
     ----------
     journal : Journal
         Notes each command.
-    swap : ModelSwap
+    adoption : Adoption
         Carries out `adopt` and `back`.
     unproven : bool
         Whether commands are accepted whose sender is not authenticated.
     """
 
-    def __init__(self, journal: Journal, swap: ModelSwap, *, unproven: bool) -> None:
+    def __init__(self, journal: Journal, adoption: Adoption, *, unproven: bool) -> None:
         self._journal = journal
-        self._swap = swap
+        self._adoption = adoption
         self._unproven = unproven
         self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
         self._refused = 0
@@ -64,7 +63,7 @@ class Commands:
             if name in (CommandName.ADOPT, CommandName.BACK):
                 request = ModelRequest.of(name, arguments)
                 reply: Future[dict[str, Any]] = Future()
-                loop.call_soon_threadsafe(self._swap.begin, name, request, reply, sender)
+                loop.call_soon_threadsafe(self._adoption.begin, name, request, reply, sender)
                 return reply
         except ServiceError as error:
             if loop is not None:

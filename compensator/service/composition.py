@@ -19,7 +19,6 @@ from compensator.service.loading import Setup
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.presence import sole_user
 from compensator.service.publisher import Publisher, Reply, Sender
-from compensator.service.transfer.adoption import Adoption
 from compensator.service.transfer.restart import resume
 from drivers.errors import DriverError
 from drivers.reading import Reading
@@ -109,7 +108,8 @@ async def run_service(
             publish=publish,
             clock=clock,
             first_sequence=max(first, checkpointed.seq + 1 if checkpointed is not None else 0),
-            adoption=Adoption(config, folder, setup.store),
+            recordings=folder,
+            store=setup.store,
             notes=(*resumed.notes, checks),
             checkpoint=checkpoint,
         )

@@ -10,6 +10,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from compensator import __version__
 from compensator.clock import NS, Clock
@@ -23,7 +24,7 @@ from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.publisher import UNNAMED, Reply, Sender
 from compensator.service.sampling import Grid, Sampler
 from compensator.service.transfer.adoption import Adoption
-from compensator.service.transfer.swap import ModelSwap
+from compensator.service.transfer.model_store import ModelStore
 from drivers.reading import Device
 
 log = logging.getLogger("compensator")
@@ -76,8 +77,10 @@ class Daemon:
         Paces the loop.
     first_sequence : int
         Sequence number of the first sample.
-    adoption : Adoption, optional
-        Prepares other models; without it the commands `adopt` and `back` are refused.
+    recordings : pathlib.Path
+        Folder of the recordings, on which another model is warmed up.
+    store : ModelStore, optional
+        Adopted models; without it the commands `adopt` and `back` are refused.
     notes : sequence of Note
         Events from before the start.
     checkpoint : OffsetCheckpoint, optional
@@ -94,7 +97,8 @@ class Daemon:
         publish: Callable[[str, bytes], None],
         clock: Clock,
         first_sequence: int,
-        adoption: Adoption | None = None,
+        recordings: Path = Path(),
+        store: ModelStore | None = None,
         notes: Sequence[Note] = (),
         checkpoint: OffsetCheckpoint | None = None,
     ) -> None:
@@ -113,8 +117,10 @@ class Daemon:
             checkpoint=checkpoint,
         )
         self._sampler = Sampler(config, devices, clock, self._journal.note)
-        self._swap = ModelSwap(adoption, self._journal, clock, lambda: self._compensation)
-        self._commands = Commands(self._journal, self._swap, unproven=config.zenoh.accepts_unproven())
+        self._adoption = Adoption(
+            config, recordings, store, journal=self._journal, clock=clock, running=lambda: self._compensation
+        )
+        self._commands = Commands(self._journal, self._adoption, unproven=config.zenoh.accepts_unproven())
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
@@ -210,7 +216,7 @@ class Daemon:
         self.stop()
         self._commands.close()
         await self._await_pending()
-        await self._swap.end()
+        await self._adoption.end()
         await self._journal.close(self._compensation.state())
         await self._sampler.close()
 
@@ -221,7 +227,7 @@ class Daemon:
         await self._await_pending()
         began = time.perf_counter()
         self._pass_pause(label_ns)
-        self._compensation = self._swap.swap()
+        self._compensation = self._adoption.swap()
         state, broke_off = self._compensation.state(), self._broken_off
         self._broken_off = True
         self._commands.apply(self._compensation)
@@ -271,7 +277,7 @@ class Daemon:
         self._publish("estimate", entry.estimate)
         self._publish("status", encode(self._status(outcome)))
         self._journal.sequence += 1
-        self._swap.follow(outcome)
+        self._adoption.follow(outcome)
         self._unreported.append(outcome)
 
     def _pass_pause(self, label_ns: int) -> None:

@@ -20,8 +20,7 @@ from compensator.reasons import Remark
 from compensator.recording.signature import Signer
 from compensator.remarks import ServiceWarning
 from compensator.service.session import tls_files
-from compensator.service.transfer.adoption import check_model
-from compensator.service.transfer.model_store import ModelStore
+from compensator.service.transfer.model_store import ModelStore, check_model
 from drivers.errors import DriverConfigError
 
 log = logging.getLogger("compensator")

@@ -24,8 +24,7 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.replay import apply, opening_of, steps_of
-from compensator.service.transfer.adoption import Adoption, check_model
-from compensator.service.transfer.model_store import ModelStore
+from compensator.service.transfer.model_store import ModelStore, check_model
 from compensator.service.transfer.restart import resume
 from sim_hardware.physics import Duty, PublishedQuill, World
 from tests.service.simulated import CHANNELS, START_NS, FakeDevice, config
@@ -97,7 +96,8 @@ class Machine:
             publish=lambda name, sent: self.published.append((name, sent)),
             clock=self.clock,
             first_sequence=first_sequence(self.recordings, MACHINE, self.clock.utc_ns(), 60.0),
-            adoption=Adoption(self.config, self.recordings, self.store),
+            recordings=self.recordings,
+            store=self.store,
             notes=resumed.notes,
             checkpoint=note,
         )

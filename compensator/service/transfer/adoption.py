@@ -1,56 +1,42 @@
-"""Prepares another model while the service runs: checks it, warms it up on the recordings, stores it.
+"""Another model for the running service: prepared on a thread of its own, swapped in between two samples.
 
-All of this runs on a thread of its own that gives way to samples; the swap lies between two samples, see `swap`.
+The thread checks the model, warms it up on the recordings and stores it for the next start; it gives way to samples.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import math
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from compensator.clock import Clock
 from compensator.config import Config
-from compensator.errors import CompensatorError, DataError, ModelError, ServiceError
-from compensator.events import CommandName
-from compensator.model.model_file import parse_model
+from compensator.errors import CompensatorError, DataError, ServiceError
+from compensator.events import CommandName, EventKind
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.compensation import Compensation, slowest_min
+from compensator.service.compensation import Compensation, Outcome, slowest_min
+from compensator.service.journal import Journal
+from compensator.service.publisher import Sender, refusal
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import WARM_UP, ModelCandidate, warm_up
-from compensator.service.transfer.model_store import ModelStore, sha256_of
+from compensator.service.transfer.model_store import ModelStore, check_model, sha256_of
+
+log = logging.getLogger("compensator")
 
 #: Longest payload of a command that brings a model, bytes.
 LONGEST_MODEL = 1_000_000
 #: Number of samples of a warm-up after which the thread sleeps for a moment, so that it never delays a sample.
 SAMPLES_PER_TURN = 10
 MOMENT_S = 0.001
-
-
-def check_model(config: Config, data: bytes, *, source: str) -> ThermalModel:
-    """Read a model file and check that the service of a configuration can run it.
-
-    Raises
-    ------
-    ModelError
-        One line that names what is wrong: the file, its dynamics, a channel that it needs, its period.
-    """
-    model = parse_model(data, source=source)
-    try:
-        if config.model.alternative:
-            model = model.with_alternative(config.model.alternative)
-        Compensation(config, model)
-    except CompensatorError as error:
-        raise ModelError(f"{source}: {error}") from error
-    polls = model.period_s / config.sampling.poll_interval_s
-    if abs(polls - round(polls)) > 1e-9 or polls < 1:
-        raise ModelError(
-            f"{source}: sample_period_s = {model.period_s:g}, "
-            f"expected a whole multiple of sampling.poll_interval_s = {config.sampling.poll_interval_s:g}"
-        )
-    return model
+_ADVICE = "wait, zero the machine at rest, or adopt it nevertheless with --force"
 
 
 class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -91,55 +77,157 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return request
 
 
+@dataclass(slots=True)
+class _Order:
+    """A command that is being carried out, with the samples that came meanwhile."""
+
+    action: str
+    request: ModelRequest
+    reply: Future[dict[str, Any]]
+    since: list[Outcome] = field(default_factory=list)
+    ready: tuple[bytes, ModelCandidate] | None = None
+    task: asyncio.Task[None] | None = None
+
+
 class Adoption:
-    """Prepares models for the service of one configuration.
+    """Carries out `adopt` and `back`, one at a time.
 
     Parameters
     ----------
     config : Config
         Settings.
-    folder : pathlib.Path
-        Recordings.
-    store : ModelStore
-        Where adopted models are kept.
+    recordings : pathlib.Path
+        Folder of the recordings.
+    store : ModelStore or None
+        Where adopted models are kept; without it every command is refused.
+    journal : Journal
+        Where it is noted.
+    clock : Clock
+        For the history of models.
+    running : callable
+        Returns the compensation that runs.
     """
 
-    def __init__(self, config: Config, folder: Path, store: ModelStore) -> None:
+    def __init__(
+        self,
+        config: Config,
+        recordings: Path,
+        store: ModelStore | None,
+        *,
+        journal: Journal,
+        clock: Clock,
+        running: Callable[[], Compensation],
+    ) -> None:
         self._config = config
-        self._folder = folder
+        self._recordings = recordings
         self._store = store
+        self._journal = journal
+        self._clock = clock
+        self._running = running
+        self._order: _Order | None = None
+        self._ended = False
 
-    def prepare(
-        self, action: str, request: ModelRequest, running: ThermalModel, zero: Zero | None, now_ns: int
+    def begin(self, action: str, request: ModelRequest, reply: Future[dict[str, Any]], sender: Sender) -> None:
+        """Begin to prepare a model; the reply comes once it is ready or refused. In the loop only."""
+        if self._store is None or self._ended or self._order is not None:
+            why = f"{action}: this service adopts no model now"
+            if self._order is not None:
+                why = f"{action}: another model is under way until the next sample; ask again then"
+            self._journal.note(EventKind.COMMAND_REFUSED, why, {"name": action, "ok": False} | sender.data())
+            reply.set_result(refusal(why))
+            return
+        # The text of the model is not repeated here: it travels in the recording that begins with it.
+        data = {"sha256": request.sha256, "force": request.force}
+        self._journal.note(EventKind.COMMAND, action, data | {"command": action} | sender.data())
+        self._order = _Order(action, request, reply)
+        self._order.task = asyncio.create_task(self._prepare(self._store, self._order))
+        self._order.task.add_done_callback(self._answer_refusal)
+
+    def follow(self, outcome: Outcome) -> None:
+        """Keep a sample that comes while a model is prepared."""
+        if self._order is not None:
+            self._order.since.append(outcome)
+
+    def swap(self) -> Compensation:
+        """Return the compensation for the next sample: the running one, or one with a model that is ready."""
+        order, old = self._order, self._running()
+        if order is None or order.ready is None:
+            return old
+        self._order = None
+        data, candidate = order.ready
+        for outcome in order.since:
+            candidate.update(outcome)
+        new = candidate.compensation
+        before, after = old.status, new.status
+        has_offset = not math.isnan(before.target_um)
+        new.continue_from(replace(before.handover, model_changed=has_offset))
+        difference = after.target_um - before.target_um
+        self._journal.start_new_file(data)
+        named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
+        self._journal.note(
+            EventKind.ADOPT,
+            f"model {named[0]} replaces {named[1]}, "
+            f"warm-up {candidate.minutes / 60.0:.1f} h, the offset moves by {difference:+.2f} µm",
+            {
+                "ok": True,
+                "action": order.action,
+                "old_sha256": old.model.sha256,
+                "new_sha256": new.model.sha256,
+                **candidate.figures(),
+                "difference_um": difference,
+                "y_std_um": after.std_um,
+            },
+        )
+        return new
+
+    async def end(self) -> None:
+        """Wait until a model under way is answered: one that was stored is used at the next start."""
+        self._ended = True
+        await asyncio.sleep(0)  # one that was asked for just now is refused
+        order = self._order
+        if order is not None and order.task is not None:
+            await asyncio.gather(order.task, return_exceptions=True)
+
+    async def _prepare(self, store: ModelStore, order: _Order) -> None:
+        """Have the model prepared on another thread, then answer; the swap comes with the next sample."""
+        running, now_ns = self._running(), self._clock.utc_ns()
+        order.ready = await asyncio.to_thread(self._prepared, store, order, running.model, running.status.zero, now_ns)
+        _, candidate = order.ready
+        model = candidate.compensation.model
+        how = f"warmed up on {candidate.samples} sample(s) of {candidate.minutes / 60.0:.1f} h"
+        if not candidate.is_known:
+            std_um = candidate.compensation.status.std_um
+            how += f", too little to know its state: standard deviation {std_um:.1f} µm for now"
+        order.reply.set_result(
+            {
+                "ok": True,
+                "text": f"model {model.name} ({model.sha256[:12]}) is adopted with the next sample, {how}",
+                "model": model.name,
+                "model_sha256": model.sha256,
+                **candidate.figures(),
+            }
+        )
+
+    def _answer_refusal(self, task: asyncio.Task[None]) -> None:
+        """Answer with the reason where a model could not be prepared; the running one stays."""
+        order, error = self._order, None if task.cancelled() else task.exception()
+        if order is None or error is None:
+            return
+        self._order = None
+        text = str(error)
+        if not isinstance(error, CompensatorError):
+            log.error("internal error", exc_info=error)
+            text = f"internal error: {type(error).__name__}: {error}"
+        self._journal.note(EventKind.ADOPT, f"refused: {text}", {"ok": False, "action": order.action})
+        order.reply.set_result(refusal(text))
+
+    # ------------------------------------------------------------------ on a thread of its own
+
+    def _prepared(
+        self, store: ModelStore, order: _Order, running: ThermalModel, zero: Zero | None, now_ns: int
     ) -> tuple[bytes, ModelCandidate]:
-        """Make a model ready and store it for the next start; this takes a while.
-
-        Parameters
-        ----------
-        action : {"adopt", "back"}
-            Which command.
-        request : ModelRequest
-            Its arguments.
-        running : ThermalModel
-            The model in use.
-        zero : Zero or None
-            The zero in force, None before the first.
-        now_ns : int
-            Now, ns since 1970 UTC.
-
-        Returns
-        -------
-        bytes
-            The model file.
-        ModelCandidate
-            Its compensation at the last recorded sample.
-
-        Raises
-        ------
-        CompensatorError
-            Why it is refused, in one line.
-        """
-        data = self._data(action, request)
+        """Return the file of a model and its candidate, and store it for the next start; this takes a while."""
+        data = _model_file(store, order)
         model = check_model(self._config, data, source=f"model {sha256_of(data)[:12]}")
         if model.sha256 == running.sha256:
             raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is the service's model already")
@@ -147,26 +235,18 @@ class Adoption:
             raise ServiceError(
                 f"model {model.name}: sample_period_s = {model.period_s:g}, the service runs at {running.period_s:g} s"
             )
-        candidate = self._candidate(model, zero, request.force)
-        if action == CommandName.BACK:
-            self._store.back(name=model.name, time_utc_ns=now_ns)
+        candidate = self._candidate(model, zero, order.request.force)
+        if order.action == CommandName.BACK:
+            store.back(name=model.name, time_utc_ns=now_ns)
         else:
-            self._store.adopt(data, name=model.name, time_utc_ns=now_ns)
+            store.adopt(data, name=model.name, time_utc_ns=now_ns)
         return data, candidate
-
-    def _data(self, action: str, request: ModelRequest) -> bytes:
-        if action == CommandName.ADOPT:
-            return request.model.encode() if request.model else self._store.load(request.sha256)
-        before = self._store.before()
-        if before is None:
-            raise ServiceError("back: the configured model is in use, there is none before it")
-        return before
 
     def _candidate(self, model: ThermalModel, zero: Zero | None, force: bool) -> ModelCandidate:
         if zero is None:
             return ModelCandidate(compensation=Compensation(self._config, model))
         try:
-            candidate = warm_up(self._folder, self._config, model, between_samples=_give_way())
+            candidate = warm_up(self._recordings, self._config, model, between_samples=_give_way())
         except DataError as error:
             if not force:
                 raise ServiceError(f"model {model.name}: no warm-up: {error}; {_ADVICE}") from error
@@ -183,7 +263,13 @@ class Adoption:
         return candidate
 
 
-_ADVICE = "wait, zero the machine at rest, or adopt it nevertheless with --force"
+def _model_file(store: ModelStore, order: _Order) -> bytes:
+    if order.action == CommandName.ADOPT:
+        return order.request.model.encode() if order.request.model else store.load(order.request.sha256)
+    before = store.before()
+    if before is None:
+        raise ServiceError("back: the configured model is in use, there is none before it")
+    return before
 
 
 def _give_way() -> Callable[[], None]:

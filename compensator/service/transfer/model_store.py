@@ -13,7 +13,11 @@ from typing import Literal
 import msgspec
 
 from compensator.atomic_write import replace_file
-from compensator.errors import ServiceError
+from compensator.config import Config
+from compensator.errors import CompensatorError, ModelError, ServiceError
+from compensator.model.model_file import parse_model
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.compensation import Compensation
 
 _FILE = "adopted.json"
 
@@ -74,12 +78,8 @@ class ModelStore:
         adopted = self._read().in_use
         return self.load(adopted[-1].sha256) if adopted else self.configured
 
-    def adopted(self) -> bool:
-        """Return whether a model other than the configured one is in use."""
-        return bool(self._read().in_use)
-
     def before(self) -> bytes | None:
-        """Return the model file that `back` leads to, None where the configured one is in use."""
+        """Return the model file that `back` leads to, None where no model is adopted."""
         adopted = self._read().in_use
         if not adopted:
             return None
@@ -147,3 +147,27 @@ class ModelStore:
 def sha256_of(data: bytes) -> str:
     """Return the hash of a model file."""
     return hashlib.sha256(data).hexdigest()
+
+
+def check_model(config: Config, data: bytes, *, source: str) -> ThermalModel:
+    """Read a model file and check that the service of a configuration can run it.
+
+    Raises
+    ------
+    ModelError
+        One line that names what is wrong: the file, its dynamics, a channel that it needs, its period.
+    """
+    model = parse_model(data, source=source)
+    try:
+        if config.model.alternative:
+            model = model.with_alternative(config.model.alternative)
+        Compensation(config, model)
+    except CompensatorError as error:
+        raise ModelError(f"{source}: {error}") from error
+    polls = model.period_s / config.sampling.poll_interval_s
+    if abs(polls - round(polls)) > 1e-9 or polls < 1:
+        raise ModelError(
+            f"{source}: sample_period_s = {model.period_s:g}, "
+            f"expected a whole multiple of sampling.poll_interval_s = {config.sampling.poll_interval_s:g}"
+        )
+    return model
