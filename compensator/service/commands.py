@@ -11,7 +11,7 @@ import msgspec
 from compensator.errors import ServiceError
 from compensator.events import CommandName, EventKind
 from compensator.service.compensation import Compensation
-from compensator.service.journal import Journal
+from compensator.service.event_log import EventLog
 from compensator.service.publisher import COMMANDS, Reply, Sender, refusal
 from compensator.service.replay import execute
 from compensator.service.transfer.adoption import LONGEST_MODEL, Adoption, ModelRequest
@@ -29,7 +29,7 @@ class Commands:
 
     Parameters
     ----------
-    journal : Journal
+    events : EventLog
         Notes each command.
     adoption : Adoption
         Carries out `adopt` and `back`.
@@ -37,8 +37,8 @@ class Commands:
         Whether commands are accepted whose sender is not authenticated.
     """
 
-    def __init__(self, journal: Journal, adoption: Adoption, *, unproven: bool) -> None:
-        self._journal = journal
+    def __init__(self, events: EventLog, adoption: Adoption, *, unproven: bool) -> None:
+        self._events = events
         self._adoption = adoption
         self._unproven = unproven
         self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
@@ -77,7 +77,7 @@ class Commands:
         self._refused = 0
         while not self._waiting.empty():
             name, arguments, sender = self._waiting.get_nowait()
-            self._journal.note(EventKind.COMMAND, name, arguments | {"command": name} | sender.data())
+            self._events.note(EventKind.COMMAND, name, arguments | {"command": name} | sender.data())
             execute(compensation, name, arguments)
 
     def _checked(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
@@ -109,4 +109,4 @@ class Commands:
     def _note_refusal(self, name: str, why: str, sender: Sender) -> None:
         self._refused += 1
         if self._refused <= NOTED_REFUSALS:
-            self._journal.note(EventKind.COMMAND_REFUSED, why, {"name": name, "ok": False} | sender.data())
+            self._events.note(EventKind.COMMAND_REFUSED, why, {"name": name, "ok": False} | sender.data())

@@ -19,7 +19,9 @@ from compensator.events import EventKind, Note, PauseData
 from compensator.messages import SCHEMA, Offset, Sample, Status, encode
 from compensator.service.commands import Commands
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.journal import Entry, Journal, Recorder
+from compensator.service.disk_writer import DiskWriter, Entry, Recorder
+from compensator.service.event_log import EventLog
+from compensator.service.journal import Journal
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.publisher import UNNAMED, Reply, Sender
 from compensator.service.sampling import Grid, Sampler
@@ -106,21 +108,21 @@ class Daemon:
         self._compensation = compensation
         self._publish = publish
         self._clock = clock
+        self._events = EventLog(config.machine.name, publish, clock, first_sequence)
+        self._writer = DiskWriter(recorder)
         self._journal = Journal(
-            machine=config.machine.name,
-            recorder=recorder,
-            publish=publish,
-            clock=clock,
-            sequence=first_sequence,
+            self._events,
+            self._writer,
+            clock,
             limit_s=min(DISK_PART * config.sampling.poll_interval_s, DISK_S),
             patience_s=min(max(PATIENCE_PART * compensation.model.period_s, DISK_S), PATIENCE_S),
             checkpoint=checkpoint,
         )
-        self._sampler = Sampler(config, devices, clock, self._journal.note)
+        self._sampler = Sampler(config, devices, clock, self._events.note)
         self._adoption = Adoption(
-            config, recordings, store, journal=self._journal, clock=clock, running=lambda: self._compensation
+            config, recordings, store, self._events, self._journal, clock=clock, running=lambda: self._compensation
         )
-        self._commands = Commands(self._journal, self._adoption, unproven=config.zenoh.accepts_unproven())
+        self._commands = Commands(self._events, self._adoption, unproven=config.zenoh.accepts_unproven())
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
@@ -156,9 +158,9 @@ class Daemon:
         period_s = self._compensation.model.period_s
         polls = max(1, round(period_s / self._config.sampling.poll_interval_s))
         grid = Grid(self._clock, period_s, polls)
-        self._journal.note(EventKind.START, f"compensator {__version__} with model {self._compensation.model.name}")
+        self._events.note(EventKind.START, f"compensator {__version__} with model {self._compensation.model.name}")
         for kind, text, data in self._earlier:
-            self._journal.note(kind, text, data)
+            self._events.note(kind, text, data)
         done = 0
         try:
             while not self._stop and (samples is None or done < samples):
@@ -195,7 +197,7 @@ class Daemon:
                 await self._sample(label_ns)
         except Exception as error:
             log.exception("internal error")
-            self._journal.note(EventKind.ERROR, f"internal error: {type(error).__name__}: {error}")
+            self._events.note(EventKind.ERROR, f"internal error: {type(error).__name__}: {error}")
             self._compensation.fail()
             if label_ns is not None:
                 await self._hold(label_ns)
@@ -203,10 +205,10 @@ class Daemon:
     async def _hold(self, label_ns: int) -> None:
         """Publish that the last offset is held, without the sample that could not be processed."""
         await self._await_pending()
-        held = self._compensation.held(self._config.machine.name, self._journal.sequence, label_ns)
+        held = self._compensation.held(self._config.machine.name, self._events.sequence, label_ns)
         offset = await self._journal.record(label_ns, self._compensation.state(), offset=held)
         self._publish("offset", encode(offset or held))
-        self._journal.sequence += 1
+        self._events.sequence += 1
 
     def stop(self) -> None:
         """End the run after the current poll; the recording is finished."""
@@ -234,7 +236,7 @@ class Daemon:
         raw = Sample(
             schema=SCHEMA,
             machine=self._config.machine.name,
-            seq=self._journal.sequence,
+            seq=self._events.sequence,
             time_utc_ns=label_ns,
             period_s=self._compensation.model.period_s,
             channels=self._sampler.close_sample(),
@@ -244,7 +246,7 @@ class Daemon:
         if broke_off:  # once for all consecutive samples that failed
             self._journal.start_new_file()
         for note in outcome.notes:
-            self._journal.note(*note)
+            self._events.note(*note)
         self._note_state(self._journal.expected(outcome.offset))
         sample, estimate = encode(outcome.sample), encode(outcome.estimate)
         entry = self._journal.enqueue(label_ns, state, sample=sample, estimate=estimate, offset=outcome.offset)
@@ -276,7 +278,7 @@ class Daemon:
         self._publish("sample", entry.sample)
         self._publish("estimate", entry.estimate)
         self._publish("status", encode(self._status(outcome)))
-        self._journal.sequence += 1
+        self._events.sequence += 1
         self._adoption.follow(outcome)
         self._unreported.append(outcome)
 
@@ -308,7 +310,7 @@ class Daemon:
             bridged=known and minutes <= bridged,
             y_std_um=std,
         )
-        self._journal.note(EventKind.RESTART, text, data.table())
+        self._events.note(EventKind.RESTART, text, data.table())
 
     def _status(self, outcome: Outcome) -> Status:
         model = self._compensation.model
@@ -324,7 +326,7 @@ class Daemon:
             model_kind=model.kind,
             model_sha256=model.sha256,
             started_utc_ns=self._started_utc_ns,
-            recording=self._journal.file,
+            recording=self._writer.file,
             devices=self._sampler.device_states(),
             effects=[effect.label for effect in model.effects],
         )
@@ -334,12 +336,12 @@ class Daemon:
     def _note_state(self, offset: Offset) -> None:
         now = " ".join([offset.state, *offset.reasons])
         if now != self._last_state:
-            self._journal.note(EventKind.STATE, now, {"state": offset.state, "reasons": offset.reasons})
+            self._events.note(EventKind.STATE, now, {"state": offset.state, "reasons": offset.reasons})
             self._last_state = now
 
     def _note_clock_step(self, seconds: float) -> None:
         if seconds:
-            self._journal.note(EventKind.CLOCK, f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
+            self._events.note(EventKind.CLOCK, f"the wall clock was set by {seconds:+.1f} s", {"seconds": seconds})
 
     def command(self, name: str, payload: bytes, sender: Sender = UNNAMED) -> Reply:
         """Accept a command from another thread; it acts at the next sample.

@@ -15,7 +15,7 @@ import pytest
 from compensator.audit.series import Audit, audit, summary
 from compensator.messages import Event, Offset
 from compensator.recording.reading import read_messages, recordings
-from compensator.service import journal
+from compensator.service import disk_writer
 from tests.audit.made import CONFIG, MACHINE, QUILL
 from tests.service.simulated import Bench
 
@@ -177,13 +177,13 @@ async def test_a_disk_that_hangs_and_then_fails_gets_everything_once(
 async def test_what_waits_is_bounded_and_what_is_given_up_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journal, "WAITING_SAMPLES", 8)
+    monkeypatch.setattr(disk_writer, "WAITING_SAMPLES", 8)
     bench = replayable(tmp_path)
     disk = Disk(bench, monkeypatch)
 
     def catch_up() -> None:
         disk.go_on()
-        while bench.daemon._journal.waiting:
+        while bench.daemon._writer.waiting:
             time.sleep(0.001)
 
     at(bench, {10: disk.stop, 12: lambda: bench.daemon.command("zero", b'{"mode": "warm"}'), 30: catch_up})

@@ -81,7 +81,7 @@ async def test_a_sample_that_breaks_off_half_way_leaves_a_recording_that_audits_
         delattr(broken_room, name)
         bench.daemon.command("resume", b"")
 
-    note = bench.daemon._journal.note
+    note = bench.daemon._events.note
     errors: list[str] = []
 
     def noted(kind: str, text: str, data: dict[str, Any] | None = None) -> None:
@@ -91,7 +91,7 @@ async def test_a_sample_that_breaks_off_half_way_leaves_a_recording_that_audits_
             if len(errors) == 3:
                 mend(kind, text)
 
-    bench.daemon._journal.note = noted  # type: ignore[method-assign]
+    bench.daemon._events.note = noted  # type: ignore[method-assign]
     await bench.run(40)
     assert errors == ["internal error: ZeroDivisionError: a defect"] * 3
     files = recordings(tmp_path / "rec", "vmc-07")

@@ -150,7 +150,7 @@ class _Machine:
                 await close(state)
                 return
             # A kill leaves the file as it is, and lets go of it.
-            daemon._journal._executor.shutdown(wait=True)
+            daemon._writer._executor.shutdown(wait=True)
             recorder._finisher.wait()
             if recorder._live is not None:
                 os.close(recorder._live._descriptor)

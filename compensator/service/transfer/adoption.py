@@ -23,6 +23,7 @@ from compensator.errors import CompensatorError, DataError, ServiceError
 from compensator.events import CommandName, EventKind
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
+from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.publisher import Sender, refusal
 from compensator.service.status import Zero
@@ -100,8 +101,10 @@ class Adoption:
         Folder of the recordings.
     store : ModelStore or None
         Where adopted models are kept; without it every command is refused.
+    events : EventLog
+        Notes what happens.
     journal : Journal
-        Where it is noted.
+        Begins the file of another model.
     clock : Clock
         For the history of models.
     running : callable
@@ -113,14 +116,16 @@ class Adoption:
         config: Config,
         recordings: Path,
         store: ModelStore | None,
-        *,
+        events: EventLog,
         journal: Journal,
+        *,
         clock: Clock,
         running: Callable[[], Compensation],
     ) -> None:
         self._config = config
         self._recordings = recordings
         self._store = store
+        self._events = events
         self._journal = journal
         self._clock = clock
         self._running = running
@@ -133,12 +138,12 @@ class Adoption:
             why = f"{action}: this service adopts no model now"
             if self._order is not None:
                 why = f"{action}: another model is under way until the next sample; ask again then"
-            self._journal.note(EventKind.COMMAND_REFUSED, why, {"name": action, "ok": False} | sender.data())
+            self._events.note(EventKind.COMMAND_REFUSED, why, {"name": action, "ok": False} | sender.data())
             reply.set_result(refusal(why))
             return
         # The text of the model is not repeated here: it travels in the recording that begins with it.
         data = {"sha256": request.sha256, "force": request.force}
-        self._journal.note(EventKind.COMMAND, action, data | {"command": action} | sender.data())
+        self._events.note(EventKind.COMMAND, action, data | {"command": action} | sender.data())
         self._order = _Order(action, request, reply)
         self._order.task = asyncio.create_task(self._prepare(self._store, self._order))
         self._order.task.add_done_callback(self._answer_refusal)
@@ -164,7 +169,7 @@ class Adoption:
         difference = after.target_um - before.target_um
         self._journal.start_new_file(data)
         named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
-        self._journal.note(
+        self._events.note(
             EventKind.ADOPT,
             f"model {named[0]} replaces {named[1]}, "
             f"warm-up {candidate.minutes / 60.0:.1f} h, the offset moves by {difference:+.2f} µm",
@@ -218,7 +223,7 @@ class Adoption:
         if not isinstance(error, CompensatorError):
             log.error("internal error", exc_info=error)
             text = f"internal error: {type(error).__name__}: {error}"
-        self._journal.note(EventKind.ADOPT, f"refused: {text}", {"ok": False, "action": order.action})
+        self._events.note(EventKind.ADOPT, f"refused: {text}", {"ok": False, "action": order.action})
         order.reply.set_result(refusal(text))
 
     # ------------------------------------------------------------------ on a thread of its own

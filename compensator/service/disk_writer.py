@@ -1,0 +1,220 @@
+"""Brings samples to disk in their order, on a thread of its own.
+
+A slow disk delays neither polling nor commands. What waits is written together, with one sync, so that a slow disk
+catches up; what a disk refuses waits and is written once the disk accepts it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections import deque
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from compensator.messages import Event, Offset, degraded, encode
+from compensator.reasons import Reason
+from compensator.recording.naming import day_of
+from compensator.service.event_log import WAITING_EVENTS
+
+#: Largest number of samples that wait for the disk (four hours at one a minute), so that a lost disk costs no memory;
+#: then the oldest are dropped.
+WAITING_SAMPLES = 240
+
+
+class Recorder(Protocol):
+    """What the writer needs of a recording; used on its thread, except `path` and `remarks`."""
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is being written."""
+
+    def write(
+        self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"", sync: bool = True
+    ) -> None:
+        """Write records, and bring them to disk unless `sync` is false."""
+
+    def start_new(self, attachments: Mapping[str, bytes] | None = None) -> None:
+        """Finish the file; the next write opens a new one, with attachments that replace those of the same name."""
+
+    def remarks(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return text and data of events about finished files."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class Entry:
+    """A sample on its way to the disk, with everything that is written together with it.
+
+    Parameters
+    ----------
+    time_utc_ns : int
+        Its time, ns since 1970 UTC.
+    state : bytes
+        State of the compensation before it.
+    events : list of Event
+        Events since the previous sample.
+    sample, estimate : bytes
+        JSON; empty if there is none.
+    offset : Offset, optional
+        As decided.
+    new_file : bool
+        Whether it must open a new file.
+    model : bytes, optional
+        Model file that is attached to recordings from here on.
+    """
+
+    time_utc_ns: int
+    state: bytes
+    events: list[Event] = field(default_factory=list)
+    sample: bytes = b""
+    estimate: bytes = b""
+    offset: Offset | None = None
+    new_file: bool = False
+    model: bytes | None = None
+    #: Reason with which the offset was published before it was on disk, empty otherwise.
+    reason: str = ""
+    on_disk: bool = False
+    #: The attempt to bring it to disk.
+    attempt: asyncio.Future[None] = field(init=False)
+
+    def records(self) -> list[tuple[str, bytes]]:
+        """Return topic and JSON of everything; the offset as it was published if it was already."""
+        records = [("event", encode(event)) for event in self.events]
+        records += [(topic, data) for topic, data in (("sample", self.sample), ("estimate", self.estimate)) if data]
+        if self.offset is not None:
+            records.append(("offset", encode(degraded(self.offset, self.reason) if self.reason else self.offset)))
+        return records
+
+    @property
+    def day(self) -> str:
+        """Its day, UTC; a file holds one."""
+        return day_of(self.time_utc_ns)
+
+    def inherit(self, dropped: Entry) -> None:
+        """Keep what must not be lost with a sample that is dropped."""
+        self.events = [*dropped.events, *self.events][-WAITING_EVENTS:]
+        self.model = self.model if self.model is not None else dropped.model
+        self.new_file = True
+
+
+class DiskWriter:
+    """Writes entries with a recorder.
+
+    Parameters
+    ----------
+    recorder : Recorder
+        Writes them.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="recording")
+        self._lock = threading.Lock()  # for what follows, which both threads use
+        self._waiting: deque[Entry] = deque()
+        self._writing: list[Entry] = []
+        self._failed = False
+        self._attempt: Future[None] | None = None
+        self._dropped = 0
+
+    # ------------------------------------------------------------------ on the loop
+
+    @property
+    def file(self) -> str:
+        """Name of the recording, empty if there is none."""
+        return self._recorder.path.name if self._recorder.path else ""
+
+    @property
+    def waiting(self) -> int:
+        """Number of samples that are not on disk."""
+        with self._lock:
+            return sum(bool(entry.sample) for entry in (*self._waiting, *self._writing))
+
+    def remarks(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return text and data of events about finished files."""
+        return self._recorder.remarks()
+
+    def enqueue(self, entry: Entry) -> None:
+        """Enqueue an entry to be written after everything that waits."""
+        with self._lock:
+            self._waiting.append(entry)
+            if len(self._waiting) > WAITING_SAMPLES:
+                dropped = self._waiting.popleft()
+                self._waiting[0].inherit(dropped)
+                self._dropped += bool(dropped.sample)
+            # An attempt that has not started yet writes everything that waits by then.
+            if self._attempt is None or self._attempt.running() or self._attempt.done():
+                self._attempt = self._executor.submit(self._write_waiting)
+            attempt = self._attempt
+        entry.attempt = asyncio.wrap_future(attempt)
+        # Retrieve the error, also when the attempt ends later.
+        entry.attempt.add_done_callback(lambda done: done.cancelled() or done.exception())
+
+    def release(self, entry: Entry) -> bool:
+        """Give an entry the reason with which its offset is published now, if it is not on disk.
+
+        Returns
+        -------
+        bool
+            Whether it is being written without that reason.
+        """
+        with self._lock:
+            if not entry.on_disk:
+                entry.reason = Reason.RECORDING_FAILED if self._failed else Reason.RECORDING_LATE
+            return bool(entry.reason) and entry in self._writing
+
+    def count_dropped(self) -> int:
+        """Return the number of samples that were dropped since the last call."""
+        dropped, self._dropped = self._dropped, 0
+        return dropped
+
+    def close(self) -> asyncio.Future[None]:
+        """Write what waits and finish the recording; the future ends then, with the error if the disk refuses."""
+        closing = asyncio.wrap_future(self._executor.submit(self._finish))
+        self._executor.shutdown(wait=False)
+        return closing
+
+    # ------------------------------------------------------------------ on the writing thread
+
+    def _finish(self) -> None:
+        try:
+            self._write_waiting()
+        finally:
+            self._recorder.close()
+
+    def _write_waiting(self) -> None:
+        while batch := self._next_batch():
+            written = False
+            try:
+                self._write(batch)
+                written = True
+            finally:
+                with self._lock:
+                    if written:
+                        for entry in batch:
+                            entry.on_disk = True
+                    else:
+                        self._waiting.extendleft(reversed(batch))
+                    self._failed, self._writing = not written, []
+
+    def _next_batch(self) -> list[Entry]:
+        """Return the entries that come next into one file."""
+        with self._lock:
+            while self._waiting:
+                entry = self._waiting[0]
+                if self._writing and (entry.new_file or entry.day != self._writing[0].day):
+                    break
+                self._writing.append(self._waiting.popleft())
+            return self._writing
+
+    def _write(self, batch: list[Entry]) -> None:
+        first = batch[0]
+        if first.new_file:
+            self._recorder.start_new(None if first.model is None else {"model.toml": first.model})
+        for entry in batch:
+            self._recorder.write(entry.records(), entry.time_utc_ns, state=entry.state, sync=entry is batch[-1])

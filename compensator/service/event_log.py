@@ -1,0 +1,57 @@
+"""The events of a service: numbered, published at once, and kept until the next sample takes them to disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from compensator.clock import Clock
+from compensator.events import EventKind
+from compensator.messages import SCHEMA, Event, encode
+
+#: Largest number of events that wait for the disk; the newest are kept.
+WAITING_EVENTS = 1000
+
+
+class EventLog:
+    """Events of one machine.
+
+    Parameters
+    ----------
+    machine : str
+        Name of the machine.
+    publish : callable
+        Publishes a message by name and JSON; never waits.
+    clock : Clock
+        For their time.
+    sequence : int
+        Number of the first sample.
+    """
+
+    def __init__(self, machine: str, publish: Callable[[str, bytes], None], clock: Clock, sequence: int) -> None:
+        self._machine = machine
+        self._publish = publish
+        self._clock = clock
+        self._events: list[Event] = []
+        #: Number of the current sample; events carry it.
+        self.sequence = sequence
+
+    def note(self, kind: EventKind, text: str, data: Mapping[str, Any] | None = None) -> None:
+        """Publish an event and keep it for the recording."""
+        event = Event(
+            schema=SCHEMA,
+            machine=self._machine,
+            seq=self.sequence,
+            time_utc_ns=self._clock.utc_ns(),
+            kind=kind,
+            text=text,
+            data=dict(data or {}),
+        )
+        # Bounded, so that a loop that cannot record costs no memory.
+        self._events = [*self._events[1 - WAITING_EVENTS :], event]
+        self._publish("event", encode(event))
+
+    def drain(self) -> list[Event]:
+        """Return the events since the last call."""
+        events, self._events = self._events, []
+        return events
