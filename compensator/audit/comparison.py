@@ -20,7 +20,7 @@ from compensator.recording.reading import in_order
 from compensator.remarks import AuditRemark
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome, slowest_min
-from compensator.service.replay import FreeRun, Step, setup_of, steps_in
+from compensator.service.replay import FreeRun, RecordedStep, setup_of, steps_in
 from compensator.service.status import Zero
 
 #: Columns of the table of both offsets.
@@ -158,7 +158,7 @@ class _Run:
         self._names: dict[str, None] = {}
         self._result = Comparison("", model.name, Spread(), Spread(), Spread(), Spread(), Spread(), 0, [])
 
-    def add(self, step: Step, contents: Contents) -> None:
+    def add(self, step: RecordedStep, contents: Contents) -> None:
         """Run one group."""
         estimate, offset = step.estimate, step.offset
         if self._free is None and (step.sample is None or estimate is None):
@@ -167,7 +167,7 @@ class _Run:
         if isinstance(result, Outcome) and estimate is not None and offset is not None:
             self._compare(estimate, offset, result)
 
-    def _ready(self, step: Step, contents: Contents, estimate: EstimateMessage | None) -> FreeRun:
+    def _ready(self, step: RecordedStep, contents: Contents, estimate: EstimateMessage | None) -> FreeRun:
         """Return the run with the other model and the configuration of the file."""
         parts = [contents.attachments.get(name) for name in ("config.toml", "model.toml")]
         data, model = (part.data if part else b"" for part in parts)
@@ -186,7 +186,7 @@ class _Run:
             self._begin(self._free.compensation, step, estimate)
         return self._free
 
-    def _begin(self, compensation: Compensation, step: Step, estimate: EstimateMessage) -> None:
+    def _begin(self, compensation: Compensation, step: RecordedStep, estimate: EstimateMessage) -> None:
         """Begin with the recorded zero where the first sample sets none."""
         zero = any(event.kind == EventKind.ZERO for event in step.events)
         if estimate.t_q_ref_degc is None or estimate.at_ref_degc is None or zero:

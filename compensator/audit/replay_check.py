@@ -16,7 +16,7 @@ from compensator.reasons import Reason
 from compensator.recording.container import Contents
 from compensator.recording.reading import Record
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.replay import Step, apply, setup_of, step_of
+from compensator.service.replay import RecordedStep, apply, setup_of, step_of
 
 #: Reasons that the disk gives: only the offset itself shows that it was published before it was on disk.
 _DISK_REASONS = tuple((reason, f'"{reason}"'.encode()) for reason in (Reason.RECORDING_FAILED, Reason.RECORDING_LATE))
@@ -94,7 +94,7 @@ class ReplayCheck:
                 result.early_seqs.add(data.published_early)
             result.removed += data.removed[:_REMOVED]
 
-    def _compare(self, step: Step, outcome: Outcome) -> None:
+    def _compare(self, step: RecordedStep, outcome: Outcome) -> None:
         """Compare the messages of a sample; what differs first is enough."""
         result, sample, records = self._result, outcome.sample, step.records
         if result.samples:

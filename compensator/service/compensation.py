@@ -21,7 +21,13 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Reason, SampleQuality, State
 from compensator.service.decision import Decision, OffsetDecision, mean
 from compensator.service.outcome import Outcome, Values, estimate_message
-from compensator.service.plausibility import HEATED_W, Evidence, PlausibilityCheck, PlausibilityState, SensorGuards
+from compensator.service.plausibility import (
+    HEATED_W,
+    PlausibilityCheck,
+    PlausibilityState,
+    SensorEvidence,
+    SensorGuards,
+)
 from compensator.service.state import (
     STATE_SCHEMA,
     CompensationState,
@@ -291,7 +297,7 @@ class Compensation:
             notes=tuple(notes),
         )
 
-    def _evidence(self, raw: Sample, values: Values, estimate: Estimate | None, y_pred: float) -> Evidence:
+    def _evidence(self, raw: Sample, values: Values, estimate: Estimate | None, y_pred: float) -> SensorEvidence:
         """Return what the checks between the sensors use."""
         t_q, at = (
             number(channel.mean) if channel is not None and channel.device_quality == SampleQuality.GOOD else NAN
@@ -301,7 +307,7 @@ class Compensation:
         rest = self._config.plausibility.rest if self._config.plausibility is not None else None
         # A prediction without both temperatures, or from an unknown state, proves nothing about a sensor.
         usable = not math.isnan(values.t_q + values.at) and self._memory.cold_min <= 0.0
-        return Evidence(
+        return SensorEvidence(
             below_k=at - t_q,
             apart_k=(values.t_q - reference.t_q_degc) - (values.at - reference.at_degc),
             rest=values.others.get(rest.channel, NAN) if rest is not None else NAN,

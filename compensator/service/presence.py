@@ -16,7 +16,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import zenoh
@@ -106,7 +105,7 @@ def _opened(path: Path) -> int:
 
 
 @contextmanager
-def sole_voice(settings: Zenoh) -> Iterator[None]:
+def sole_publisher(settings: Zenoh) -> Iterator[None]:
     """Ensure that no other service of this prefix is alive; the block declares the own token.
 
     If no router is reached nothing is known about others, and compensation starts all the same.
@@ -137,7 +136,7 @@ def sole_voice(settings: Zenoh) -> Iterator[None]:
         yield
 
 
-def _reached(settings: Zenoh) -> Any:
+def _reached(settings: Zenoh) -> zenoh.Session:
     """Open a session; retry a router that a whole shop asks at once.
 
     A client without its router is retried by the publisher.
@@ -159,7 +158,7 @@ def _client_config(settings: Zenoh) -> zenoh.Config:
     return config
 
 
-def _claim(session: Any, prefix: str) -> Any:
+def _claim(session: zenoh.Session, prefix: str) -> zenoh.LivelinessToken:
     """Return the token of a starting service, if none is alive and no other was first."""
     key = f"{prefix}/thermal/alive"
     end = time.monotonic() + STALE_S
@@ -173,11 +172,11 @@ def _claim(session: Any, prefix: str) -> Any:
     time.sleep(SHOWN_S)
     first = min([own, *_tokens(session, f"{others}/*")])
     if first != own or _tokens(session, key):
-        candidate.undeclare()
+        candidate.undeclare()  # type: ignore[no-untyped-call]
         raise ServiceError(f"{key}: another service started at the same moment and continues; this one ends")
     return candidate
 
 
-def _tokens(session: Any, key: str) -> list[str]:
+def _tokens(session: zenoh.Session, key: str) -> list[str]:
     replies = session.liveliness().get(key, timeout=ANSWER_S)
     return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]

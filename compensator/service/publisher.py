@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import ExitStack
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import zenoh
 
@@ -22,7 +22,7 @@ from compensator.errors import ServiceError
 from compensator.events import CommandName
 from compensator.reasons import Remark
 from compensator.remarks import ServiceWarning
-from compensator.service.presence import sole_voice
+from compensator.service.presence import sole_publisher
 from compensator.service.session import in_words, log_links, session_config
 
 log = logging.getLogger("compensator")
@@ -80,6 +80,12 @@ UNNAMED = Sender()
 CommandHandler = Callable[[str, bytes, Sender], Reply]
 
 
+class _Declared(Protocol):
+    """A token or queryable of a session."""
+
+    def undeclare(self) -> None: ...
+
+
 class Publisher:
     """The service's side of Zenoh. Use it as a context manager: an open session would hang the exit.
 
@@ -100,9 +106,9 @@ class Publisher:
         self._settings = settings
         self._on_command = on_command
         self._latest: dict[str, bytes] = {}
-        self._session: Any = None
-        self._publishers: dict[str, Any] = {}
-        self._declared: list[Any] = []
+        self._session: zenoh.Session | None = None
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._declared: list[_Declared] = []
         self._closing = threading.Event()
         self._waiting: threading.Thread | None = None
 
@@ -130,10 +136,12 @@ class Publisher:
     def _begin(self) -> None:
         with ExitStack() as unfinished:  # if a step fails everything is undone, and retried as a whole
             # First: nothing may be published or answered in the name of a machine that has its service already.
-            with sole_voice(self._settings):
+            with sole_publisher(self._settings):
                 session = zenoh.open(session_config(self._settings))
                 unfinished.callback(session.close)
-                declared: list[Any] = [session.liveliness().declare_token(f"{self._settings.prefix}/thermal/alive")]
+                declared: list[_Declared] = [
+                    session.liveliness().declare_token(f"{self._settings.prefix}/thermal/alive")
+                ]
             publishers = {name: self._publisher(session, name) for name in _KEYS}
             for name in ("offset", "status", "sample", "estimate"):
                 declared.append(session.declare_queryable(self.key(name), self._answer_latest(name)))
@@ -145,7 +153,7 @@ class Publisher:
         self._publishers, self._declared = publishers, declared
         self._session = session  # last: from here on other threads publish
 
-    def _publisher(self, session: Any, name: str) -> Any:
+    def _publisher(self, session: zenoh.Session, name: str) -> zenoh.Publisher:
         return session.declare_publisher(
             self.key(name),
             encoding=zenoh.Encoding.APPLICATION_JSON,
@@ -188,7 +196,7 @@ class Publisher:
             return
         for declared in self._declared:
             declared.undeclare()
-        session.close()
+        session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Publisher:
         self.open()
@@ -197,8 +205,8 @@ class Publisher:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _answer_latest(self, name: str) -> Callable[[Any], None]:
-        def answer(query: Any) -> None:
+    def _answer_latest(self, name: str) -> Callable[[zenoh.Query], None]:
+        def answer(query: zenoh.Query) -> None:
             with query:
                 data = self._latest.get(name)
                 if data is not None:
@@ -206,16 +214,16 @@ class Publisher:
 
         return answer
 
-    def _answer_command(self, name: str) -> Callable[[Any], None]:
-        def send(query: Any, key: str, reply: dict[str, Any]) -> None:
+    def _answer_command(self, name: str) -> Callable[[zenoh.Query], None]:
+        def send(query: zenoh.Query, key: str, reply: dict[str, Any]) -> None:
             with query:
                 query.reply(key, json.dumps(reply).encode(), encoding=zenoh.Encoding.APPLICATION_JSON)
 
-        def answer(query: Any) -> None:
+        def answer(query: zenoh.Query) -> None:
             key = str(query.key_expr)
             sender = self._sender(name, key)
             if sender is None:
-                query.drop()
+                query.drop()  # type: ignore[no-untyped-call]
                 return
             payload = query.payload.to_bytes() if query.payload is not None else b""
             reply = self._on_command(name, payload, sender)

@@ -40,7 +40,7 @@ _ESTIMATE, _OFFSET = msgspec.json.Decoder(EstimateMessage), msgspec.json.Decoder
 
 
 @dataclass(slots=True)
-class Step:
+class RecordedStep:
     """One recorded group: a sample and what followed from it, or an offset that was held without a sample.
 
     Parameters
@@ -85,7 +85,7 @@ class Step:
         return None if estimate is None else "rest" if estimate.y_base_um == 0.0 else "warm"
 
 
-def step_of(records: Sequence[Record], contents: Contents, file: str) -> Step:
+def step_of(records: Sequence[Record], contents: Contents, file: str) -> RecordedStep:
     """Read one group of records.
 
     Raises
@@ -100,10 +100,10 @@ def step_of(records: Sequence[Record], contents: Contents, file: str) -> Step:
         else:
             found[record.topic] = record
     sample = decode_with(_SAMPLE, found["sample"], file) if "sample" in found else None
-    return Step(file, contents.metadata.get("run", {}), found, events, sample)
+    return RecordedStep(file, contents.metadata.get("run", {}), found, events, sample)
 
 
-def steps_in(container: Container) -> Iterator[Step]:
+def steps_in(container: Container) -> Iterator[RecordedStep]:
     """Yield the groups of a recording as far as it can be read; what is complete in a torn group comes last.
 
     Raises
@@ -117,7 +117,7 @@ def steps_in(container: Container) -> Iterator[Step]:
                 yield step_of(records, container.contents, container.path.name)
 
 
-def steps_of(path: Path) -> Iterator[Step]:
+def steps_of(path: Path) -> Iterator[RecordedStep]:
     """Yield the groups of a recording, see `steps_in`."""
     with Container(path) as container:
         yield from steps_in(container)
@@ -173,7 +173,7 @@ def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) ->
 
 
 def apply(
-    compensation: Compensation, step: Step, *, commands: bool = True, since: int | None = None
+    compensation: Compensation, step: RecordedStep, *, commands: bool = True, since: int | None = None
 ) -> Outcome | Offset | None:
     """Do what the service did with one recorded group: commands and errors of its number, then the sample.
 
@@ -181,7 +181,7 @@ def apply(
     ----------
     compensation : Compensation
         In the state before the group.
-    step : Step
+    step : RecordedStep
         The group.
     commands : bool
         Whether commands and errors count.
@@ -254,7 +254,7 @@ class FreeRun:
         #: Offset before a sample of a torn end, whose own offset was not published.
         self._before_torn_um: float | None = None
 
-    def run(self, step: Step, *, commands: bool = True) -> Outcome | Offset | None:
+    def run(self, step: RecordedStep, *, commands: bool = True) -> Outcome | Offset | None:
         """Run the next group, after the pause before it; see `apply`.
 
         Raises
@@ -286,14 +286,14 @@ class FreeRun:
             self.seq, self.time_ns = result.seq, result.time_utc_ns
         return result
 
-    def _pass_pause(self, step: Step, sample: Sample) -> None:
+    def _pass_pause(self, step: RecordedStep, sample: Sample) -> None:
         if self._file not in (step.run.get("file", step.file), step.run.get("previous_file")):
             self.compensation.pause(round((sample.time_utc_ns - self.time_ns) / (sample.period_s * NS)) - 1)
             return
         if not self._pass_noted_pause(step, sample.seq):
             self.compensation.pause(sample.seq - self.seq - 1)
 
-    def _pass_noted_pause(self, step: Step, seq: int) -> bool:
+    def _pass_noted_pause(self, step: RecordedStep, seq: int) -> bool:
         """Pass the pause that a start has noted, and return whether there is one."""
         pauses = ((event, data_of(event, PauseData)) for event in step.events if event.kind == EventKind.RESTART)
         for event, pause in pauses:

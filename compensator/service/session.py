@@ -165,13 +165,13 @@ def files_of(source: Path, tls: dict[str, str], side: str) -> TlsFiles:
     )
 
 
-def log_links(session: Any, endpoints: Sequence[str]) -> None:
+def log_links(session: zenoh.Session, endpoints: Sequence[str]) -> None:
     """Log when a link is established or lost, and once if there is none yet.
 
     Without this, a certificate that the router refuses looks like a running service.
     """
 
-    def log_event(event: Any) -> None:
+    def log_event(event: zenoh.TransportEvent) -> None:
         established = event.kind == zenoh.SampleKind.PUT
         kind = str(event.transport.whatami).rpartition(".")[2].lower()
         who = f"zenoh: {kind} {event.transport.zid}"

@@ -16,7 +16,7 @@ from compensator.config import parse_config
 from compensator.errors import ConfigError
 from compensator.messages import encode, number
 from compensator.service.compensation import Compensation, Outcome
-from compensator.service.plausibility import BLOCK_SAMPLES, Evidence, PlausibilityCheck, PlausibilityState
+from compensator.service.plausibility import BLOCK_SAMPLES, PlausibilityCheck, PlausibilityState, SensorEvidence
 from compensator.service.state import decode_state
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.service.records import QUILL, sample
@@ -176,9 +176,11 @@ def test_false_alarms_come_as_rarely_as_stated() -> None:
     for e in (math.sqrt(1.0 - keep * keep) * random.normal(size=blocks)).tolist():
         z = keep * z + e
         check.state.sums, check.state.used = ((BLOCK_SAMPLES - 1) * z * std, (BLOCK_SAMPLES - 1) * std**2, 0.0), 9
-        check.state.taken = BLOCK_SAMPLES - 1
+        check.state.samples = BLOCK_SAMPLES - 1
         check._check_residual(
-            Evidence(below_k=0.0, apart_k=0.0, rest=0.0, residual_um=z * std, std_um=QUILL.y_std_um, predicted_um=0.0)
+            SensorEvidence(
+                below_k=0.0, apart_k=0.0, rest=0.0, residual_um=z * std, std_um=QUILL.y_std_um, predicted_um=0.0
+            )
         )
         if check.reasons:
             alarms += 1

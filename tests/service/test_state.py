@@ -214,3 +214,12 @@ def test_a_pause_is_walked_over_and_the_uncertainty_grows_with_it() -> None:
         assert "cold_start" not in b.offset.reasons
         assert not math.isnan(b.offset.y_offset_um)
     assert stds == sorted(stds)
+
+
+def test_the_checks_keep_the_names_of_their_state() -> None:
+    """State files of earlier versions have these names."""
+    compensation = Compensation(config(plausibility={"t_q_below_at_after_min": 30.0}), QUILL)
+    names = json.loads(compensation.state())["plausibility"].keys()
+    assert " ".join(names) == (
+        "below_min exchanged rest_min apart taken used sums blocks z skipped high low suspects accused calm"
+    )

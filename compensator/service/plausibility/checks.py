@@ -21,15 +21,17 @@ Basseville and Nikiforov (1993), chapter 8, for whitening first.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from compensator.arrays import NAN
 from compensator.config import Config, Plausibility
 from compensator.events import EventKind, Implausibility, Note
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Reason
-from compensator.service.plausibility.isolation import LOG_ODDS, Block, FaultIsolation, Fit
+from compensator.service.plausibility.isolation import LOG_ODDS, FaultFit, FaultIsolation, ResidualBlock
 
 #: Samples in a block of the residual: single minutes after a heat step say nothing about a sensor.
 BLOCK_SAMPLES = 10
@@ -42,15 +44,18 @@ _SHIFT = 5.0
 #: An innovation is clipped at this many of its standard deviations: a few minutes of outliers raise no alarm.
 _CLIP = 3.0
 #: The alarm ends after this number of consecutive blocks within this number of standard deviations.
-CALM_BLOCKS = 6
-_CALM = 2.0
+QUIET_BLOCKS = 6
+_QUIET = 2.0
 #: Mean excess of a Gaussian random walk over a boundary, in its standard deviations (Siegmund).
 _EXCESS = 1.166
 _DAY_MIN = 1440.0
 
 
-@dataclass(slots=True)
-class PlausibilityState:
+#: Names in the state file; states of earlier versions have them too.
+_STORED = {"samples": "taken", "blocks_in_alarm": "accused", "quiet_blocks": "calm"}
+
+
+class PlausibilityState(msgspec.Struct, kw_only=True, rename=_STORED):
     """What the checks remember.
 
     Parameters
@@ -63,11 +68,11 @@ class PlausibilityState:
         For how long nothing has heated the machine, min.
     apart : bool
         Whether T_Q and AT were apart at the last rest.
-    taken, used : int
+    samples, used : int
         Samples in the current block, and the usable ones among them.
     sums : tuple of three floats
         Residual, its variance and the prediction, summed over the usable ones.
-    blocks : list of Block
+    blocks : list of ResidualBlock
         The last blocks, the newest last.
     z : float
         Residual of the last usable block in standard deviations; NaN before the first.
@@ -77,31 +82,31 @@ class PlausibilityState:
         The two CUSUMs.
     suspects : list of str
         Likely causes of the alarm; empty without an alarm.
-    accused : int
+    blocks_in_alarm : int
         Blocks since the alarm.
-    calm : int
-        Quiet blocks in a row since then.
+    quiet_blocks : int
+        Consecutive blocks since then whose residual is small again.
     """
 
     below_min: float = 0.0
     exchanged: bool = False
     rest_min: float = 0.0
     apart: bool = False
-    taken: int = 0
+    samples: int = 0
     used: int = 0
     sums: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    blocks: list[Block] = field(default_factory=list)
+    blocks: list[ResidualBlock] = []
     z: float = NAN
     skipped: int = 0
     high: float = 0.0
     low: float = 0.0
-    suspects: list[str] = field(default_factory=list)
-    accused: int = 0
-    calm: int = 0
+    suspects: list[str] = []
+    blocks_in_alarm: int = 0
+    quiet_blocks: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Evidence:
+class SensorEvidence:
     """One sample, as the checks use it; NaN where something cannot be used.
 
     Parameters
@@ -191,7 +196,7 @@ class PlausibilityCheck:
         )
         return "; ".join(parts)
 
-    def update(self, evidence: Evidence) -> list[Note]:
+    def update(self, evidence: SensorEvidence) -> list[Note]:
         """Check one sample; return its events."""
         self._notes = []
         self._check_exchanged(evidence.below_k)
@@ -239,7 +244,7 @@ class PlausibilityCheck:
         """Account for samples that were not measured."""
         self.state.rest_min = 0.0
         if self._watched:
-            nothing = Evidence(below_k=NAN, apart_k=NAN, rest=NAN, residual_um=NAN, std_um=NAN, predicted_um=NAN)
+            nothing = SensorEvidence(below_k=NAN, apart_k=NAN, rest=NAN, residual_um=NAN, std_um=NAN, predicted_um=NAN)
             for _ in range(min(samples, WINDOW * BLOCK_SAMPLES)):
                 self._check_residual(nothing)
 
@@ -258,7 +263,7 @@ class PlausibilityCheck:
                 minutes=state.below_min,
             )
 
-    def _check_rest(self, evidence: Evidence) -> None:
+    def _check_rest(self, evidence: SensorEvidence) -> None:
         rest, state = self._limits.rest, self.state
         if rest is None or math.isnan(evidence.rest):
             return
@@ -278,9 +283,9 @@ class PlausibilityCheck:
             self._note(Implausibility.TOGETHER, "T_Q and AT have come together at rest")
         state.apart = apart
 
-    def _check_residual(self, evidence: Evidence) -> None:
+    def _check_residual(self, evidence: SensorEvidence) -> None:
         state = self.state
-        state.taken += 1
+        state.samples += 1
         if not math.isnan(evidence.residual_um) and not math.isnan(evidence.std_um):
             residual, variance, predicted = state.sums
             extra = evidence.std_um * evidence.std_um - self._model_std_um * self._model_std_um
@@ -290,18 +295,18 @@ class PlausibilityCheck:
                 predicted + evidence.predicted_um,
             )
             state.used += 1
-        if state.taken < BLOCK_SAMPLES:
+        if state.samples < BLOCK_SAMPLES:
             return
         n, (residual, variance, predicted) = state.used, state.sums
         if n >= _USABLE * BLOCK_SAMPLES:
-            block = Block(residual / n, math.sqrt(variance / n), predicted / n)
+            block = ResidualBlock(residual / n, math.sqrt(variance / n), predicted / n)
         else:
-            block = Block(NAN, 1.0, NAN)
-        state.taken, state.used, state.sums = 0, 0, (0.0, 0.0, 0.0)
+            block = ResidualBlock(NAN, 1.0, NAN)
+        state.samples, state.used, state.sums = 0, 0, (0.0, 0.0, 0.0)
         state.blocks = [*state.blocks[-WINDOW + 1 :], block]
         self._update_cusum(block)
 
-    def _update_cusum(self, block: Block) -> None:
+    def _update_cusum(self, block: ResidualBlock) -> None:
         state = self.state
         if math.isnan(block.residual_um):
             state.skipped += 1
@@ -318,18 +323,18 @@ class PlausibilityCheck:
         state.low = max(0.0, state.low - e - self._allowance)
         state.z, state.skipped = z, 0
         if state.suspects:
-            state.calm = state.calm + 1 if abs(z) < _CALM else 0
-            if state.calm >= CALM_BLOCKS:
-                state.suspects, state.high, state.low, state.calm, state.accused = [], 0.0, 0.0, 0, 0
+            state.quiet_blocks = state.quiet_blocks + 1 if abs(z) < _QUIET else 0
+            if state.quiet_blocks >= QUIET_BLOCKS:
+                state.suspects, state.high, state.low, state.quiet_blocks, state.blocks_in_alarm = [], 0.0, 0.0, 0, 0
                 self._note(Implausibility.RESIDUAL_OVER, "measured and predicted Y agree again")
                 return
         if state.suspects or max(state.high, state.low) > self.threshold:
             self._isolate(block)
 
-    def _isolate(self, block: Block) -> None:
+    def _isolate(self, block: ResidualBlock) -> None:
         """Find the likely causes; every further block may improve this until the onset leaves the window."""
-        self.state.accused += 1
-        if self.state.accused > WINDOW // 2:
+        self.state.blocks_in_alarm += 1
+        if self.state.blocks_in_alarm > WINDOW // 2:
             return
         ranked, misfit = self._isolation.fits(self.state.blocks)
         named = [fit for fit in ranked if fit.gain >= ranked[0].gain - LOG_ODDS]
@@ -345,7 +350,7 @@ class PlausibilityCheck:
             std_um=block.std_um,
         )
 
-    def _describe_alarm(self, block: Block, named: list[Fit], misfit: bool) -> str:
+    def _describe_alarm(self, block: ResidualBlock, named: list[FaultFit], misfit: bool) -> str:
         words = [f"{fit.words} since {self._ago(fit)}" if fit.suspect != "model" else fit.words for fit in named]
         if misfit:
             words.append("none of this fits well: something acts that the model does not know")
@@ -354,7 +359,7 @@ class PlausibilityCheck:
             + ", or ".join(words)
         )
 
-    def _ago(self, fit: Fit) -> str:
+    def _ago(self, fit: FaultFit) -> str:
         return f"{fit.blocks_ago * BLOCK_SAMPLES * self._period_min:g} min"
 
     def _note(self, code: Implausibility, text: str, **data: Any) -> None:

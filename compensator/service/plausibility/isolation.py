@@ -32,7 +32,7 @@ _HOUR_MIN = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class ResidualBlock:
     """Mean of a few samples.
 
     Parameters
@@ -51,7 +51,7 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class FaultFit:
     """How well one shape explains a residual.
 
     Parameters
@@ -100,17 +100,17 @@ class FaultIsolation:
         self._keep = keep
         self._hours = block_samples * model.period_s / 3600.0
 
-    def fits(self, blocks: Sequence[Block]) -> tuple[list[Fit], bool]:
+    def fits(self, blocks: Sequence[ResidualBlock]) -> tuple[list[FaultFit], bool]:
         """Return the best fit of each suspect, the likeliest first, and whether even that one fits badly.
 
         Parameters
         ----------
-        blocks : sequence of Block
+        blocks : sequence of ResidualBlock
             The newest last.
         """
         z = [block.residual_um / block.std_um for block in blocks]
         candidates = [self._starting_at(begin, blocks, z) for begin in range(len(blocks) - 1)]
-        best: dict[str, Fit] = {}
+        best: dict[str, FaultFit] = {}
         for fit in [fit for each in candidates for fit in each] + [self._as_prediction(blocks, z)]:
             if fit.suspect not in best or fit.gain > best[fit.suspect].gain:
                 best[fit.suspect] = fit
@@ -119,7 +119,7 @@ class FaultIsolation:
         left = 2.0 * (energy - ranked[0].gain) if ranked else 0.0
         return ranked, count > 0 and left > MISFIT * count
 
-    def _starting_at(self, begin: int, blocks: Sequence[Block], z: Sequence[float]) -> list[Fit]:
+    def _starting_at(self, begin: int, blocks: Sequence[ResidualBlock], z: Sequence[float]) -> list[FaultFit]:
         fits = []
         for shape in self._shapes:
             v = [0.0] * begin + [
@@ -127,14 +127,14 @@ class FaultIsolation:
             ]
             size, gain = _fitted(z, v, self._keep)
             words = f"{shape.what} by {size:+.2g} {shape.unit}"
-            fits.append(Fit(shape.suspect, words, len(blocks) - begin, gain))
+            fits.append(FaultFit(shape.suspect, words, len(blocks) - begin, gain))
         return fits
 
-    def _as_prediction(self, blocks: Sequence[Block], z: Sequence[float]) -> Fit:
+    def _as_prediction(self, blocks: Sequence[ResidualBlock], z: Sequence[float]) -> FaultFit:
         v = [block.predicted_um / block.std_um for block in blocks]
         size, gain = _fitted(z, v, self._keep)
         words = f"measured Y is {1.0 + size:.2f} times the prediction"
-        return Fit("model", words, len(blocks), gain)
+        return FaultFit("model", words, len(blocks), gain)
 
     @cached_property
     def _shapes(self) -> tuple[_Shape, ...]:

@@ -22,7 +22,7 @@ from compensator.messages import EstimateMessage
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import decode, read_messages, recordings
 from compensator.service.compensation import Compensation, Outcome, slowest_min
-from compensator.service.replay import FreeRun, Step, opening_of, steps_of
+from compensator.service.replay import FreeRun, RecordedStep, opening_of, steps_of
 from compensator.service.state import decode_state
 from compensator.service.status import Zero
 
@@ -102,7 +102,7 @@ def warm_up(
     names = {channel.name for channel in config.channel}
     first_ns, samples, newest = 0, 0, zero
 
-    def run(step: Step) -> None:
+    def run(step: RecordedStep) -> None:
         nonlocal first_ns, samples, newest
         if step.sample is not None:
             if step.zero is not None:
@@ -141,7 +141,7 @@ class _Window:
     zero: Zero
     files: list[Path]
     from_ns: int
-    at_rest: Step | None = None
+    at_rest: RecordedStep | None = None
 
 
 def _window(folder: Path, machine: str, slowest: float, between_samples: Callable[[], None]) -> _Window:

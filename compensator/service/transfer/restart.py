@@ -21,7 +21,7 @@ from compensator.reasons import Reason
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.offset_checkpoint import CheckpointedOffset
-from compensator.service.replay import Step, apply, opening_of, steps_of
+from compensator.service.replay import RecordedStep, apply, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
 from compensator.service.status import Handover
 from compensator.service.transfer.candidate import warm_up
@@ -75,7 +75,7 @@ class _LastFile:
             internal_error=state.memory.internal_error,
         )
 
-    def add(self, step: Step) -> float:
+    def add(self, step: RecordedStep) -> float:
         """Follow one group; return the offset that was published with it, µm, NaN where none was."""
         self.samples += step.sample is not None
         offset_um, held, failed = self.handover.offset_um, self.handover.operator_hold, self.handover.internal_error
