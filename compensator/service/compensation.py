@@ -44,9 +44,9 @@ __all__ = ["Compensation", "Outcome", "slowest_min"]
 #: Number of samples over which rate and heat are averaged before they decide anything.
 MEAN_SAMPLES = 5
 
-#: Longest pause that is passed over, in samples: a longer one would delay the sample after it.
+#: Longest pause that is simulated, in samples: a longer one would delay the sample after it.
 MOST_BRIDGED = 1500
-#: After how many slowest time constants an unknown initial state counts as known (5 % are left then).
+#: An unknown initial state counts as known after this many slowest time constants: 5 % of its error are left.
 KNOWN_AFTER = 3.0
 
 
@@ -109,11 +109,11 @@ class Compensation:
                 self._pass_cold(self._cold_samples)
 
     def fail(self) -> None:
-        """Hold the offset because of an internal error."""
+        """Hold the offset because of an internal error, until `resume`."""
         self._memory.internal_error = True
 
     def held(self, machine: str, seq: int, time_utc_ns: int) -> Offset:
-        """Return the message that the last offset is held, for a sample that could not be processed."""
+        """Return the message for a sample that could not be processed: the last offset is held."""
         known = self._memory.estimate is not None
         limited = self._limiter.hold() if known else None
         decision = Decision(State.HOLD if known else State.FAULT, [Reason.INTERNAL_ERROR], limited)
@@ -123,7 +123,7 @@ class Compensation:
 
     @property
     def status(self) -> CompensationStatus:
-        """What holds after the last sample."""
+        """Zero, target and handover after the last sample."""
         memory, zero, estimate = self._memory, self._zero, self._memory.estimate
         return CompensationStatus(
             seq=memory.seq,
@@ -169,37 +169,38 @@ class Compensation:
         Raises
         ------
         DataError
-            If it is no state, or that of another model or of other channels; then nothing is changed.
+            If it cannot be read, or belongs to another model or other channels; then nothing is changed.
         """
-        whole = decode_state(state)
+        restored = decode_state(state)
         for name, found, expected in (
-            ("model_sha256", whole.model_sha256, self.model.sha256),
-            ("alternative", whole.alternative, self._config.model.alternative),
-            ("guards", sorted(whole.guards), sorted(self._guards.snapshot())),
+            ("model_sha256", restored.model_sha256, self.model.sha256),
+            ("alternative", restored.alternative, self._config.model.alternative),
+            ("guards", sorted(restored.guards), sorted(self._guards.snapshot())),
         ):
             if found != expected:
                 raise DataError(f"state: {name} = {found!r}, expected {expected!r}")
         engine = Engine(self.model)
         try:
-            engine.check(whole.engine)
-            engine.restore(whole.engine)
+            engine.check(restored.engine)
+            engine.restore(restored.engine)
         except ValueError as error:
             raise DataError(f"state: {error}") from error
-        estimate = whole.memory.estimate
+        estimate = restored.memory.estimate
         if estimate is not None and len(estimate.y_effects_um) != len(self.model.effects):
             raise DataError(f"state: estimate of {len(estimate.y_effects_um)} effects")
-        self._engine, self._zero, self._memory = engine, whole.zero, whole.memory
-        self._guards.restore(whole.guards)
-        self._limiter.offset_um = whole.offset_um
+        self._engine, self._zero, self._memory = engine, restored.zero, restored.memory
+        self._guards.restore(restored.guards)
+        self._limiter.offset_um = restored.offset_um
         # A state from a version without these checks has none of theirs.
-        self.plausibility.state = whole.plausibility or PlausibilityState()
+        self.plausibility.state = restored.plausibility or PlausibilityState()
 
     def pause(self, samples: int | None) -> None:
         """Pass over samples that were not measured, such as those while the service did not run.
 
-        They count as missing: the prediction continues and its standard deviation grows, and the next sample with both
+        They count as missing: the prediction continues, its standard deviation grows, and the next sample with both
         temperatures interpolates them. After more than `bridge_max_min` the state is unknown: the machine is assumed
-        to have been all the time as it is found, and the reason `cold_start` stays until that is forgotten.
+        to have been in its present condition throughout, and the reason `cold_start` remains until the error of that
+        assumption has decayed.
 
         Parameters
         ----------
@@ -305,7 +306,7 @@ class Compensation:
         )
         reference = self._engine.reference
         rest = self._config.plausibility.rest if self._config.plausibility is not None else None
-        # A prediction without both temperatures, or from an unknown state, proves nothing about a sensor.
+        # A prediction without both temperatures, or from an unknown state, is no evidence against a sensor.
         usable = not math.isnan(values.t_q + values.at) and self._memory.cold_min <= 0.0
         return SensorEvidence(
             below_k=at - t_q,

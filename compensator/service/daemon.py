@@ -31,10 +31,10 @@ from drivers.reading import Device
 
 log = logging.getLogger("compensator")
 
-#: How long the loop blocks for the disk: a fraction of the poll interval, so that no poll is late, and a limit in s.
+#: How long the loop waits for the disk: a fraction of the poll interval, so that no poll is late, and a limit in s.
 DISK_PART, DISK_S = 0.4, 2.0
 #: How long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
-#: and a limit in s. An offset of that age does no harm, its rate is published with it; one not on record might.
+#: and a limit in s. An offset of that age is usable, since its rate is published with it.
 PATIENCE_PART, PATIENCE_S = 0.25, 15.0
 
 
@@ -53,7 +53,7 @@ class Latency:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Decided:
-    """A sample that is decided and on its way to the disk; `began` is when its processing began, s."""
+    """A sample whose outcome is on its way to the disk; `began` is when its processing began, s."""
 
     outcome: Outcome
     entry: Entry
@@ -128,12 +128,12 @@ class Daemon:
         self._last_state = ""
         #: Outcomes that were published and not reported to the caller yet.
         self._unreported: list[Outcome] = []
-        #: A sample that is decided and waits for the disk while polling continues.
+        #: A sample that waits for the disk while polling continues.
         self._pending: asyncio.Task[None] | None = None
         self._earlier = notes
         self._first = True
-        #: Whether processing a sample failed half-way, so that its file cannot give the state after it.
-        self._broken_off = False
+        #: Whether the processing of a sample failed midway, so that its file cannot reproduce the state after it.
+        self._failed_midway = False
         self.latency = Latency()
 
     async def run(
@@ -225,13 +225,13 @@ class Daemon:
     # ------------------------------------------------------------------ one sample
 
     async def _sample(self, label_ns: int) -> None:
-        """Decide; publish once it is on disk, and continue polling if that takes long."""
+        """Process a sample and publish it once it is on disk; polling continues if that takes long."""
         await self._await_pending()
         began = time.perf_counter()
         self._pass_pause(label_ns)
         self._compensation = self._adoption.swap()
-        state, broke_off = self._compensation.state(), self._broken_off
-        self._broken_off = True
+        state, failed_midway = self._compensation.state(), self._failed_midway
+        self._failed_midway = True
         self._commands.apply(self._compensation)
         raw = Sample(
             schema=SCHEMA,
@@ -242,8 +242,8 @@ class Daemon:
             channels=self._sampler.close_sample(),
         )
         outcome = self._compensation.process(raw)
-        self._broken_off = False
-        if broke_off:  # once for all consecutive samples that failed
+        self._failed_midway = False
+        if failed_midway:  # once for all consecutive samples that failed
             self._journal.start_new_file()
         for note in outcome.notes:
             self._events.note(*note)

@@ -40,9 +40,9 @@ class Journal:
     clock : Clock
         Waits, and dates the end.
     limit_s : float
-        So long the loop blocks for the disk, s.
+        How long the loop waits for the disk, s.
     patience_s : float
-        So long an offset waits for the disk while polling continues, s; not if the previous one was late already.
+        How long an offset waits for the disk while polling continues, s; not if the previous one was late already.
     checkpoint : OffsetCheckpoint, optional
         Keeps an offset that is published before it is on disk.
     """
@@ -110,7 +110,7 @@ class Journal:
         return entry
 
     async def wait_briefly(self, entry: Entry) -> bool:
-        """Block for the disk; return whether longer waiting would be useless."""
+        """Wait while polling stands still; return whether longer waiting would be useless."""
         await self._clock.settle([entry.attempt], self._limit_s)
         return entry.attempt.done() or bool(self._reason)
 

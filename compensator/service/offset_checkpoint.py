@@ -29,17 +29,7 @@ _LONGEST = 4096
 
 
 class CheckpointedOffset(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An offset that was published before it was on disk.
-
-    Parameters
-    ----------
-    seq : int
-        Its number.
-    time_utc_ns : int
-        Its time, ns since 1970 UTC.
-    y_offset_um : float
-        The offset, µm.
-    """
+    """An offset that was published before it was on disk; the fields are those of `Offset`."""
 
     seq: int
     time_utc_ns: int
@@ -89,7 +79,7 @@ class OffsetCheckpoint:
             log.warning("%s", Remark(ServiceWarning.NOTE_NOT_REMOVED, figures).marked)
 
     def read(self, offset_max_um: float) -> CheckpointedOffset | None:
-        """Return the offset, None if there is none that this user wrote and a service could have published.
+        """Return the offset; None without one, and for one that another user wrote or no service could have published.
 
         Parameters
         ----------
@@ -102,7 +92,7 @@ class OffsetCheckpoint:
             return None
         with os.fdopen(descriptor, "rb") as file:
             status = os.fstat(file.fileno())
-            # Everybody may write into this folder.
+            # Every user may write into this folder.
             if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o022:
                 self._refuse("not written by this service")
                 return None

@@ -1,4 +1,4 @@
-"""One service for each machine: a second one, started by mistake here or elsewhere, is refused and does no harm.
+"""One service for each machine: a second one, started by mistake here or elsewhere, is refused.
 
 On one computer a lock on a file among the recordings shows it; the kernel releases it however the service ends.
 Elsewhere the liveliness token shows it: before anything is published, a client session of its own asks for

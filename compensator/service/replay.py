@@ -1,16 +1,16 @@
 """Replay: recorded samples through a compensation again.
 
 The audit, the comparison with another model, the restart and the warm-up of another model read and run recordings here.
-`apply` does what the service did with one group of records. This is enough where the state comes from the file: each
+`apply` does what the service did with one group of records. This suffices where the state comes from the file: each
 file opens with the state before its first sample, after any pause. `FreeRun` is for a compensation of another model,
 whose state is in no file: it passes the pauses as well.
 
-A pause is a number of samples that the compensation did not get. Time does not measure it: the wall clock may be set
-and the computer may sleep, and the service passes no pause for either. A pause is therefore
+A pause is a number of samples that the compensation did not get. It cannot be derived from times: the wall clock may be
+set and the computer may sleep, and the service passes no pause for either. A pause is therefore
 
 - at the start of a service, what that start recorded (`PauseData`), which may be a pause of unknown length;
-- else the numbers missing between two samples; a number that a held offset carries is not missing;
-- where files between two others were not given, the time between them: numbers do not follow it across restarts.
+- else the numbers missing between two samples; the number of a held offset is not missing;
+- where files in between were not given, the time between the two: numbers do not count it across restarts.
 """
 
 from __future__ import annotations

@@ -18,10 +18,10 @@ from compensator.errors import DataError
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.plausibility import PlausibilityState
 
-#: Version of the state. A state of another version is refused, never guessed at.
+#: Version of the state; a state of another version is refused.
 STATE_SCHEMA = 1
 
-#: Covariances stay below this by far; the products of larger ones would not be finite.
+#: Covariances are far smaller; the products of larger ones would not be finite.
 LARGEST_COVARIANCE = 1e60
 
 ZeroMode = Literal["auto", "rest", "warm"]
@@ -66,7 +66,7 @@ class Memory:
     operator_hold, internal_error : bool
         Why the offset is held.
     model_changed : bool
-        Whether the offset is still under way to that of another model.
+        Whether the offset is still moving to that of another model.
     cold_min : float
         For how much longer the state counts as unknown, min.
     """
@@ -124,16 +124,16 @@ def encode_state(state: CompensationState) -> bytes:
     table = msgspec.to_builtins(state)
     if state.plausibility is None:
         del table["plausibility"]
-    return json.dumps(_worded(table), separators=(",", ":")).encode()
+    return json.dumps(_encodable(table), separators=(",", ":")).encode()
 
 
-def _worded(value: Any) -> Any:
-    """Replace numbers that are not finite by words."""
+def _encodable(value: Any) -> Any:
+    """Replace numbers that are not finite by texts."""
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, dict):
-        return {key: _worded(entry) for key, entry in value.items()}
-    return [_worded(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+        return {key: _encodable(entry) for key, entry in value.items()}
+    return [_encodable(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 
 
 def decode_state(data: bytes) -> CompensationState:

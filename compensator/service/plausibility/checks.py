@@ -33,7 +33,7 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Reason
 from compensator.service.plausibility.isolation import LOG_ODDS, FaultFit, FaultIsolation, ResidualBlock
 
-#: Samples in a block of the residual: single minutes after a heat step say nothing about a sensor.
+#: Samples in a block of the residual: single minutes after a heat step are no evidence against a sensor.
 BLOCK_SAMPLES = 10
 #: Fraction of a block that must be usable.
 _USABLE = 0.5
@@ -56,7 +56,7 @@ _STORED = {"samples": "taken", "blocks_in_alarm": "accused", "quiet_blocks": "ca
 
 
 class PlausibilityState(msgspec.Struct, kw_only=True, rename=_STORED):
-    """What the checks remember.
+    """State of the checks.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ from compensator.service.replay import FreeRun, RecordedStep, opening_of, steps_
 from compensator.service.state import decode_state
 from compensator.service.status import Zero
 
-#: Length of a warm-up at most, in slowest time constants: 0.03 % of what was before is left then.
+#: Longest warm-up, in slowest time constants: 0.03 % of the influence of earlier samples is left.
 WARM_UP = 8.0
 
 
@@ -59,7 +59,7 @@ class ModelCandidate:
         if sample.seq <= last:
             return
         if last >= 0:
-            # Numbers between were not on disk in time for the warm-up.
+            # The numbers in between were not on disk in time for the warm-up.
             self.compensation.pause(sample.seq - last - 1)
         for note in outcome.notes:
             if note.kind == EventKind.ZERO:
@@ -166,7 +166,7 @@ def _window(folder: Path, machine: str, slowest: float, between_samples: Callabl
                 window.at_rest = step
                 window.from_ns = max(window.from_ns, step.sample.time_utc_ns)
                 break
-            # What the model predicts there is what the deformation counts from: it must be known there, too.
+            # The deformation counts from the model's prediction at this zero, so the state must be known there, too.
             window.from_ns = min(window.from_ns, step.sample.time_utc_ns - span_ns)
         if window.at_rest is not None:
             break

@@ -1,6 +1,6 @@
 """The adopted models, stored with the recordings: which one is in use, and which came before.
 
-An adopted model is used until the configured model itself is changed: the configuration has the last word.
+An adopted model is used until the configured model is changed: the configuration has precedence.
 """
 
 from __future__ import annotations

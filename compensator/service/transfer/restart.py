@@ -143,13 +143,13 @@ def _from_disk(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
         if changes or why:
             _warm(resumed, last, loaded, model, " and ".join(changes or [why]))
         else:
-            _go_on(resumed, last, compensation, differing)
+            _continue(resumed, last, compensation, differing)
         break
     return resumed
 
 
 def _changes(last: _LastFile, loaded: LoadedConfig, model: ThermalModel) -> list[str]:
-    """Return in words why the state of the recording is not that of this configuration and model."""
+    """Return why the state of the recording does not fit this configuration and model, as texts."""
     if last.state is None:
         return ["the recording carries no state that can be used"]
     changes = []
@@ -192,8 +192,8 @@ def _run_again(last: _LastFile, compensation: Compensation, *, restore: bool) ->
     return differing, why
 
 
-def _go_on(resumed: Resumed, last: _LastFile, compensation: Compensation, differing: int) -> None:
-    """Go on with a compensation that has run the last file."""
+def _continue(resumed: Resumed, last: _LastFile, compensation: Compensation, differing: int) -> None:
+    """Continue with a compensation that has run the last file."""
     if differing:
         resumed.note(
             f"{differing} offset(s) of {last.path.name} do not come out as they were published: audit it",
@@ -202,7 +202,7 @@ def _go_on(resumed: Resumed, last: _LastFile, compensation: Compensation, differ
         )
     resumed.compensation = compensation
     if last.samples:
-        # Not from the offset of a torn last sample, which was not published.
+        # The offset of a torn last sample was computed but not published.
         resumed.continue_from(last.handover.offset_um)
     status = compensation.status
     resumed.note(
