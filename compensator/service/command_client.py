@@ -26,13 +26,8 @@ class NotReached(ServiceError):
 class Operator(NamedTuple):
     """How an operator reaches services.
 
-    Parameters
-    ----------
-    config : zenoh.Config
-        Configuration of the session.
-    name : str
-        Common name of the certificate; without TLS the user's name on this computer, which proves nothing. Empty if
-        neither can be part of a key.
+    `name` is the common name of the certificate; without TLS the user's name on this computer, which is no proof. It is
+    empty if neither can be part of a key.
     """
 
     config: zenoh.Config
@@ -164,14 +159,7 @@ def ask(
 def alive_at(key: str, session: zenoh.Session, timeout_s: float) -> list[str]:
     """Return the prefixes of the services that are alive, as far as the session may see them.
 
-    Parameters
-    ----------
-    key : str
-        Key of their tokens, such as `**/thermal/alive` for all.
-    session : zenoh.Session
-        Open.
-    timeout_s : float
-        How long to wait, s.
+    `key` is that of their tokens, such as `**/thermal/alive` for all.
     """
     replies = session.liveliness().get(key, timeout=timeout_s)
     return sorted({str(reply.ok.key_expr).removesuffix("/thermal/alive") for reply in replies if reply.ok is not None})

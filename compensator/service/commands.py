@@ -25,17 +25,7 @@ NOTED_REFUSALS = 10
 
 
 class Commands:
-    """Receives commands from other threads.
-
-    Parameters
-    ----------
-    events : EventLog
-        Notes each command.
-    adoption : Adoption
-        Carries out `adopt` and `back`.
-    unproven : bool
-        Whether commands are accepted whose sender is not authenticated.
-    """
+    """Receives commands from other threads; `unproven`: whether those of unauthenticated senders are accepted."""
 
     def __init__(self, events: EventLog, adoption: Adoption, *, unproven: bool) -> None:
         self._events = events

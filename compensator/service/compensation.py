@@ -17,6 +17,7 @@ from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind, Note, ZeroData
 from compensator.messages import Offset, Sample, number
 from compensator.model.engine import Engine, Estimate
+from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Reason, SampleQuality, State
 from compensator.service.decision import Decision, OffsetDecision, mean
@@ -39,7 +40,7 @@ from compensator.service.state import (
 )
 from compensator.service.status import CompensationStatus, Handover, Zero
 
-__all__ = ["Compensation", "Outcome", "slowest_min"]
+__all__ = ["Compensation", "Outcome", "model_of", "slowest_min"]
 
 #: Number of samples over which rate and heat are averaged before they decide anything.
 MEAN_SAMPLES = 5
@@ -51,15 +52,7 @@ KNOWN_AFTER = 3.0
 
 
 class Compensation:
-    """Compensation of one machine.
-
-    Parameters
-    ----------
-    config : Config
-        Limits, guards, loss, zero.
-    model : ThermalModel
-        Predicts the deformation.
-    """
+    """Compensation of one machine, with the limits and guards of a configuration and a model of the deformation."""
 
     def __init__(self, config: Config, model: ThermalModel) -> None:
         self._config = config
@@ -345,6 +338,18 @@ class Compensation:
         # A machine on a long plateau grows slowly but is heated: its heat must not become the zero.
         heated = abs(mean(self._memory.heats)) > HEATED_W
         return heated or abs(mean(self._memory.rates)) > self._config.zero.rest_rate_um_per_min
+
+
+def model_of(config: Config, data: bytes, *, source: str) -> ThermalModel:
+    """Read a model file as a configuration uses it, with the alternative path that it selects.
+
+    Raises
+    ------
+    ModelError
+        One line that names the source and what is wrong.
+    """
+    model = parse_model(data, source=source)
+    return model.with_alternative(config.model.alternative) if config.model.alternative else model
 
 
 def slowest_min(model: ThermalModel) -> float:

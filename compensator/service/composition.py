@@ -63,10 +63,8 @@ async def run_service(
         Number of samples to stop after.
     on_ready : callable, optional
         Called with the daemon once everything is open.
-    on_sample : callable, optional
-        Called after each sample.
-    on_poll : callable, optional
-        Called after each poll.
+    on_sample, on_poll : callable, optional
+        Called after each sample, with its outcome, and after each poll.
     on_publish : callable, optional
         Called with name and JSON of each message after it was published.
     """

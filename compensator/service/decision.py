@@ -22,15 +22,7 @@ VALID_SAMPLES = 2.5
 
 @dataclass(frozen=True, slots=True)
 class Limited:
-    """An offset within its limits.
-
-    Parameters
-    ----------
-    offset_um, rate_um_per_min : float
-        What may be published.
-    reasons : tuple of Reason
-        Limits that acted.
-    """
+    """An offset within its limits, its rate, and the limits that acted."""
 
     offset_um: float
     rate_um_per_min: float
@@ -63,15 +55,7 @@ class Decision:
 
 
 class OffsetLimiter:
-    """Keeps the offset within its limits, so that it never jumps.
-
-    Parameters
-    ----------
-    limits : Limits
-        Largest value, µm, and rate, µm/min.
-    period_min : float
-        Length of a sample, min.
-    """
+    """Keeps the offset within its limits, so that it never jumps; `period_min` is the length of a sample, min."""
 
     def __init__(self, limits: Limits, period_min: float) -> None:
         self._max_um = limits.offset_max_um
@@ -120,17 +104,7 @@ class OffsetLimiter:
 
 
 class OffsetDecision:
-    """Decides state, reasons and offset of each sample.
-
-    Parameters
-    ----------
-    config : Config
-        Limits, validity, loss.
-    model : ThermalModel
-        Its range of validity narrows the configuration's.
-    channels : sequence of str
-        Channels that the model's effects use.
-    """
+    """Decides state, reasons and offset of each sample; `channels` are those that the model's effects use."""
 
     def __init__(self, config: Config, model: ThermalModel, channels: Sequence[str]) -> None:
         self._channels = tuple(channels)

@@ -104,13 +104,7 @@ class Entry:
 
 
 class DiskWriter:
-    """Writes entries with a recorder.
-
-    Parameters
-    ----------
-    recorder : Recorder
-        Writes them.
-    """
+    """Writes entries with a recorder."""
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder

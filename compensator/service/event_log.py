@@ -14,19 +14,7 @@ WAITING_EVENTS = 1000
 
 
 class EventLog:
-    """Events of one machine.
-
-    Parameters
-    ----------
-    machine : str
-        Name of the machine.
-    publish : callable
-        Publishes a message by name and JSON; never waits.
-    clock : Clock
-        For their time.
-    sequence : int
-        Number of the first sample.
-    """
+    """Events of one machine; `sequence` is the number of the first sample, `publish` never waits."""
 
     def __init__(self, machine: str, publish: Callable[[str, bytes], None], clock: Clock, sequence: int) -> None:
         self._machine = machine

@@ -38,7 +38,7 @@ class Journal:
     writer : DiskWriter
         Brings them to disk.
     clock : Clock
-        Waits, and dates the end.
+        For waiting.
     limit_s : float
         How long the loop waits for the disk, s.
     patience_s : float
@@ -82,18 +82,9 @@ class Journal:
         estimate: bytes = b"",
         offset: Offset | None = None,
     ) -> Entry:
-        """Enqueue a sample and the pending events to be written after everything that waits.
+        """Enqueue a sample with the events since the previous one.
 
-        Parameters
-        ----------
-        time_utc_ns : int
-            Time of the sample, ns since 1970 UTC.
-        state : bytes
-            State of the compensation before it.
-        sample, estimate : bytes
-            JSON; empty if there is none.
-        offset : Offset, optional
-            As decided.
+        `state` is that of the compensation before the sample; `sample` and `estimate` are JSON, empty if there is none.
         """
         entry = Entry(
             time_utc_ns=time_utc_ns,

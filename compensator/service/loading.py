@@ -14,11 +14,12 @@ import drivers
 from compensator.certificates import Certificate, check_files, remarks
 from compensator.config import Config, LoadedConfig, Zenoh, load_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
-from compensator.model.model_file import parse_model, read_model_bytes
+from compensator.model.model_file import read_model_bytes
 from compensator.model.thermal_model import ThermalModel
 from compensator.reasons import Remark
 from compensator.recording.signature import Signer
 from compensator.remarks import ServiceWarning
+from compensator.service.compensation import model_of
 from compensator.service.session import tls_files
 from compensator.service.transfer.model_store import ModelStore, check_model
 from drivers.errors import DriverConfigError
@@ -131,9 +132,7 @@ def _model(loaded: LoadedConfig) -> tuple[ThermalModel, bytes, ModelStore]:
     config = loaded.config
     try:
         configured = read_model_bytes(loaded.model_name())
-        model = parse_model(configured, source=config.model.file)
-        if config.model.alternative:
-            model = model.with_alternative(config.model.alternative)
+        model = model_of(config, configured, source=config.model.file)
     except ModelError as error:
         raise ConfigError(f"{loaded.path}: model: {error}") from error
     store = ModelStore(loaded.store(), configured)

@@ -14,19 +14,7 @@ from compensator.service.state import ZeroState
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Everything that one sample leads to.
-
-    Parameters
-    ----------
-    sample : Sample
-        The sample with its final qualities.
-    estimate : EstimateMessage
-        The model's estimate.
-    offset : Offset
-        What is published.
-    notes : tuple of Note
-        Events of this sample.
-    """
+    """Everything that one sample leads to: the sample with final qualities, estimate, offset, and its events."""
 
     sample: Sample
     estimate: EstimateMessage

@@ -72,15 +72,7 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
 
 
 def is_used(folder: Path, machine: str) -> bool:
-    """Return whether a service of a machine holds the folder of its recordings; changes nothing.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Folder of the recordings.
-    machine : str
-        Name of the machine.
-    """
+    """Return whether a service of a machine holds the folder of its recordings; changes nothing."""
     try:
         descriptor = os.open(folder / f"{machine}.lock", os.O_RDONLY | os.O_CLOEXEC)
     except OSError:

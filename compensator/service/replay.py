@@ -28,11 +28,10 @@ from compensator.config import Config, parse_config
 from compensator.errors import DataError
 from compensator.events import CommandName, EventKind, PauseData, command_of, data_of
 from compensator.messages import EstimateMessage, Event, Offset, Sample
-from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.container import Container, Contents, Damaged
 from compensator.recording.reading import Record, decode_with, groups_of
-from compensator.service.compensation import Compensation, Outcome
+from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.state import ZeroMode
 
 _SAMPLE, _EVENT = msgspec.json.Decoder(Sample), msgspec.json.Decoder(Event)
@@ -144,10 +143,7 @@ def setup_of(contents: Contents, file: str) -> tuple[Config, ThermalModel]:
         If one of them is not there or cannot be used; the line names file and attachment.
     """
     config = parse_config(_attachment(contents, "config.toml", file), source=f"{file}: config.toml")
-    model = parse_model(_attachment(contents, "model.toml", file), source=f"{file}: model.toml")
-    if config.model.alternative:
-        model = model.with_alternative(config.model.alternative)
-    return config, model
+    return config, model_of(config, _attachment(contents, "model.toml", file), source=f"{file}: model.toml")
 
 
 def _attachment(contents: Contents, name: str, file: str) -> bytes:
@@ -215,23 +211,12 @@ def apply(
         assert held is not None
         return compensation.held(held.machine, held.seq, held.time_utc_ns)
     try:
-        return compensation.process(_as_measured(sample))
+        # The guards set `quality` again, from `device_quality` alone.
+        return compensation.process(sample)
     except (KeyError, AttributeError, TypeError) as error:
         raise DataError(
             f"{step.file}: /sample {sample.seq}: {type(error).__name__} {error}; expected the configured channels"
         ) from error
-
-
-def _as_measured(sample: Sample) -> Sample:
-    """Return a recorded sample as the devices gave it, without the verdicts of the guards."""
-    channels = sample.channels
-    for channel in channels.values():
-        if channel.quality != channel.device_quality:
-            break
-    else:
-        return sample
-    measured = {k: msgspec.structs.replace(c, quality=c.device_quality) for k, c in channels.items()}
-    return msgspec.structs.replace(sample, channels=measured)
 
 
 # ---------------------------------------------------------------------- another model

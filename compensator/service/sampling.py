@@ -33,17 +33,7 @@ _OUTLIER = "outlier"
 
 
 class Grid:
-    """Times of the polls and samples.
-
-    Parameters
-    ----------
-    clock : Clock
-        Wall and monotonic clock.
-    period_s : float
-        Length of a sample, s.
-    polls : int
-        Polls in a sample; the last one is at its end.
-    """
+    """Times of the polls and samples: `polls` in each sample of `period_s` seconds, the last one at its end."""
 
     def __init__(self, clock: Clock, period_s: float, polls: int) -> None:
         self._clock = clock

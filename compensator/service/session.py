@@ -42,13 +42,7 @@ def in_words(error: zenoh.ZError) -> str:
 
 
 def session_config(settings: Zenoh) -> zenoh.Config:
-    """Make a Zenoh configuration that listens and connects only as configured.
-
-    Parameters
-    ----------
-    settings : Zenoh
-        Mode, endpoints and TLS files.
-    """
+    """Make a Zenoh configuration that listens and connects only as configured."""
     config = zenoh.Config()
     set_key(config, "mode", settings.mode)
     set_key(config, "listen/endpoints", settings.listen)
@@ -95,15 +89,7 @@ def tls_files(settings: Zenoh) -> TlsFiles | None:
 
 
 class ConfigFile(NamedTuple):
-    """A Zenoh configuration file.
-
-    Parameters
-    ----------
-    config : zenoh.Config
-        Its content; paths of TLS files are absolute.
-    tls : dict of str to str
-        Its TLS files by key.
-    """
+    """A Zenoh configuration file: its content, with absolute paths of the TLS files, and those paths by key."""
 
     config: zenoh.Config
     tls: dict[str, str]

@@ -130,15 +130,7 @@ class SensorEvidence:
 
 
 class PlausibilityCheck:
-    """The checks of one machine.
-
-    Parameters
-    ----------
-    config : Config
-        Limits; without `[plausibility]` nothing is checked.
-    model : ThermalModel
-        The running model.
-    """
+    """The checks of one machine; without `[plausibility]` in the configuration nothing is checked."""
 
     def __init__(self, config: Config, model: ThermalModel) -> None:
         self._limits = config.plausibility or Plausibility()

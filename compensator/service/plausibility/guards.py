@@ -21,15 +21,7 @@ GuardState = tuple[float, float, float, float]
 
 
 class ChannelGuard:
-    """Range, rate and stuck guard of one channel.
-
-    Parameters
-    ----------
-    channel : Channel
-        Its limits.
-    period_min : float
-        Length of a sample, min.
-    """
+    """Range, rate and stuck guard of one channel; `period_min` is the length of a sample, min."""
 
     def __init__(self, channel: Channel, period_min: float) -> None:
         self._channel = channel
@@ -89,17 +81,7 @@ class ChannelGuard:
 
 
 class SensorGuards:
-    """All guards of a machine.
-
-    Parameters
-    ----------
-    channels : list of Channel
-        Channels with their limits.
-    guards : Guards
-        Limits between channels.
-    period_min : float
-        Length of a sample, min.
-    """
+    """All guards of a machine; `period_min` is the length of a sample, min."""
 
     def __init__(self, channels: list[Channel], guards: Guards, period_min: float) -> None:
         self._guards = {channel.name: ChannelGuard(channel, period_min) for channel in channels}

@@ -33,17 +33,7 @@ _HOUR_MIN = 60.0
 
 @dataclass(frozen=True, slots=True)
 class ResidualBlock:
-    """Mean of a few samples.
-
-    Parameters
-    ----------
-    residual_um : float
-        Measured − predicted, µm; NaN if too few samples were usable.
-    std_um : float
-        Its stated standard deviation, µm.
-    predicted_um : float
-        Prediction, µm.
-    """
+    """Means of a few samples, µm: the residual (NaN if too few were usable), its standard deviation, the prediction."""
 
     residual_um: float
     std_um: float

@@ -96,17 +96,13 @@ class Adoption:
     Parameters
     ----------
     config : Config
-        Settings.
+        Settings that the model must fit.
     recordings : pathlib.Path
-        Folder of the recordings.
+        Folder of the recordings for the warm-up.
     store : ModelStore or None
-        Where adopted models are kept; without it every command is refused.
-    events : EventLog
-        Notes what happens.
-    journal : Journal
-        Begins the file of another model.
-    clock : Clock
-        For the history of models.
+        Adopted models; without it every command is refused.
+    events, journal, clock
+        For events, the file of another model, and the history of models.
     running : callable
         Returns the compensation that runs.
     """

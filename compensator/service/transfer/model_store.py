@@ -23,19 +23,7 @@ _FILE = "adopted.json"
 
 
 class Adopted(msgspec.Struct, frozen=True, kw_only=True):
-    """One change of the model.
-
-    Parameters
-    ----------
-    sha256 : str
-        Hash of the model file that was in use from then on.
-    name : str
-        Name of the model.
-    time_utc_ns : int
-        When, ns since 1970 UTC.
-    action : {"adopt", "back"}
-        What was asked for.
-    """
+    """One change of the model: hash and name of the file in use from then on, time, and the command."""
 
     sha256: str
     name: str

@@ -29,15 +29,7 @@ from compensator.service.transfer.candidate import warm_up
 
 @dataclass(slots=True)
 class Resumed:
-    """A compensation that continues where the last recording ends.
-
-    Parameters
-    ----------
-    compensation : Compensation
-        As it was, or at its first start.
-    notes : list of Note
-        Events that describe it.
-    """
+    """A compensation that continues where the last recording ends, with events that describe how."""
 
     compensation: Compensation
     notes: list[Note] = field(default_factory=list)
