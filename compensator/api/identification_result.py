@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compensator.api.files import page_in
+from compensator.arrays import NAN
 from compensator.data.frames import frame_of
-from compensator.display import html_table
+from compensator.display import Shown, Table, Words, is_determined
 from compensator.identify.calibration import Calibration, Part
 from compensator.identify.comparison import Row
 from compensator.identify.criticism import Criticism
-from compensator.identify.summary import figures, text, verdict, with_std
+from compensator.identify.summary import contents, estimates, figures
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class IdentificationResult:
+class IdentificationResult(Shown):
     """An identified model with everything that was found about it.
 
     Parameters
@@ -52,21 +53,13 @@ class IdentificationResult:
     @property
     def params(self) -> dict[str, float]:
         """Gains at rest and time constants by name, such as `dtf_gain_um_per_w`, `dtf_tau_1_min`."""
-        return {name: value for name, (value, _) in self._estimates().items()}
+        return {name: one.value for name, one in estimates(self.criticism).items()}
 
     @property
     def std_errors(self) -> dict[str, float]:
-        """Standard errors of `params`, by the same names."""
-        return {name: std for name, (_, std) in self._estimates().items()}
-
-    def _estimates(self) -> dict[str, tuple[float, float]]:
-        found = {}
-        for view in self.criticism.paths:
-            path, unit = view.name.lower(), view.unit.lower().replace("/", "_per_")
-            found[f"{path}_gain_{unit}"] = (view.gain, view.gain_std)
-            for i, estimate in enumerate(zip(view.taus_min, view.taus_std_min, strict=True), start=1):
-                found[f"{path}_tau_{i}_min"] = estimate
-        return found
+        """Standard errors of `params`, by the same names; NaN where the data do not determine the parameter."""
+        found = estimates(self.criticism)
+        return {name: one.std if is_determined(one.value, one.std) else NAN for name, one in found.items()}
 
     @property
     def predictions(self) -> Any:
@@ -81,9 +74,9 @@ class IdentificationResult:
         columns["residual_um"] = columns["y_um"] - columns["y_pred_um"]
         return frame_of(columns) if self.in_frame else columns
 
-    def summary(self) -> str:
-        """Return what `compensator identify` prints."""
-        return text(self.calibration, self.criticism)
+    def contents(self) -> list[str | Table | Words]:
+        """Return what it shows: the verdict, parameters, errors in free run, warnings."""
+        return list(contents(self.calibration, self.criticism, self.comparison))
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures, as `compensator identify --json` prints them."""
@@ -137,30 +130,6 @@ class IdentificationResult:
                 for axis in axes:
                     axis.axvspan(start + part.t_s[0] / 3600.0, start + part.t_s[-1] / 3600.0, color="0.9")
         return figure
-
-    def __repr__(self) -> str:
-        return self.summary()
-
-    def _repr_html_(self) -> str:
-        estimates = [[name, with_std(value, std)] for name, (value, std) in self._estimates().items()]
-        errors = [
-            [
-                part.name,
-                part.role,
-                f"{part.model.fit_pct:.2f}",
-                f"{part.model.rms_um:.2f}",
-                f"{part.nothing.rms_um:.2f}",
-            ]
-            for part in self.calibration.parts
-        ]
-        return "".join(
-            (
-                f"<p><b>{self.model.name}</b>: {verdict(self.calibration)}</p>",
-                html_table(["parameter", "value ± standard error"], estimates),
-                html_table(["data", "part", "fit %", "rms µm", "no compensation µm"], errors),
-                html_table(["warnings"], [[warning.marked] for warning in self.criticism.warnings]),
-            )
-        )
 
 
 def _starts(parts: Sequence[Part]) -> list[float]:

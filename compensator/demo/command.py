@@ -12,8 +12,7 @@ from typing import Any
 from compensator.commands import Answer
 from compensator.demo.calibration import calibrate, paper_case
 from compensator.demo.day import run_day
-from compensator.demo.figures import as_text, shown
-from compensator.demo.figures import table as table_of
+from compensator.demo.figures import shown, table_of
 from compensator.demo.live import run_live
 from compensator.demo.loop import close_the_loop
 from compensator.demo.machine import MACHINES
@@ -91,4 +90,4 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
         f"Second day: {loop['second_day_rms_um']['without']:.2f} µm rms without compensation. {closed(loop)}"
     )
     result = {"machines": results, "loop": loop, "report": str(page)}
-    return result, f"{as_text(table)}\n\n{verdict(days)}\n{summary}\npage: {page}"
+    return result, f"{table.text()}\n\n{verdict(days)}\n{summary}\npage: {page}"

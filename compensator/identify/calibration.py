@@ -239,10 +239,11 @@ def _drive(run: Run, temperature: TemperatureFit | None, settings: Settings) -> 
 
 
 def _path(name: str, kind: Kind, path: PathFit) -> Path:
-    covariance = None
-    if path.fit is not None:
-        covariance = tuple(tuple(row) for row in path.fit.coefficient_covariance(path.column).tolist())
-    return Path(sampled=path.function, unit=PATH_UNITS[kind][name], covariance=covariance)
+    unit = PATH_UNITS[kind][name]
+    if path.fit is None:
+        return Path(sampled=path.function, unit=unit)
+    covariance = tuple(tuple(row) for row in path.fit.coefficient_covariance(path.column).tolist())
+    return Path(sampled=path.function, unit=unit, covariance=covariance, gain_std=path.fit.gain(path.column)[1])
 
 
 def _estimator(runs: Sequence[Run], drives: Sequence[Vector], noise: Mapping[str, float], kind: Kind) -> Estimator:

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import compensator as tc
-from compensator.api.simulation import SimulationResult
+from compensator.api.simulation_result import SimulationResult
 from tests.api.tables import arrays, frame, write_run
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W
 
@@ -84,7 +84,7 @@ def test_a_diagnosis_shows_draws_and_writes_itself(tmp_path: Path, run: Path) ->
 def test_a_free_run_shows_and_draws_itself(run: Path) -> None:
     out = tc.simulate("quill", arrays(run))
     assert isinstance(out, SimulationResult)
-    assert "720 samples" in repr(out) and "µm rms" in out._repr_html_()
+    assert "720 samples" in repr(out) and "rms µm" in out._repr_html_()
     assert len(shown(out)) > 5_000
     without = {name: values for name, values in arrays(run).items() if name != "y_um"}
     alone = tc.simulate("quill", without)
