@@ -1,35 +1,34 @@
-"""`tc.compare`: models beside no compensation and persistence, on the same samples."""
+"""`tc.compare`: models, no compensation and persistence on the same samples."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from compensator.api.files import ModelLike, model_of, page_in
+from compensator.api.files import ModelLike, Paged, model_of
 from compensator.arrays import Mask, Vector
 from compensator.blas import one_thread
 from compensator.data.frames import frame_of
 from compensator.data.measurement import DataLike, measurements
 from compensator.data.record import require
-from compensator.display import Shown, Table
+from compensator.display import Table
 from compensator.errors import DataError, UsageError
 from compensator.model.simulation import SCORE_HEAD, Scores, scores, simulate
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
+    from compensator.report.page import Page
 
 #: What every model is compared with.
 NOTHING, PERSISTENCE = "no compensation", "persistence"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class ComparisonResult(Shown):
+class ComparisonResult(Paged):
     """Errors of models in free run on the same samples.
 
     Parameters
@@ -80,24 +79,16 @@ class ComparisonResult(Shown):
         )
         return [f"{self.samples} samples in free run" + (f" from {self.from_h:g} h on" if self.from_h else ""), table]
 
-    def page(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page: .html, .pdf, or .png for its picture."""
-        return page_in(path, self.write_page)
-
-    def write_page(self, path: Path, also: Path | None = None) -> Path:
-        """Write the page as HTML, and in the format of another file too."""
-        from compensator.report.formats import write
-        from compensator.report.page import Figure, Line, Page, write_page
+    def as_page(self) -> Page:
+        """Return the content of the page."""
+        from compensator.report.page import Figure, Line, Page
 
         lines = tuple(Line(name, self.t_h, values) for name, values in self.residuals.items())
         figure = Figure(title="Error in free run", x_label="time, h", y_label="measured − predicted, µm", lines=lines)
         samples = self.contents()[0]
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)
         words = f"Smallest error: {best}, {self.scores[best].rms_um:.2f} µm rms. {samples}."
-        page = Page(title="Comparison of models", verdict=words, blocks=[figure, *self.tables()], tone="good")
-        if also is not None:
-            write(also, page)
-        return write_page(path, page)
+        return Page(title="Comparison of models", verdict=words, blocks=[figure, *self.tables()], tone="good")
 
     def plot(self) -> Plot:
         """Draw the error of each over time."""

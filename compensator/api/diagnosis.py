@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compensator import __version__
-from compensator.api.files import ModelLike, as_in_file, model_of, page_in
+from compensator.api.files import ModelLike, Paged, as_in_file, model_of
 from compensator.arrays import Vector
 from compensator.blas import in_one_thread, one_thread
 from compensator.data.measurement import DataLike, Measurement, measurements, runs_in
@@ -22,7 +22,7 @@ from compensator.data.screening import screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.outcome import Diagnosis, FoundEffect
 from compensator.diagnose.summary import contents, figures
-from compensator.display import Shown, Table, Words
+from compensator.display import Table, Words
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
@@ -30,13 +30,14 @@ from compensator.reasons import Remark
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
+    from compensator.report.page import Page
 
 #: What `save` writes into a folder.
 FILES = ("model.toml", "diagnosis.json", "report.html")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class DiagnosisResult(Shown):
+class DiagnosisResult(Paged):
     """What a model lacks.
 
     Parameters
@@ -95,15 +96,11 @@ class DiagnosisResult(Shown):
         found.write_text(json.dumps(self.to_dict(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
         self.write_page(page, also=also)
 
-    def page(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page: .html, .pdf, or .png for its first picture."""
-        return page_in(path, self.write_page)
+    def as_page(self) -> Page:
+        """Return the content of the page."""
+        from compensator.report.diagnosis import page_of
 
-    def write_page(self, path: Path, also: Path | None = None) -> Path:
-        """Write the page as HTML, and in the format of another file too."""
-        from compensator.report.diagnosis import write_report
-
-        return write_report(path, self.diagnosis, self.model, self.remarks, also=also)
+        return page_of(self.diagnosis, self.model, self.remarks)
 
     def plot(self) -> Plot:
         """Draw the residual before and after on data that took no part, one run after another."""

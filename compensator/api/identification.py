@@ -20,7 +20,7 @@ from compensator.identify.settings import Method, Settings
 from compensator.identify.summary import figures
 from compensator.progress import Progress, unreported
 
-#: What a model file keeps of the figures, beside where it comes from.
+#: Figures that a model file keeps in its provenance.
 _KEPT = ("method", "parts", "warnings", "remarks", "ttf")
 _DEFAULT = Settings()
 

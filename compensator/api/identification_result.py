@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from compensator.api.files import page_in
+from compensator.api.files import Paged
 from compensator.arrays import NAN
 from compensator.data.frames import frame_of
-from compensator.display import Shown, Table, Words, is_determined
+from compensator.display import Table, Words, is_determined
 from compensator.identify.calibration import Calibration, Part
 from compensator.identify.comparison import Row
 from compensator.identify.criticism import Criticism
@@ -24,10 +24,11 @@ from compensator.model.thermal_model import ThermalModel
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
+    from compensator.report.page import Page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class IdentificationResult(Shown):
+class IdentificationResult(Paged):
     """An identified model with everything that was found about it.
 
     Parameters
@@ -39,7 +40,7 @@ class IdentificationResult(Shown):
     criticism : Criticism
         Step, impulse and frequency responses, correlations of the residuals, warnings.
     comparison : tuple of Row
-        Coefficients beside those of a reference model; empty without one.
+        Coefficients compared with those of a reference model; empty without one.
     in_frame : bool
         Whether tables are DataFrames.
     """
@@ -96,15 +97,11 @@ class IdentificationResult(Shown):
         write_model(Path(path), self.model)
         return Path(path)
 
-    def page(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page for the engineer who signs the model: .html, .pdf, or .png for its first picture."""
-        return page_in(path, self.write_page)
+    def as_page(self) -> Page:
+        """Return the content of the page."""
+        from compensator.report.identification import page_of
 
-    def write_page(self, path: Path, also: Path | None = None) -> Path:
-        """Write the page as HTML, and in the format of another file too."""
-        from compensator.report.identification import write_report
-
-        return write_report(path, self.calibration, self.criticism, self.model, self.comparison, also=also)
+        return page_of(self.calibration, self.criticism, self.model, self.comparison)
 
     def plot(self) -> Plot:
         """Draw measured and predicted deformation, and the residual; what was held out is shaded."""

@@ -59,7 +59,7 @@ def paper_case(folder: Path, *, seed: int) -> Sequence[Row]:
     Returns
     -------
     sequence of Row
-        Each coefficient beside the printed one.
+        Each coefficient, compared with the printed one.
     """
     duty = Duty.paper_calibration(seed)
     per_reading = np.sqrt(READINGS) * 0.01 / 1.96

@@ -185,7 +185,7 @@ def error_table(calibration: Calibration) -> Table:
 
 
 def comparison_table(rows: Sequence[Row]) -> Table:
-    """Return gains, time constants and coefficients beside those of a reference model."""
+    """Return gains, time constants and coefficients, compared with those of a reference model."""
     return Table(
         title="Comparison with the reference model",
         head=["path and figure", "identified ± standard error", "reference", "difference / standard error"],

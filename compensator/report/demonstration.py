@@ -59,7 +59,7 @@ def page_of(
     second_day : dict of str to (numpy.ndarray, numpy.ndarray)
         Time in h and error in µm of the second day, by model.
     paper : sequence of Comparison
-        Coefficients of the paper's case beside the printed ones.
+        Coefficients of the paper's case, compared with the printed ones.
     """
     blocks: list[Block] = [_error(day) for day in days]
     blocks += [

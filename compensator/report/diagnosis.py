@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from compensator.diagnose.summary import (
     verdict,
 )
 from compensator.model.thermal_model import ThermalModel
-from compensator.report.formats import write
 from compensator.report.page import (
     Block,
     Details,
@@ -32,22 +30,17 @@ from compensator.report.page import (
     Tone,
     Words,
     warnings_of,
-    write_page,
 )
 
 #: Tone of each verdict.
 TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
 
 
-def write_report(
-    path: Path, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str], *, also: Path | None = None
-) -> Path:
-    """Write the page.
+def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Page:
+    """Make the page.
 
     Parameters
     ----------
-    path, also : pathlib.Path
-        The HTML file, and another file for the same page, with any suffix of `formats.SUFFIXES`.
     diagnosis : Diagnosis
         The diagnosis.
     model : ThermalModel
@@ -63,10 +56,7 @@ def write_report(
         blocks.append(_ranking(diagnosis))
     blocks.append(_details(t, diagnosis, model, remarks))
     title = f"Diagnosis: what {model.name} lacks"
-    page = Page(title=title, verdict=verdict(figures(diagnosis)), blocks=blocks, tone=TONES[diagnosis.verdict])
-    if also is not None:
-        write(also, page)
-    return write_page(path, page)
+    return Page(title=title, verdict=verdict(figures(diagnosis)), blocks=blocks, tone=TONES[diagnosis.verdict])
 
 
 def _hours(diagnosis: Diagnosis) -> Vector:

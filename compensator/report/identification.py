@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from compensator.identify.summary import (
     verdict,
 )
 from compensator.model.thermal_model import ThermalModel
-from compensator.report.formats import write
 from compensator.report.page import (
     Block,
     Details,
@@ -39,25 +37,16 @@ from compensator.report.page import (
     Tone,
     Words,
     warnings_of,
-    write_page,
 )
 
 
-def write_report(
-    path: Path,
-    calibration: Calibration,
-    criticism: Criticism,
-    model: ThermalModel,
-    comparison: Sequence[Comparison],
-    *,
-    also: Path | None = None,
-) -> Path:
-    """Write the page.
+def page_of(
+    calibration: Calibration, criticism: Criticism, model: ThermalModel, comparison: Sequence[Comparison] = ()
+) -> Page:
+    """Make the page.
 
     Parameters
     ----------
-    path, also : pathlib.Path
-        The HTML file, and another file for the same page, with any suffix of `formats.SUFFIXES`.
     calibration : Calibration
         The calibration.
     criticism : Criticism
@@ -65,7 +54,7 @@ def write_report(
     model : ThermalModel
         As written, with its hash.
     comparison : sequence of Comparison
-        Coefficients compared with those of another model; may be empty.
+        Coefficients compared with those of another model.
     """
     errors = errors_of(calibration)
     blocks: list[Block] = [_prediction(calibration), _residuals(calibration), error_table(calibration)]
@@ -77,10 +66,7 @@ def write_report(
     blocks.append(Section(title="Residual analysis", blocks=[_correlations(view) for view in criticism.residuals]))
     blocks.append(_choice(calibration))
     blocks.append(_provenance(calibration, model))
-    page = Page(title=f"Calibration: {model.name}", verdict=verdict(errors), blocks=blocks, tone=tone_of(errors))
-    if also is not None:
-        write(also, page)
-    return write_page(path, page)
+    return Page(title=f"Calibration: {model.name}", verdict=verdict(errors), blocks=blocks, tone=tone_of(errors))
 
 
 def tone_of(errors: Mapping[str, Any]) -> Tone:

@@ -12,7 +12,8 @@ from compensator.identify.criticism import criticise
 from compensator.identify.settings import Settings
 from compensator.identify.summary import errors_of
 from compensator.model.simulation import Scores
-from compensator.report.identification import _joined, tone_of, write_report
+from compensator.report.identification import _joined, page_of, tone_of
+from compensator.report.page import write_page
 from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
 
 
@@ -40,7 +41,7 @@ def calibration():
 def page(calibration, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "report.html"
     model = dataclasses.replace(calibration.model, sha256="cd" * 32)
-    assert write_report(path, calibration, criticise(calibration), model, ()) == path
+    assert write_page(path, page_of(calibration, criticise(calibration), model)) == path
     return path.read_text(encoding="utf-8")
 
 
