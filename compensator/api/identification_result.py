@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ from compensator.api.files import Paged
 from compensator.arrays import NAN
 from compensator.data.frames import frame_of
 from compensator.display import Table, Words, is_determined
-from compensator.identify.calibration import Calibration, Part
+from compensator.identify.calibration import Calibration, joined
 from compensator.identify.comparison import Row
 from compensator.identify.criticism import Criticism
 from compensator.identify.summary import contents, estimates, figures
@@ -107,33 +106,11 @@ class IdentificationResult(Paged):
         """Draw measured and predicted deformation, and the residual; what was held out is shaded."""
         from compensator.api.plotting import stacked
 
-        def joined(name: str) -> np.ndarray[Any, Any]:
-            return np.concatenate([np.append(getattr(part, name), np.nan) for part in parts])
-
-        parts = self.calibration.parts
-        starts = _starts(parts)
-        hours = np.concatenate(
-            [np.append(part.t_s / 3600.0 + start, np.nan) for part, start in zip(parts, starts, strict=True)]
-        )
-        y, predicted = joined("y_um"), joined("y_pred_um")
-        figure, axes = stacked(
-            [
-                ("Y, µm", [("measured", hours, y), ("predicted, free run", hours, predicted)]),
-                ("residual, µm", [("measured − predicted", hours, y - predicted)]),
-            ]
-        )
-        for part, start in zip(parts, starts, strict=True):
-            if part.role == "held out":
-                for axis in axes:
-                    axis.axvspan(start + part.t_s[0] / 3600.0, start + part.t_s[-1] / 3600.0, color="0.9")
+        hours, y, predicted, held_out = joined(self.calibration.parts)
+        curves = [("measured", hours, y), ("predicted, free run", hours, predicted)]
+        residual = [("measured − predicted", hours, y - predicted)]
+        figure, axes = stacked([("Y, µm", curves), ("residual, µm", residual)])
+        for axis in axes:
+            for first, last in held_out:
+                axis.axvspan(first, last, color="0.9")
         return figure
-
-
-def _starts(parts: Sequence[Part]) -> list[float]:
-    """Return where each part's time begins on a common axis, h: files follow each other."""
-    starts: list[float] = []
-    end, last = 0.0, ""
-    for part in parts:
-        starts.append(end if part.name != last and starts else (starts[-1] if starts else 0.0))
-        last, end = part.name, starts[-1] + float(part.t_s[-1]) / 3600.0 + 0.5
-    return starts

@@ -9,7 +9,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.display import with_std
-from compensator.identify.calibration import Calibration, Part
+from compensator.identify.calibration import Calibration, Part, joined
 from compensator.identify.choice import Candidate
 from compensator.identify.comparison import Row as Comparison
 from compensator.identify.criticism import LAGS, Criticism, PathView, ResidualView
@@ -76,27 +76,10 @@ def tone_of(errors: Mapping[str, Any]) -> Tone:
 
 
 def _joined(parts: Sequence[Part]) -> tuple[Vector, Vector, Vector, tuple[Span, ...]]:
-    """Join the parts on one time axis in hours, with a gap between files and a span for each held-out part."""
-    t: list[Vector] = []
-    y: list[Vector] = []
-    predicted: list[Vector] = []
-    spans: list[Span] = []
-    shift, last_name = 0.0, ""
-    for part in parts:
-        hours = part.t_s / 3600.0
-        if t and part.name != last_name:
-            shift = t[-1][-1] + 0.5 - hours[0]
-            gap = np.array([np.nan])
-            t.append(np.array([t[-1][-1]]))
-            y.append(gap)
-            predicted.append(gap)
-        last_name = part.name
-        t.append(hours + shift)
-        y.append(part.y_um)
-        predicted.append(part.y_pred_um)
-        if part.role == "held out":
-            spans.append(Span("held out" if not spans else "", float(t[-1][0]), float(t[-1][-1])))
-    return np.concatenate(t), np.concatenate(y), np.concatenate(predicted), tuple(spans)
+    """Return the parts on one time axis, and a span for each held-out part, the first of them named."""
+    t, y, predicted, held_out = joined(parts)
+    spans = (Span("" if i else "held out", first, last) for i, (first, last) in enumerate(held_out))
+    return t, y, predicted, tuple(spans)
 
 
 def _prediction(calibration: Calibration) -> Figure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 from pathlib import Path
 
 import matplotlib
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 
 import compensator as tc
 from compensator.api.simulation_result import SimulationResult
+from compensator.display import with_std
 from tests.api.tables import arrays, frame, write_run
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W
 
@@ -54,6 +56,32 @@ def test_an_identification_shows_draws_and_writes_itself(tmp_path: Path, found: 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html", "page.pdf", "page.png"]
     with pytest.raises(tc.CompensatorError, match=r"page.txt: expected a name that ends in .html, .pdf or .png"):
         found.page(tmp_path / "page.txt")
+
+
+def test_terminal_notebook_and_page_show_the_same_tables(tmp_path: Path, found: object) -> None:
+    page = found.page(tmp_path / "page.html").read_text(encoding="utf-8")
+    tables = found.tables()
+    assert [table.title for table in tables] == ["Gains and time constants", "Errors in free run"]
+    for shown in (page, found._repr_html_(), found.summary()):
+        for table in tables:
+            assert all(html.escape(cell) in shown for row in table.rows for cell in row)
+
+
+def test_a_model_shows_its_gains_as_its_file_does(tmp_path: Path, found: object) -> None:
+    gain, std = found.params["dtf_gain_um_per_w"], found.std_errors["dtf_gain_um_per_w"]
+    text = found.save(tmp_path / "model.toml").read_text(encoding="utf-8")
+    assert f"Gain at rest {gain:.5g} +- {std:.2g} um/W (one standard error)" in text
+    for model in (found.model, tc.load_model(tmp_path / "model.toml")):
+        assert model.dtf.gain_std == std
+        assert f"<td>{with_std(gain, std)}</td><td>µm/W</td>" in model._repr_html_()
+
+
+def test_what_the_data_do_not_determine_has_no_standard_error(found: object) -> None:
+    first, *paths = found.criticism.paths
+    wide = dataclasses.replace(first, gain_std=228246.0)
+    poor = dataclasses.replace(found, criticism=dataclasses.replace(found.criticism, paths=(wide, *paths)))
+    assert np.isnan(poor.std_errors["ttf_gain_k_per_w"]) and np.isfinite(poor.params["ttf_gain_k_per_w"])
+    assert "228246" not in poor.summary() and "(not determined)" in poor.summary()
 
 
 def test_the_predictions_are_those_that_the_errors_were_computed_of(found: object) -> None:
