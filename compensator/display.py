@@ -1,21 +1,208 @@
-"""Tables for a notebook: what `_repr_html_` returns."""
+"""Results for people: tables and lists of sentences that terminal, notebook and page render alike."""
 
 from __future__ import annotations
 
 import html
+import math
+import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from compensator.reasons import Remark
+
+#: Cells of a column of numbers: digits, signs, errors, percent, and dashes for missing values.
+_NUMBER = re.compile(
+    r"[-+−±–]?\s*\d[\d.,\s]*([eE][-+−]?\d+)?(\s*±\s*\d[\d.,eE+−-]*)?\s*%?(\s*\(.*\))?|nan|[-+−]?(inf|∞)|[-–—]"
+)
 
 
-def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return an HTML table; everything is escaped.
+@dataclass(frozen=True, slots=True)
+class CodeLink:
+    """A state, reason, quality or warning, such as `hold`, or `outside_validity:t_q_degc`.
+
+    On a page it links to its meaning and action at the end.
+    """
+
+    code: str
+
+    @property
+    def word(self) -> str:
+        """The code without its subject."""
+        return self.code.split(":", maxsplit=1)[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A link to another page: its text and a relative address."""
+
+    text: str
+    href: str
+
+
+#: Content of a cell or line: text, codes and links.
+Cell = str | CodeLink | Link | tuple[str | CodeLink | Link, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A table; on a page it scrolls in its own box where it is too wide.
+
+    Parameters
+    ----------
+    title : str
+        A heading; may be empty.
+    head : sequence of str
+        Names of the columns, with units; if all are empty, there is no header row.
+    rows : sequence of sequence of Cell
+        The first cell names the row. Columns of numbers are aligned right, others left.
+    note : str
+        A sentence below, on a page.
+    """
+
+    title: str = ""
+    head: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    note: str = ""
+
+    def numeric(self) -> list[bool]:
+        """Return which columns hold numbers; the first never does."""
+        columns = ([text_of(row[i]) for row in self.rows if i < len(row)] for i in range(self.width))
+        return [i > 0 and _is_numeric([cell for cell in cells if cell]) for i, cells in enumerate(columns)]
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return max(map(len, [self.head, *self.rows]))
+
+    def text(self) -> str:
+        """Return it as aligned text.
+
+        Examples
+        --------
+        >>> print(Table(title="Errors", head=["data", "rms µm"], rows=[["a", "10.25"], ["b", "3"]]).text())
+        Errors
+        data  rms µm
+        a      10.25
+        b          3
+        """
+        rows = [[text_of(cell) for cell in row] for row in ([self.head] if any(self.head) else []) + list(self.rows)]
+        widths = [max(len(row[i]) for row in rows) for i in range(self.width)]
+        form = [f"{'>' if right else '<'}{width}" for right, width in zip(self.numeric(), widths, strict=True)]
+        lines = ["  ".join(map(format, row, form)).rstrip() for row in rows]
+        return "\n".join([self.title, *lines] if self.title else lines)
+
+    def html(self) -> str:
+        """Return it as HTML without style, for a notebook.
+
+        Examples
+        --------
+        >>> Table(head=["a"], rows=[["<1"]]).html()
+        '<table><tr><th>a</th></tr><tr><td>&lt;1</td></tr></table>'
+        """
+
+        def line(tag: str, cells: Sequence[Cell]) -> str:
+            return "<tr>" + "".join(f"<{tag}>{html.escape(text_of(cell))}</{tag}>" for cell in cells) + "</tr>"
+
+        title = f"<caption>{html.escape(self.title)}</caption>" if self.title else ""
+        head = line("th", self.head) if any(self.head) else ""
+        return f"<table>{title}{head}{''.join(line('td', row) for row in self.rows)}</table>"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Words:
+    """A list of sentences, plain or as a warning."""
+
+    title: str
+    lines: Sequence[Cell]
+    kind: Literal["warning", "plain"] = "plain"
+
+    def text(self) -> str:
+        """Return it as lines of text."""
+        return "\n".join([f"{self.title}:", *(f"- {text_of(line)}" for line in self.lines)])
+
+    def html(self) -> str:
+        """Return it as HTML without style, for a notebook."""
+        lines = "".join(f"<li>{html.escape(text_of(line))}</li>" for line in self.lines)
+        return f"<p>{html.escape(self.title)}</p><ul>{lines}</ul>"
+
+
+class Shown:
+    """A result that shows itself: as text by `summary()` and `repr`, as HTML in a notebook."""
+
+    __slots__ = ()
+
+    def contents(self) -> Sequence[str | Table | Words]:
+        """Return what it shows: sentences, tables, and lists of sentences, in order."""
+        raise NotImplementedError
+
+    def tables(self) -> list[Table]:
+        """Return its tables, as terminal, notebook and page show them."""
+        return [part for part in self.contents() if isinstance(part, Table)]
+
+    def summary(self) -> str:
+        """Return it as text, as the command of its name prints it."""
+        return text_of_all(self.contents())
+
+    def __repr__(self) -> str:
+        return self.summary()
+
+    def _repr_html_(self) -> str:
+        return "".join(
+            f"<p>{html.escape(part)}</p>" if isinstance(part, str) else part.html() for part in self.contents()
+        )
+
+
+def text_of_all(parts: Iterable[str | Table | Words]) -> str:
+    """Return sentences, tables and lists as text, an empty line between them."""
+    return "\n\n".join(part if isinstance(part, str) else part.text() for part in parts)
+
+
+def text_of(cell: Cell) -> str:
+    """Return the text of a cell; a code within a line is in brackets."""
+    if isinstance(cell, tuple):
+        return "".join(f"[{part.code}]" if isinstance(part, CodeLink) else text_of(part) for part in cell)
+    return cell if isinstance(cell, str) else cell.code if isinstance(cell, CodeLink) else cell.text
+
+
+def warnings_of(warnings: Iterable[Remark], title: str = "Warnings") -> list[Words]:
+    """Return warnings or remarks as a list with their codes; nothing where there are none."""
+    lines = [sentence_of(warning) for warning in warnings]
+    return [Words(title=title, lines=lines, kind="warning")] if lines else []
+
+
+def sentence_of(remark: Remark) -> Cell:
+    """Return a warning or remark as a line with its code."""
+    return (str(remark), " ", CodeLink(remark.code))
+
+
+def _is_numeric(cells: Sequence[str]) -> bool:
+    return 2 * sum(bool(_NUMBER.fullmatch(cell)) for cell in cells) >= len(cells)
+
+
+def is_determined(value: float, std: float) -> bool:
+    """Whether a standard error means anything: it is a number, and at most ten times the value."""
+    return math.isfinite(std) and std <= 10.0 * abs(value)
+
+
+def with_std(value: float, std: float) -> str:
+    """Return a value with its standard error, to two digits of the error; without one, the value alone.
 
     Examples
     --------
-    >>> html_table(["a"], [["<1"]])
-    '<table><tr><th>a</th></tr><tr><td>&lt;1</td></tr></table>'
+    >>> with_std(1.0182, 0.0021), with_std(10.0, 0.0), with_std(169.0, 3e5)
+    ('1.0182 ± 0.0021', '10', '169 (not determined)')
+    >>> with_std(133.5, 26.1), with_std(1203.0, 1980.0), with_std(-2.147e-6, 1.6e-7)
+    ('134 ± 26', '1200 ± 2000', '-2.15e-06 ± 0.16e-06')
     """
-
-    def line(tag: str, cells: Sequence[str]) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    return "<table>" + line("th", head) + "".join(line("td", row) for row in rows) + "</table>"
+    if std == 0.0:
+        return f"{value:.4g}"
+    if not is_determined(value, std):
+        return f"{value:.3g} (not determined)"
+    decimals = 1 - int(f"{std:.1e}".partition("e")[2])
+    power = int(f"{max(abs(value), std):.1e}".partition("e")[2])
+    if -4 < power < 6:
+        places = max(decimals, 0)
+        return f"{round(value, decimals):.{places}f} ± {round(std, decimals):.{places}f}"
+    places = max(decimals + power, 0)
+    return f"{value / 10.0**power:.{places}f}e{power:+03d} ± {std / 10.0**power:.{places}f}e{power:+03d}"

@@ -150,6 +150,11 @@ class SampleQuality(Code):
     STALE = "stale", "The device gives no new values.", "Check device and connection."
     INVALID = "invalid", "The device marks the value as invalid.", "Check the device."
     TOO_FEW = "too_few", "Too few good readings in the sample.", "See the channel's errors: line, module, noise."
+    OUTLIER = (
+        "outlier",
+        "A single reading far from the others of its sample was left out.",
+        "Nothing for a few; check the line for noise if there are many.",
+    )
     OUT_OF_RANGE = "out_of_range", "The value is outside the channel's plausible range.", "Check sensor and range."
     TOO_FAST = (
         "too_fast",

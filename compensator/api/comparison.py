@@ -1,37 +1,34 @@
-"""`tc.compare`: models beside no compensation and persistence, on the same samples."""
+"""`tc.compare`: models, no compensation and persistence on the same samples."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from compensator.api.files import ModelLike, model_of, page_in
+from compensator.api.files import ModelLike, Paged, model_of
 from compensator.arrays import Mask, Vector
 from compensator.blas import one_thread
 from compensator.data.frames import frame_of
-from compensator.data.measurement import measurements
+from compensator.data.measurement import DataLike, measurements
 from compensator.data.record import require
-from compensator.display import html_table
+from compensator.display import Table
 from compensator.errors import DataError, UsageError
-from compensator.identify.summary import aligned
-from compensator.model.simulation import Scores, scores, simulate
+from compensator.model.simulation import SCORE_HEAD, Scores, scores, simulate
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
+    from compensator.report.page import Page
 
 #: What every model is compared with.
 NOTHING, PERSISTENCE = "no compensation", "persistence"
-_HEAD = ["", "rms µm", "peak to peak µm", "fit %"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class ComparisonResult:
+class ComparisonResult(Paged):
     """Errors of models in free run on the same samples.
 
     Parameters
@@ -73,28 +70,25 @@ class ComparisonResult:
         found = {name: dataclasses.asdict(row) for name, row in self.scores.items()}
         return {"from_h": self.from_h, "samples": self.samples, "scores": found}
 
-    def summary(self) -> str:
-        """Return the errors as a table of text."""
-        return "\n".join([self._words(), "", *aligned([_HEAD, *self._rows()], left=1)])
+    def contents(self) -> list[str | Table]:
+        """Return what it shows: the samples compared, and the errors of each model."""
+        table = Table(
+            title="Errors on the same samples",
+            head=["", *SCORE_HEAD],
+            rows=[[name, *row.cells()] for name, row in self.scores.items()],
+        )
+        return [f"{self.samples} samples in free run" + (f" from {self.from_h:g} h on" if self.from_h else ""), table]
 
-    def page(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page: .html, .pdf, or .png for its picture."""
-        return page_in(path, self.write_page)
-
-    def write_page(self, path: Path, also: Path | None = None) -> Path:
-        """Write the page as HTML, and in the format of another file too."""
-        from compensator.report.formats import write
-        from compensator.report.page import Figure, Line, Page, Table, write_page
+    def as_page(self) -> Page:
+        """Return the content of the page."""
+        from compensator.report.page import Figure, Line, Page
 
         lines = tuple(Line(name, self.t_h, values) for name, values in self.residuals.items())
         figure = Figure(title="Error in free run", x_label="time, h", y_label="measured − predicted, µm", lines=lines)
-        table = Table(title="Errors on the same samples", head=_HEAD, rows=self._rows())
+        samples = self.contents()[0]
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)
-        words = f"Smallest error: {best}, {self.scores[best].rms_um:.2f} µm rms. {self._words()}."
-        page = Page(title="Comparison of models", verdict=words, blocks=[figure, table], tone="good")
-        if also is not None:
-            write(also, page)
-        return write_page(path, page)
+        words = f"Smallest error: {best}, {self.scores[best].rms_um:.2f} µm rms. {samples}."
+        return Page(title="Comparison of models", verdict=words, blocks=[figure, *self.tables()], tone="good")
 
     def plot(self) -> Plot:
         """Draw the error of each over time."""
@@ -103,25 +97,10 @@ class ComparisonResult:
         curves = [(name, self.t_h, values) for name, values in self.residuals.items()]
         return stacked([("measured − predicted, µm", curves)])[0]
 
-    def __repr__(self) -> str:
-        return self.summary()
-
-    def _repr_html_(self) -> str:
-        return f"<p>{self._words()}</p>" + html_table(_HEAD, self._rows())
-
-    def _words(self) -> str:
-        return f"{self.samples} samples in free run" + (f" from {self.from_h:g} h on" if self.from_h else "")
-
-    def _rows(self) -> list[list[str]]:
-        return [
-            [name, f"{row.rms_um:.2f}", f"{row.peak_to_peak_um:.2f}", f"{row.fit_pct:.2f}"]
-            for name, row in self.scores.items()
-        ]
-
 
 @one_thread
 def compare(
-    models: Mapping[str, ModelLike], data: Any, *, columns: Mapping[str, str] | None = None, from_h: float = 0.0
+    models: Mapping[str, ModelLike], data: DataLike, *, columns: Mapping[str, str] | None = None, from_h: float = 0.0
 ) -> ComparisonResult:
     """Compare models in free run on the samples that all of them predict.
 
@@ -129,8 +108,8 @@ def compare(
     ----------
     models : mapping of str to (ThermalModel, path or name)
         What to compare, by names of your own.
-    data : path, DataFrame, mapping of str to array_like, Measurement, or list of those
-        With T_Q, AT and measured Y; see `compensator.read`.
+    data : DataLike
+        With T_Q, AT and measured Y.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
     from_h : float

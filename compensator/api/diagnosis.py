@@ -14,16 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compensator import __version__
-from compensator.api.files import ModelLike, as_in_file, model_of, page_in
+from compensator.api.files import ModelLike, Paged, as_in_file, model_of
 from compensator.arrays import Vector
 from compensator.blas import in_one_thread, one_thread
-from compensator.data.measurement import Measurement, measurements, runs_in
+from compensator.data.measurement import DataLike, Measurement, measurements, runs_in
 from compensator.data.screening import screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.outcome import Diagnosis, FoundEffect
-from compensator.diagnose.summary import figures, text, verdict
-from compensator.display import html_table
-from compensator.identify.summary import with_std
+from compensator.diagnose.summary import contents, figures
+from compensator.display import Table, Words
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
@@ -31,13 +30,14 @@ from compensator.reasons import Remark
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
+    from compensator.report.page import Page
 
 #: What `save` writes into a folder.
 FILES = ("model.toml", "diagnosis.json", "report.html")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class DiagnosisResult:
+class DiagnosisResult(Paged):
     """What a model lacks.
 
     Parameters
@@ -68,10 +68,9 @@ class DiagnosisResult:
         """Return what `diagnosis.json` holds."""
         return figures(self.diagnosis)
 
-    def summary(self) -> str:
-        """Return what `compensator diagnose` prints."""
-        remarks = f"\n\nremarks: {'; '.join(self.remarks)}" if self.remarks else ""
-        return text(self.diagnosis) + remarks
+    def contents(self) -> list[str | Table | Words]:
+        """Return what it shows: the verdict, errors, effects with their parameters, warnings."""
+        return list(contents(self.diagnosis, self.remarks))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the extended model to a file, or everything to a folder as `compensator diagnose` does.
@@ -97,15 +96,11 @@ class DiagnosisResult:
         found.write_text(json.dumps(self.to_dict(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
         self.write_page(page, also=also)
 
-    def page(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page: .html, .pdf, or .png for its first picture."""
-        return page_in(path, self.write_page)
+    def as_page(self) -> Page:
+        """Return the content of the page."""
+        from compensator.report.diagnosis import page_of
 
-    def write_page(self, path: Path, also: Path | None = None) -> Path:
-        """Write the page as HTML, and in the format of another file too."""
-        from compensator.report.diagnosis import write_report
-
-        return write_report(path, self.diagnosis, self.model, self.remarks, also=also)
+        return page_of(self.diagnosis, self.model, self.remarks)
 
     def plot(self) -> Plot:
         """Draw the residual before and after on data that took no part, one run after another."""
@@ -116,35 +111,11 @@ class DiagnosisResult:
         before, after = ("before", hours, found.held_out_before), ("after", hours, found.held_out_after)
         return stacked([("residual on held-out blocks, µm", [before, after])])[0]
 
-    def __repr__(self) -> str:
-        return self.summary()
-
-    def _repr_html_(self) -> str:
-        rows = [
-            [
-                " ".join(filter(None, (effect.kind, effect.path, effect.channel))),
-                ", ".join(f"{name} {with_std(v['value'], v['std'])}" for name, v in effect.parameters.items()),
-                effect.explanation,
-            ]
-            for effect in self.effects
-        ]
-        errors = [
-            [name, f"{scores.rms_um:.2f}", f"{scores.peak_to_peak_um:.2f}", f"{scores.fit_pct:.2f}"]
-            for name, scores in (("before", self.diagnosis.before), ("after", self.diagnosis.after))
-        ]
-        return "".join(
-            (
-                f"<p><b>{self.verdict}</b>: {verdict(self.diagnosis)}</p>",
-                html_table(["effect", "value ± standard error", "in words"], rows) if rows else "",
-                html_table(["held out", "rms µm", "peak to peak µm", "fit %"], errors),
-            )
-        )
-
 
 @one_thread
 def diagnose(
     model: ModelLike,
-    data: Any,
+    data: DataLike,
     *,
     columns: Mapping[str, str] | None = None,
     progress: Progress = unreported,
@@ -156,8 +127,8 @@ def diagnose(
     ----------
     model : ThermalModel, path or name
         The base model.
-    data : path, DataFrame, mapping of str to array_like, Measurement, or list of those
-        Measured Y with every channel that was logged; see `compensator.read`.
+    data : DataLike
+        Measured Y with every channel that was logged.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
     progress : callable

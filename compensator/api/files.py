@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from compensator.display import Shown
 from compensator.errors import UsageError
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
+
+if TYPE_CHECKING:
+    from compensator.report.page import Page
 
 ModelLike = ThermalModel | str | os.PathLike[str]
 
@@ -47,21 +50,32 @@ def as_in_file(model: ThermalModel, provenance: Mapping[str, Any]) -> ThermalMod
     return parse_model(dump_model(whole).encode("utf-8"), source=model.name)
 
 
-def page_in(path: str | os.PathLike[str], write_html: Callable[..., Path]) -> Path:
-    """Write a page in the format that its name asks for: .html, .pdf, or .png.
+class Paged(Shown):
+    """A result that also has a page."""
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    write_html : callable
-        Called with the HTML file, and with `also`, a file of another format.
-    """
-    from compensator.report.formats import checked
+    __slots__ = ()
 
-    page = checked(Path(path), option="page")
-    if page.suffix.lower() == ".html":
-        return write_html(page)
-    with tempfile.TemporaryDirectory() as folder:
-        write_html(Path(folder) / "report.html", also=page)
-    return page
+    def as_page(self) -> Page:
+        """Return the content of the page."""
+        raise NotImplementedError
+
+    def page(self, path: str | os.PathLike[str]) -> Path:
+        """Write the page: .html, .pdf, or .png for its first picture.
+
+        Raises
+        ------
+        CompensatorError
+            If the name has another ending, or there is no browser to print with.
+        """
+        from compensator.report.formats import checked
+
+        return self.write_page(checked(Path(path), option="page"))
+
+    def write_page(self, path: Path, also: Path | None = None) -> Path:
+        """Write the page, and once more in the format of another file."""
+        from compensator.report.formats import write
+
+        page = self.as_page()
+        for target in filter(None, (path, also)):
+            write(target, page)
+        return path

@@ -10,7 +10,7 @@ from compensator import __version__
 from compensator.api.files import ModelLike, as_in_file, model_of
 from compensator.api.identification_result import IdentificationResult
 from compensator.blas import one_thread
-from compensator.data.measurement import PERIOD_S, Measurement, measurements, runs_in
+from compensator.data.measurement import PERIOD_S, DataLike, Measurement, measurements, runs_in
 from compensator.data.screening import screen_temperatures
 from compensator.errors import UsageError
 from compensator.identify.calibration import calibrate
@@ -20,17 +20,17 @@ from compensator.identify.settings import Method, Settings
 from compensator.identify.summary import figures
 from compensator.progress import Progress, unreported
 
-#: What a model file keeps of the figures, beside where it comes from.
+#: Figures that a model file keeps in its provenance.
 _KEPT = ("method", "parts", "warnings", "remarks", "ttf")
 _DEFAULT = Settings()
 
 
 @one_thread
 def identify(
-    data: Any,
+    data: DataLike,
     *,
-    validate: Any = (),
-    etve: Any = (),
+    validate: DataLike = (),
+    etve: DataLike = (),
     columns: Mapping[str, str] | None = None,
     name: str = "model",
     kind: Literal["auto", "heat", "direct"] = "auto",
@@ -49,9 +49,9 @@ def identify(
 
     Parameters
     ----------
-    data : path, DataFrame, mapping of str to array_like, Measurement, or list of those
-        Runs that the model is fitted to; see `compensator.read`.
-    validate, etve : as `data`, optional
+    data : DataLike
+        Runs that the model is fitted to.
+    validate, etve : DataLike, optional
         Runs that only validate the model; a test without heat source (methods II and III).
     columns : mapping of str to str, optional
         Column name for each role that has another name.

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import pandas
 
-from compensator.api.simulation import SimulationResult
+from compensator.api.simulation_result import SimulationResult
 from compensator.data.frames import time_index
 from compensator.model.simulation import Scores
 from compensator.reasons import Remark
@@ -20,7 +20,7 @@ class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
     Parameters
     ----------
     result : SimulationResult
-        The same columns as arrays, with scores, remarks and `plot()`.
+        The same columns as arrays, with `plot()` and `to_dict()`, which on a DataFrame are pandas's.
     """
 
     _metadata: ClassVar[list[str]] = ["result"]
@@ -29,7 +29,7 @@ class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
     @classmethod
     def of(cls, result: SimulationResult, start_utc_s: float | None, *, local: bool) -> SimulationFrame:
         """Make a DataFrame of a result; `start_utc_s`: the time of `t_s` = 0, s since 1970 (`local`: no zone)."""
-        frame = cls(result.columns, index=time_index(result["t_s"], start_utc_s, local=local))
+        frame = cls(result.table, index=time_index(result["t_s"], start_utc_s, local=local))
         frame.result = result
         return frame
 

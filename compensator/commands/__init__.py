@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
+
+from compensator.reasons import Remark
+
+log = logging.getLogger("compensator")
 
 
 class Answer(NamedTuple):
@@ -21,3 +27,14 @@ class Answer(NamedTuple):
     result: dict[str, Any]
     text: str
     code: int = 0
+
+
+def log_warnings(source: object, warnings: Iterable[Remark]) -> None:
+    """Log warnings about a file, each with its code."""
+    for warning in warnings:
+        log.warning("%s: warning: %s", source, warning.marked)
+
+
+def warnings_as_json(warnings: Sequence[Remark]) -> dict[str, Any]:
+    """Return warnings and their codes as the results of commands hold them."""
+    return {"warnings": list(warnings), "warning_codes": [warning.code for warning in warnings]}

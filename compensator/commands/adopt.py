@@ -8,10 +8,11 @@ from typing import Any
 
 from compensator.clock import SystemClock
 from compensator.commands import Answer
+from compensator.commands.order import answered, operator_of
 from compensator.errors import ServiceError
 from compensator.events import CommandName
 from compensator.model.model_file import read_model_bytes
-from compensator.service.command_client import NotReached, ask, operator_of_file
+from compensator.service.command_client import NotReached, ask
 from compensator.service.loading import Setup, load
 from compensator.service.transfer.model_store import check_model
 
@@ -60,11 +61,9 @@ def back(arguments: argparse.Namespace) -> Answer:
 
 def _ask(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Namespace) -> dict[str, Any] | None:
     """Send a command to the running service; return None if there is none."""
-    operator = operator_of_file(arguments.zenoh) if arguments.zenoh is not None else None
+    payload, operator = json.dumps(wanted).encode(), operator_of(arguments)
     try:
-        return ask(
-            setup.config.zenoh, name, json.dumps(wanted).encode(), timeout_s=arguments.timeout, operator=operator
-        )
+        return ask(setup.config.zenoh, name, payload, timeout_s=arguments.timeout, operator=operator)
     except NotReached:
         return None
 
@@ -73,6 +72,4 @@ def _answered(reply: dict[str, Any] | None, kept: str, sha256: str) -> Answer:
     if reply is None:
         text = f"{kept} {NOT_REACHED}"
         return Answer({"ok": True, "service_reached": False, "model_sha256": sha256, "text": text}, text)
-    if not reply.get("ok"):
-        raise ServiceError(f"the service refuses: {reply.get('text', 'no reason given')}")
-    return Answer({**reply, "service_reached": True}, str(reply.get("text", "")))
+    return answered(reply, service_reached=True)

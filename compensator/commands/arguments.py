@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-_COLUMN = "role of a column of another name"
 _OPERATOR = "Zenoh configuration with the operator's certificate, such as operator.json5; needed over TLS"
 _SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (default: all cores of this machine)"
+
+
+def _column(parser: argparse.ArgumentParser) -> None:
+    words = "role of a column of another name"
+    parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME", help=words)
 
 
 def _page(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +39,7 @@ def demo(parser: argparse.ArgumentParser) -> None:
 
 
 def run(parser: argparse.ArgumentParser) -> None:
-    """Describe the argument of `run`, `check` and `probe`."""
+    """Describe the argument of `run`, `check` and `probe`; `adopt` and `back` have it as well."""
     parser.add_argument("--config", required=True, metavar="FILE", help="configuration of the service")
 
 
@@ -48,7 +52,7 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     add("data", type=Path, metavar="DATA", help="CSV, MAT, or a recording")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="CSV")
-    add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
+    _column(parser)
 
 
 def export(parser: argparse.ArgumentParser) -> None:
@@ -80,7 +84,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     add("data", type=Path, nargs="+", metavar="DATA", help="CSV, MAT, or recordings; one or several")
     add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html is written next to it")
     _page(parser)
-    add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
+    _column(parser)
     add("--name", help="name of the model (default: that of the file)")
     add = parser.add_argument_group("structure of the model").add_argument
     words = "with a TTF, or from T_Q - AT straight to y (default: with one where heat_w is known)"
@@ -113,7 +117,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
     _page(parser)
-    add("--column", action="append", default=[], metavar="ROLE=NAME", help=_COLUMN)
+    _column(parser)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
 

@@ -16,15 +16,7 @@ log = logging.getLogger("compensator")
 
 
 def run(arguments: argparse.Namespace) -> Answer | None:
-    """Run the command.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be used, or gives no sign that was determined on the machine.
-    UsageError
-        If asyncua is not installed.
-    """
+    """Run the command."""
     settings, opcua = load_bridge(arguments.config)
     if arguments.check:
         text = (

@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import logging
 
-from compensator.commands import Answer
+from compensator.commands import Answer, log_warnings, warnings_as_json
 from compensator.service.compensation import Compensation
 from compensator.service.loading import load
 
-log = logging.getLogger("compensator")
-
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command.
-
-    Raises
-    ------
-    CompensatorError
-        Naming what is wrong with the configuration.
-    """
+    """Run the command."""
     setup = load(arguments.config)
     config, model = setup.config, setup.model
     checks = Compensation(config, model).plausibility.describe()
     warnings = setup.warnings()
-    for warning in warnings:
-        log.warning("%s: warning: %s", arguments.config, warning.marked)
+    log_warnings(arguments.config, warnings)
     machine, devices = config.machine.name, setup.fleet.devices
     text = (
         f"{arguments.config}: good. Machine {machine}, model {model.name} ({model.kind}), "
@@ -38,8 +28,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         "model": model.name,
         "model_sha256": model.sha256,
         "devices": list(devices),
-        "warnings": list(warnings),
-        "warning_codes": [warning.code for warning in warnings],
+        **warnings_as_json(warnings),
         "checks": checks,
     }
     return Answer(result, text)

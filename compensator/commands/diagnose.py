@@ -9,7 +9,7 @@ from pathlib import Path
 from compensator.api.diagnosis import FILES, diagnose
 from compensator.api.files import model_of
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_folder, checked_page
+from compensator.commands.outputs import checked_folder, checked_page, pages_text
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.data.measurement import measurements
@@ -21,13 +21,7 @@ ALONE = 30_000
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command.
-
-    Raises
-    ------
-    CompensatorError
-        If the data or the model cannot be read, or there is too little.
-    """
+    """Run the command."""
     given = arguments
     page = checked_page(given.page)
     return diagnose_files(
@@ -52,6 +46,7 @@ def diagnose_files(
     with progress_bar("searching") as progress, workers(FOLDS if values > ALONE else 1, scheduler) as executor:
         found = diagnose(base, measured, progress=progress, executor=executor)
     found.save_all(out, also=also)
-    paths = {"model": str(out / FILES[0]), "model_sha256": found.model.sha256, "report": str(out / FILES[2])}
-    text = f"{found.summary()}\n\nmodel: {paths['model']}\npage: {paths['report']}"
+    model_file, page = out / FILES[0], out / FILES[2]
+    paths = {"model": str(model_file), "model_sha256": found.model.sha256, "report": str(page)}
+    text = f"{found.summary()}\n\nmodel: {model_file}\n{pages_text(page, also)}"
     return Answer(found.to_dict() | paths, text)

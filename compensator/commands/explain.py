@@ -7,25 +7,20 @@ import difflib
 
 from compensator.commands import Answer
 from compensator.errors import UsageError
-from compensator.reasons import WORDS, explain
+from compensator.reasons import WORDS
 from compensator.receiver.reasons import WORDS as RECEIVER_WORDS
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command.
-
-    Raises
-    ------
-    UsageError
-        If there is no such code.
-    """
+    """Run the command."""
     known = {**WORDS, **{code: words for code, words in RECEIVER_WORDS.items() if code not in WORDS}}
     if arguments.code is None:
         lines = [f"{code:<22} {means}" for code, (means, _) in known.items()]
         return Answer({code: {"means": means, "do": do} for code, (means, do) in known.items()}, "\n".join(lines))
-    words = explain(arguments.code) or RECEIVER_WORDS.get(arguments.code)
+    code = arguments.code.lower()
+    words = known.get(code.partition(":")[0])
     if words is None:
-        near = difflib.get_close_matches(arguments.code, known, n=3)
-        meant = f"expected one of: {', '.join(near)}" if near else "no code is similar"
-        raise UsageError(f"{arguments.code}: unknown, {meant}; `compensator explain` has all codes")
-    return Answer({"code": arguments.code, "means": words[0], "do": words[1]}, f"{words[0]}\n{words[1]}")
+        near = difflib.get_close_matches(code, known, n=3)
+        meant = f"did you mean {', '.join(near)}?" if near else "no code is similar;"
+        raise UsageError(f"{arguments.code}: unknown code, {meant} `compensator explain` lists all codes")
+    return Answer({"code": code, "means": words[0], "do": words[1]}, f"{words[0]}\n{words[1]}")

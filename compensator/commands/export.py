@@ -10,13 +10,7 @@ from compensator.data.export import export
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command.
-
-    Raises
-    ------
-    CompensatorError
-        If the recording cannot be read, or the table cannot be written there.
-    """
+    """Run the command."""
     out = checked_file(arguments.out, "--out", read=arguments.recording, ending=".csv")
     samples = export(arguments.recording, out, arguments.machine)
     return Answer({"samples": samples, "out": str(out)}, f"{samples} samples → {out}")

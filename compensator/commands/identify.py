@@ -8,7 +8,7 @@ from pathlib import Path
 from compensator.api.identification import identify
 from compensator.api.identification_result import IdentificationResult
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_file, checked_page
+from compensator.commands.outputs import checked_file, checked_page, pages_text
 from compensator.commands.progress import progress_bar
 from compensator.data.table import roles_of
 from compensator.errors import UsageError
@@ -16,13 +16,7 @@ from compensator.model.model_file import BUILT_IN
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command.
-
-    Raises
-    ------
-    CompensatorError
-        If the data or the options allow no model.
-    """
+    """Run the command."""
     given = arguments
     if str(given.out) in BUILT_IN:
         raise UsageError(f"--out {given.out}: is the name of the published model, expected one that ends in .toml")
@@ -55,4 +49,4 @@ def write(found: IdentificationResult, out: Path, *, also: Path | None = None) -
     found.save(out)
     page = found.write_page(out.parent / "report.html", also=also)
     files = {"model": str(out), "model_sha256": found.model.sha256, "report": str(page)}
-    return Answer(files | found.to_dict(), f"{found.summary()}\n\nmodel: {out}\npage: {page}")
+    return Answer(files | found.to_dict(), f"{found.summary()}\n\nmodel: {out}\n{pages_text(page, also)}")

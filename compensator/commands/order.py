@@ -12,21 +12,21 @@ from compensator.commands import Answer
 from compensator.config import Zenoh, load_config
 from compensator.errors import ServiceError, UsageError
 from compensator.events import CommandName
-from compensator.service.command_client import ask, operator_of_file
+from compensator.service.command_client import Operator, ask, operator_of_file
 
 
 def zero(arguments: argparse.Namespace) -> Answer:
-    """Run the command; see `_order`."""
+    """Set the machine's present state as zero."""
     return _order(CommandName.ZERO, {"mode": arguments.mode}, arguments)
 
 
 def hold(arguments: argparse.Namespace) -> Answer:
-    """Run the command; see `_order`."""
+    """Freeze the offset."""
     return _order(CommandName.HOLD, {}, arguments)
 
 
 def resume(arguments: argparse.Namespace) -> Answer:
-    """Run the command; see `_order`."""
+    """Let the offset follow again."""
     return _order(CommandName.RESUME, {}, arguments)
 
 
@@ -38,7 +38,7 @@ def _order(name: str, payload: dict[str, Any], arguments: argparse.Namespace) ->
     CompensatorError
         If the service is not reached, does not answer or refuses.
     """
-    operator = operator_of_file(arguments.zenoh) if arguments.zenoh is not None else None
+    operator = operator_of(arguments)
     if (arguments.config is None) == (arguments.prefix is None):
         raise UsageError("expected either --config FILE, or --prefix PREFIX with --zenoh FILE")
     if arguments.config is not None:
@@ -50,7 +50,16 @@ def _order(name: str, payload: dict[str, Any], arguments: argparse.Namespace) ->
             settings = msgspec.convert({"prefix": arguments.prefix}, Zenoh)
         except msgspec.ValidationError as error:
             raise UsageError(f"--prefix {arguments.prefix!r}: expected words between single slashes") from error
-    reply = ask(settings, name, json.dumps(payload).encode(), timeout_s=arguments.timeout, operator=operator)
+    return answered(ask(settings, name, json.dumps(payload).encode(), timeout_s=arguments.timeout, operator=operator))
+
+
+def operator_of(arguments: argparse.Namespace) -> Operator | None:
+    """Return the operator of `--zenoh`, None without it."""
+    return operator_of_file(arguments.zenoh) if arguments.zenoh is not None else None
+
+
+def answered(reply: dict[str, Any], **more: Any) -> Answer:
+    """Return the service's reply, with more for `--json`; raise what it refuses."""
     if not reply.get("ok"):
         raise ServiceError(f"the service refuses: {reply.get('text', 'no reason given')}")
-    return Answer(reply, str(reply.get("text", "")))
+    return Answer({**reply, **more}, str(reply.get("text", "")))

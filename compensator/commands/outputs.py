@@ -86,6 +86,11 @@ def checked_page(path: Path | None) -> Path | None:
     return checked(path, option="--page")
 
 
+def pages_text(page: Path, also: Path | None) -> str:
+    """Return a line for each page that was written."""
+    return "\n".join(f"page: {path}" for path in (page, also) if path is not None)
+
+
 def _check_parent(path: Path, option: str) -> None:
     """Refuse a file whose folder does not exist and cannot be made."""
     there = path.absolute().parent

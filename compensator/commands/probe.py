@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import logging
 from typing import Any
 
-from compensator.commands import Answer
+from compensator.commands import Answer, log_warnings, warnings_as_json
 from compensator.reasons import Remark
 from compensator.remarks import ServiceWarning
 from compensator.service.composition import read_once
@@ -16,25 +15,16 @@ from compensator.service.presence import is_used
 from drivers.errors import DriverError
 from drivers.reading import Quality
 
-log = logging.getLogger("compensator")
-
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command; the exit code is 1 if a channel gave no good reading.
-
-    Raises
-    ------
-    CompensatorError
-        If the configuration cannot be used.
-    """
+    """Run the command; the exit code is 1 if a channel gave no good reading."""
     setup = load(arguments.config)
     config, fleet = setup.config, setup.fleet
     warnings = []
     if is_used(setup.recordings, config.machine.name):
         figures = f"The service of {config.machine.name} is running and uses the devices."
         warnings.append(Remark(ServiceWarning.SERVICE_RUNS, figures))
-    for warning in warnings:
-        log.warning("%s: warning: %s", arguments.config, warning.marked)
+    log_warnings(arguments.config, warnings)
     units = {name: dict(device.units) for name, device in fleet.devices.items()}
     answers = asyncio.run(read_once(fleet))
     rows: list[dict[str, Any]] = []
@@ -50,7 +40,7 @@ def run(arguments: argparse.Namespace) -> Answer:
                 row["value"] = reading.value
         rows.append(row)
     good = all(row["quality"] == Quality.GOOD for row in rows)
-    result = {"channels": rows, "warnings": list(warnings), "warning_codes": [warning.code for warning in warnings]}
+    result = {"channels": rows, **warnings_as_json(warnings)}
     return Answer(result, "\n".join(map(_line, rows)), 0 if good else 1)
 
 

@@ -12,7 +12,7 @@ from compensator.atomic_write import atomic_write
 from compensator.audit.comparison import COLUMNS, compare
 from compensator.audit.series import audit, summary
 from compensator.commands import Answer
-from compensator.commands.outputs import checked_file
+from compensator.commands.outputs import checked_file, checked_page
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
@@ -29,18 +29,8 @@ ALONE = 8_000_000
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command.
-
-    Raises
-    ------
-    CompensatorError
-        If something that was given cannot be read.
-    """
-    paths, page = recordings_in(arguments.recording), arguments.page
-    if page is not None:
-        from compensator.report.formats import checked
-
-        checked(page, option="--page")
+    """Run the command."""
+    paths, page = recordings_in(arguments.recording), checked_page(arguments.page)
     if arguments.model is not None:
         if arguments.public_key is not None:
             raise UsageError("--public-key: belongs to the audit, which --model does not make")

@@ -12,13 +12,7 @@ from compensator.errors import UsageError
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command.
-
-    Raises
-    ------
-    CompensatorError
-        If there are neither recordings nor pages, or the page cannot be written.
-    """
+    """Run the command."""
     from compensator.recording.reading import recordings_in
     from compensator.report.formats import checked
 

@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from compensator.certificates import check_files, remarks
-from compensator.commands import Answer
+from compensator.commands import Answer, log_warnings
 from compensator.errors import ConfigError, ServiceError
 from compensator.reasons import Remark
 from compensator.remarks import ServiceWarning
@@ -25,15 +25,7 @@ _SECURED = ("tls/", "quic/")
 
 
 def run(arguments: argparse.Namespace) -> Answer | None:
-    """Run the command.
-
-    Raises
-    ------
-    ConfigError
-        If the file has an unknown key, or one that would not have the effect it suggests.
-    ServiceError
-        If an endpoint cannot be listened on.
-    """
+    """Run the command."""
     path: Path = arguments.config
     config = checked(path, read_config_file(path))
     endpoints = get(config, "listen/endpoints")
@@ -75,8 +67,7 @@ def checked(path: Path, file: ConfigFile) -> zenoh.Config:
         wrong = certificate.wrong_at(now) if certificate is not None else None
         if wrong is not None:
             raise ConfigError(f"{path}: {wrong}")
-        for remark in remarks(certificate, now):
-            log.warning("%s: warning: %s", path, remark.marked)
+        log_warnings(path, remarks(certificate, now))
     return config
 
 
@@ -87,7 +78,7 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
         if access.get("rules") or access.get("policies"):
             raise ConfigError(f"{path}: access_control/enabled: expected true with rules; without it none applies")
         figures = "No access list: whoever connects may publish and command everything."
-        log.warning("%s: warning: %s", path, Remark(ServiceWarning.NO_ACCESS_LIST, figures).marked)
+        log_warnings(path, [Remark(ServiceWarning.NO_ACCESS_LIST, figures)])
         return
     if access.get("default_permission") != "deny":
         raise ConfigError(

@@ -15,13 +15,7 @@ log = logging.getLogger("compensator")
 
 
 def run(arguments: argparse.Namespace) -> Answer:
-    """Run the command.
-
-    Raises
-    ------
-    CompensatorError
-        If the data or the model cannot be read.
-    """
+    """Run the command."""
     given = arguments
     out = checked_file(given.out, "--out", read=(given.data, Path(given.model)), ending=".csv")
     found = simulate(given.model, given.data, columns=roles_of(given.column))

@@ -7,19 +7,23 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
+from compensator import display
 from compensator.data.files import read_csv, read_mat, read_recordings
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
 from compensator.data.record import Data, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.table import Table
-from compensator.display import html_table
 from compensator.errors import DataError, UsageError
 from compensator.reasons import Remark
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 #: Sample period of the models made, s: the service's.
 PERIOD_S = 60.0
@@ -55,7 +59,7 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
-class Measurement:
+class Measurement(display.Shown):
     """Measured data as it was read: one table, or recordings that follow each other.
 
     Parameters
@@ -105,12 +109,9 @@ class Measurement:
         data = to_grid(self.table, period_s)
         return Data(records=data.records, remarks=(*self.remarks, *data.remarks))
 
-    def __repr__(self) -> str:
-        rows = [": ".join(row) for row in self._rows()]
-        return "\n".join([f"{self.name}:", *(f"  {row}" for row in rows)])
-
-    def _repr_html_(self) -> str:
-        return html_table([self.name, ""], self._rows())
+    def contents(self) -> list[display.Table]:
+        """Return what it shows: span, samples, columns, remarks."""
+        return [display.Table(title=self.name, head=["", ""], rows=self._rows())]
 
     def _rows(self) -> list[list[str]]:
         t_s, columns = self.table.t_s, self.table.columns
@@ -125,14 +126,23 @@ class Measurement:
         return rows + [["remark", remark] for remark in remarks]
 
 
-def read(data: Any, *, columns: Mapping[str, str] | None = None, name: str = "data") -> Measurement:
+Source: TypeAlias = "str | os.PathLike[str] | DataFrame | Mapping[str, npt.ArrayLike] | Measurement"
+DataLike: TypeAlias = "Source | Sequence[Source]"
+"""What every verb accepts as data: a path, a DataFrame, a mapping of arrays, a Measurement, or several of those.
+
+A path names a table (CSV or MAT) or a recording. Columns of what is in memory have the names of a table's: `t_s` or
+`time_utc` is the time, the others are roles (`t_q_degc`, `at_degc`, `y_um`, `heat_w`) or further channels; NaN is
+missing. A sequence is several runs; recordings in it follow each other and are one.
+"""
+
+
+def read(data: DataLike, *, columns: Mapping[str, str] | None = None, name: str = "data") -> Measurement:
     """Read measured data.
 
     Parameters
     ----------
-    data : path, DataFrame, mapping of str to array_like, Measurement, or sequence of paths
-        A table (CSV or MAT), a recording or several that follow each other, or a table in memory. Its time is `t_s`, s,
-        or `time_utc`; NaN is missing.
+    data : DataLike
+        One table, or recordings that follow each other.
     columns : mapping of str to str, optional
         Column name for each role that has another name: `{"t_q_degc": "t5"}`.
     name : str
@@ -146,10 +156,10 @@ def read(data: Any, *, columns: Mapping[str, str] | None = None, name: str = "da
     Examples
     --------
     >>> read({"t_s": [0, 60], "t5": [20.0, 20.5], "at_degc": [20.0, 20.1]}, columns={"t_q_degc": "t5"})
-    data:
-      span: 0.02 h
-      samples: 2 of 60 s
-      columns: at_degc, t_q_degc
+    data
+    span     0.02 h
+    samples  2 of 60 s
+    columns  at_degc, t_q_degc
     """
     found = measurements(data, name, columns, needed=True)
     if len(found) != 1:
@@ -158,7 +168,7 @@ def read(data: Any, *, columns: Mapping[str, str] | None = None, name: str = "da
 
 
 def measurements(
-    data: Any, role: str, columns: Mapping[str, str] | None = None, *, needed: bool = False
+    data: DataLike | None, role: str, columns: Mapping[str, str] | None = None, *, needed: bool = False
 ) -> list[Measurement]:
     """Read a DATA argument: one source or a list of them.
 
@@ -167,7 +177,7 @@ def measurements(
     Parameters
     ----------
     data, columns
-        As :func:`read`, and lists of them.
+        As :func:`read`; several tables, too.
     role : str
         What messages call data that is no file; numbered where there are several.
     needed : bool
@@ -178,8 +188,9 @@ def measurements(
     DataError
         As :func:`read`.
     """
-    several = isinstance(data, Sequence) and not isinstance(data, (str, bytes))
-    sources = list(data) if several else [] if data is None else [data]
+    sources: list[Any] = [] if data is None else [data]
+    if isinstance(data, Sequence) and not isinstance(data, (str, bytes)):
+        sources = list(data)
     if columns is not None and not isinstance(columns, Mapping):
         raise UsageError(f'columns: {type(columns).__name__}, expected names by role: {{"t_q_degc": "t5"}}')
     if needed and not sources:

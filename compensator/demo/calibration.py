@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from compensator.api.identification import identify
 from compensator.arrays import Vector
 from compensator.commands.identify import write
 from compensator.demo.machine import MACHINES
+from compensator.identify.comparison import Row
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 
 PERIOD_S = 60.0
@@ -44,7 +44,7 @@ def calibrate(folder: Path, *, machine: str, seed: int) -> None:
     write(identify(table, name=f"sim-{machine}"), table.parent / "model.toml")
 
 
-def paper_case(folder: Path, *, seed: int) -> dict[str, Any]:
+def paper_case(folder: Path, *, seed: int) -> Sequence[Row]:
     """Repeat the paper's calibration on its published equations and compare the result with the printed coefficients.
 
     90 W for six of twelve hours; 95 % of the readings within 1 % of full scale, as stated in the paper.
@@ -58,8 +58,8 @@ def paper_case(folder: Path, *, seed: int) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        The result of `identify`, with the comparison.
+    sequence of Row
+        Each coefficient, compared with the printed one.
     """
     duty = Duty.paper_calibration(seed)
     per_reading = np.sqrt(READINGS) * 0.01 / 1.96
@@ -69,7 +69,8 @@ def paper_case(folder: Path, *, seed: int) -> dict[str, Any]:
     table = folder / "run.csv"
     write_table(table, World(PublishedQuill(), duty, sensors, seed).record(PERIOD_S))
     found = identify(table, name="paper", order=(3, 3, 2), drive="known", reference="quill")
-    return write(found, folder / "model.toml").result
+    write(found, folder / "model.toml")
+    return found.comparison
 
 
 def write_table(path: Path, columns: Mapping[str, Vector]) -> None:

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from compensator.commands import Answer
+from compensator.commands.outputs import checked_page, pages_text
 from compensator.demo.calibration import calibrate, paper_case
 from compensator.demo.day import run_day
-from compensator.demo.figures import as_text, shown
-from compensator.demo.figures import table as table_of
+from compensator.demo.figures import shown, table_of
 from compensator.demo.live import run_live
 from compensator.demo.loop import close_the_loop
 from compensator.demo.machine import MACHINES
 from compensator.report.demonstration import closed, page_of, verdict
-from compensator.report.formats import checked, write
+from compensator.report.formats import write
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -50,7 +50,7 @@ def _run(arguments: argparse.Namespace) -> Answer:
         recordings = run_live(arguments.out, hours=arguments.hours, seed=arguments.seed, port=arguments.port)
         text = f"stopped; for the recordings: compensator replay {recordings}, compensator report {recordings}"
         return Answer({"recordings": str(recordings)}, text)
-    also = checked(arguments.page, option="--page") if arguments.page else None
+    also = checked_page(arguments.page)
     return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed, also=also))
 
 
@@ -83,7 +83,7 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
     table = table_of(results)
     loop, second_day = close_the_loop(out / "conduction", hours=hours, seed=seed)
     made = page_of(days, table, loop, second_day, paper_case(out / "paper", seed=seed))
-    for path in (page, *([also] if also is not None else [])):
+    for path in filter(None, (page, also)):
         write(path, made)
     summary = (
         f"Closed loop on the conduction machine, effect drawn by the seed: {loop['drawn']}; found in the recordings of "
@@ -91,4 +91,4 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
         f"Second day: {loop['second_day_rms_um']['without']:.2f} µm rms without compensation. {closed(loop)}"
     )
     result = {"machines": results, "loop": loop, "report": str(page)}
-    return result, f"{as_text(table)}\n\n{verdict(days)}\n{summary}\npage: {page}"
+    return result, f"{table.text()}\n\n{verdict(days)}\n{summary}\n{pages_text(page, also)}"

@@ -10,6 +10,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.demo.day import START_NS, Day
+from compensator.display import Table
 from compensator.messages import number
 from compensator.model.simulation import scores
 from compensator.report.demonstration import MachineDay
@@ -69,15 +70,12 @@ def shown(name: str, day: Day) -> MachineDay:
     )
 
 
-def table(results: Mapping[str, Any]) -> list[list[str]]:
-    """Return the table of errors of all machines, with its head."""
-    rows = [["simulated machine", "", "rms µm", "peak-to-peak µm", "fit %", "samples", "seconds"]]
+def table_of(results: Mapping[str, Any]) -> Table:
+    """Return the table of errors of all machines."""
+    cases = {"without": "no compensation", "held": "offset held 60 s", "followed": "rate followed"}
+    rows = []
     for machine, figures in results.items():
-        for key, words in (
-            ("without", "no compensation"),
-            ("held", "offset held 60 s"),
-            ("followed", "rate followed"),
-        ):
+        for key, words in cases.items():
             first = key == "without"
             rows.append(
                 [
@@ -90,10 +88,9 @@ def table(results: Mapping[str, Any]) -> list[list[str]]:
                     f"{figures['seconds']:.1f}" if first else "",
                 ]
             )
-    return rows
-
-
-def as_text(rows: list[list[str]]) -> str:
-    """Return a table as aligned text."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return Table(
+        title="Errors in Y",
+        head=["simulated machine", "", "rms µm", "peak to peak µm", "fit %", "samples", "seconds"],
+        rows=rows,
+        note="Fit: of measured and predicted deformation, 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖).",
+    )

@@ -1,15 +1,16 @@
-"""A diagnosis in figures and in words: `diagnosis.json` and the terminal."""
+"""A diagnosis in figures, tables and words: for `diagnosis.json`, terminal, notebook and page."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from compensator.diagnose.fit import Term
 from compensator.diagnose.outcome import Diagnosis, FoundEffect
-from compensator.identify.summary import with_std
-from compensator.model.simulation import Scores
+from compensator.display import Table, Words, warnings_of, with_std
+from compensator.model.simulation import SCORE_HEAD, Scores
+from compensator.reasons import Remark
 from compensator.remarks import ModelWarning
 
 _VERDICTS = {
@@ -23,6 +24,22 @@ _DOES_NOT_HOLD = (
     "Something acts that the model lacks; what fits it best here does not hold on held-out data, so the model was left "
     "as it was."
 )
+
+#: Parameters of an effect that are shown unfolded.
+SHOWN = 6
+#: Units in the names of parameters, and on the page.
+_UNITS = {
+    "um": "µm",
+    "k": "K",
+    "w": "W",
+    "min": "min",
+    "h": "h",
+    "s": "s",
+    "degc": "°C",
+    "rpm": "(1/min)",
+    "pct": "%",
+    "bar": "bar",
+}
 
 #: What `diagnosis.json` says of an effect, after its place.
 _FIGURES = ("parameters", "deployable", "explanation", "rms_before_um", "rms_after_um")
@@ -63,47 +80,100 @@ def _scores(scores: Scores) -> dict[str, float | None]:
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def verdict(diagnosis: Diagnosis) -> str:
-    """Return the diagnosis in one or two sentences."""
-    words = _VERDICTS[diagnosis.verdict]
-    if any(warning.code == ModelWarning.MADE_WORSE for warning in diagnosis.warnings):
+def verdict(found: Mapping[str, Any]) -> str:
+    """Return a diagnosis in one or two sentences.
+
+    Parameters
+    ----------
+    found : mapping
+        As :func:`figures`, or read from `diagnosis.json`.
+    """
+    words = _VERDICTS[found["verdict"]]
+    if ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
-    before, after, noise = diagnosis.before.rms_um, diagnosis.after.rms_um, diagnosis.noise_floor_um
-    if not diagnosis.effects:
+    before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
+    if not found["effects"]:
         return f"{words} Residual {before:.2f} µm rms, sensor noise {noise:.2f}."
     return (
-        f"{words} {_names(diagnosis.effects)}. On held-out data the residual goes from {before:.2f} to {after:.2f} µm "
+        f"{words} {_names(found['effects'])}. On held-out data the residual goes from {before:.2f} to {after:.2f} µm "
         f"rms (sensor noise {noise:.2f})."
     )
 
 
-def _names(effects: Sequence[FoundEffect]) -> str:
+def _names(effects: Sequence[Mapping[str, Any]]) -> str:
     """Return kinds and places of all effects, those of one kind together."""
     places: dict[str, list[str]] = {}
     for effect in effects:
-        kind, _, place = name(effect).partition(": ")
-        places.setdefault(kind, []).append(place)
+        place = " ".join(filter(None, (effect["path"], effect["channel"])))
+        places.setdefault(effect["kind"].capitalize(), []).append(place)
     return "; ".join(": ".join(filter(None, (kind, ", ".join(filter(None, where))))) for kind, where in places.items())
 
 
 def name(effect: FoundEffect) -> str:
     """Return an effect's kind and place."""
-    kind, *where = effect.place
-    return ": ".join(part for part in (kind.capitalize(), " ".join(word for word in where if word)) if part)
+    return _names([_place(effect.term)])
 
 
-def text(diagnosis: Diagnosis) -> str:
-    """Return the summary for the terminal."""
-    lines = [verdict(diagnosis)]
+def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | Table | Words]:
+    """Yield what terminal and notebook show: the verdict, tables, explanations, warnings and remarks."""
+    yield verdict(figures(diagnosis))
+    yield error_table(diagnosis)
     for i, effect in enumerate(diagnosis.effects, start=1):
-        values = ", ".join(f"{n} {with_std(v, effect.std[n])}" for n, v in list(effect.named.items())[:6])
-        lines += ["", f"{i}. {name(effect)}: {values}", f"   {effect.explanation}"]
-        if not effect.deployable:
-            lines.append("   It cannot be compensated by the model; model.toml leaves it out.")
-        lines += [
-            f"   nearly as good: {rival.label} ({rival.rms_after_um:.2f} µm rms). {rival.how_to_tell_apart}"
-            for rival in effect.rivals
-        ]
-    if diagnosis.warnings:
-        lines += ["", "warnings:", *(f"- {word} [{word.code}]" for word in diagnosis.warnings)]
-    return "\n".join(lines)
+        yield parameter_table(effect, title=f"{i}. {name(effect)}", count=SHOWN)
+        yield explanation(effect)
+        if effect.rivals:
+            yield rivals(effect)
+    yield from warnings_of(diagnosis.warnings)
+    yield from warnings_of(remarks, "Remarks on the data")
+
+
+def error_table(diagnosis: Diagnosis) -> Table:
+    """Return the errors on held-out data, of the base model and the extended one."""
+    return Table(
+        title="Errors on held-out data",
+        head=["", *SCORE_HEAD],
+        rows=[
+            ["base model", *diagnosis.before.cells()],
+            ["extended model", *diagnosis.after.cells()],
+            ["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""],
+        ],
+        note=f"Held-out data: {diagnosis.held_out}.",
+    )
+
+
+def parameter_table(effect: FoundEffect, *, title: str = "", count: int | None = None) -> Table:
+    """Return the parameters of an effect, or the first of them, with their standard errors."""
+    rows = [[in_words(key), with_std(value, effect.std[key])] for key, value in effect.named.items()]
+    if count is not None:
+        rows = rows[:count]
+        rows.append(["residual of the fit without the effect, µm rms", f"{effect.rms_before_um:.2f}"])
+        rows.append(["residual of the fit with the effect, µm rms", f"{effect.rms_after_um:.2f}"])
+    return Table(title=title, head=["parameter", "value ± standard error"], rows=rows)
+
+
+def explanation(effect: FoundEffect) -> Words:
+    """Return what an effect means, and whether the model compensates it."""
+    deploy = "Deployed in the extended model." if effect.deployable else "Not deployable: not in the extended model."
+    return Words(title="Explanation", lines=[effect.explanation, deploy])
+
+
+def rivals(effect: FoundEffect) -> Words:
+    """Return the other explanations of an effect, and how to tell them apart."""
+    lines = [f"{r.label}: {r.rms_after_um:.2f} µm rms remain. {r.how_to_tell_apart}" for r in effect.rivals]
+    return Words(title="Rival explanations", lines=lines)
+
+
+def in_words(key: str) -> str:
+    """Return the name of a parameter with its unit in the usual notation.
+
+    Examples
+    --------
+    >>> in_words("half_width_um"), in_words("gain_um_per_rpm2"), in_words("um_per_h"), in_words("change_per_100")
+    ('half width, µm', 'gain, µm/(1/min)²', 'rate, µm/h', 'change per 100')
+    """
+    words = key.split("_")
+    at = len(words)
+    while at and (words[at - 1].rstrip("2") in _UNITS or words[at - 1] == "per"):
+        at -= 1
+    unit = "".join("/" if word == "per" else _UNITS[word.rstrip("2")] + "²" * word.endswith("2") for word in words[at:])
+    return f"{' '.join(words[:at]) or 'rate'}{', ' if unit else ''}{unit}"

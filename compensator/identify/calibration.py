@@ -122,6 +122,35 @@ class Calibration:
         return (*first, self.deformation.dtf, self.deformation.tdtf)
 
 
+def joined(parts: Sequence[Part]) -> tuple[Vector, Vector, Vector, list[tuple[float, float]]]:
+    """Join parts on one time axis, h: files follow each other with a gap of half an hour, in which Y is NaN.
+
+    Returns
+    -------
+    (numpy.ndarray, numpy.ndarray, numpy.ndarray, list of (float, float))
+        Time, h; measured and predicted Y, µm; first and last hour of each held-out part.
+    """
+    t: list[Vector] = []
+    y: list[Vector] = []
+    predicted: list[Vector] = []
+    held_out = []
+    shift, last_name = 0.0, ""
+    for part in parts:
+        hours = part.t_s / 3600.0
+        if t and part.name != last_name:
+            end = t[-1][-1]
+            shift = end + 0.5 - hours[0]
+            for values, gap in ((t, end), (y, np.nan), (predicted, np.nan)):
+                values.append(np.array([gap]))
+        last_name = part.name
+        t.append(hours + shift)
+        y.append(part.y_um)
+        predicted.append(part.y_pred_um)
+        if part.role == "held out":
+            held_out.append((float(t[-1][0]), float(t[-1][-1])))
+    return np.concatenate(t), np.concatenate(y), np.concatenate(predicted), held_out
+
+
 def calibrate(
     runs: Sequence[Run],
     settings: Settings,
@@ -239,10 +268,11 @@ def _drive(run: Run, temperature: TemperatureFit | None, settings: Settings) -> 
 
 
 def _path(name: str, kind: Kind, path: PathFit) -> Path:
-    covariance = None
-    if path.fit is not None:
-        covariance = tuple(tuple(row) for row in path.fit.coefficient_covariance(path.column).tolist())
-    return Path(sampled=path.function, unit=PATH_UNITS[kind][name], covariance=covariance)
+    unit = PATH_UNITS[kind][name]
+    if path.fit is None:
+        return Path(sampled=path.function, unit=unit)
+    covariance = tuple(tuple(row) for row in path.fit.coefficient_covariance(path.column).tolist())
+    return Path(sampled=path.function, unit=unit, covariance=covariance, gain_std=path.fit.gain(path.column)[1])
 
 
 def _estimator(runs: Sequence[Run], drives: Sequence[Vector], noise: Mapping[str, float], kind: Kind) -> Estimator:

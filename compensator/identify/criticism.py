@@ -11,6 +11,7 @@ from scipy.special import gammaincc
 
 from compensator.arrays import ComplexVector, Mask, Vector
 from compensator.data.runs import Run
+from compensator.display import with_std
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
 from compensator.reasons import Remark
@@ -266,7 +267,7 @@ class _Warnings:
         path = self.paths["TDTF"]
         if path.gain_std == 0.0:
             return None
-        gain = f"the TDTF's gain is {path.gain:.2f} ± {path.gain_std:.2f} µm/K"
+        gain = f"the TDTF's gain is {with_std(path.gain, path.gain_std)} µm/K"
         if swing < 2.0:
             return Remark(
                 ModelWarning.QUIET_AMBIENT,
@@ -318,8 +319,8 @@ class _Warnings:
         return [
             Remark(
                 ModelWarning.UNDETERMINED_GAIN,
-                f"The gain of the {name} at rest is {path.gain:.3g} ± {path.gain_std:.2g} {_shown(path.unit)}: "
-                "poorly determined.",
+                f"The gain of the {name} at rest is poorly determined: {with_std(path.gain, path.gain_std)} "
+                f"{_shown(path.unit)}.",
             )
             for name, path in self.paths.items()
             if name != "TDTF" and path.gain_std > 0.3 * abs(path.gain)

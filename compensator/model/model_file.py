@@ -7,8 +7,10 @@ value and what was expected. The writer adds comments to the numbers.
 from __future__ import annotations
 
 import hashlib
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path as FilePath
 from typing import Any
@@ -19,8 +21,9 @@ from compensator.model.table import Table, shown
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
 
-#: Key of `ThermalModel.held_out_rms_um` in the provenance, where version 0.1.0 accepts any key.
-HELD_OUT_KEY = "folds_rms_um"
+#: Keys of `ThermalModel.held_out_rms_um` and of every `Path.gain_std` in the provenance, where version 0.1.0 accepts
+#: any key.
+HELD_OUT_KEY, GAIN_STD_KEY = "folds_rms_um", "gain_std"
 #: Models that ship with the package.
 BUILT_IN = ("quill",)
 
@@ -121,7 +124,9 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
     period_s = top.number("sample_period_s", low=0.1, high=3600.0)
     names = ("TTF", "DTF", "TDTF") if kind == "heat" else ("DTF", "TDTF")
     paths_table = Table("paths", table.get("paths", {}), names)
+    held_out, stds, provenance = _provenance(table.get("provenance", {}))
     paths = {name: _path(f"paths.{name}", value, period_s) for name, value in paths_table.table.items()}
+    paths |= {name: replace(path, gain_std=stds[name]) for name, path in paths.items() if name in stds}
     for name in names[:-1]:
         if name not in paths:
             raise ModelError(f"paths.{name} is missing; a model of kind {kind!r} needs it")
@@ -138,7 +143,8 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
         y_std_um=_uncertainty(table.get("uncertainty", {"y_std_um": 0.0})),
         effects=_effects(top.text("name"), table.get("effect", [])),
         alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
-        **_provenance(table.get("provenance", {})),
+        provenance=provenance,
+        held_out_rms_um=held_out,
         sha256=sha256,
     )
 
@@ -184,14 +190,16 @@ def _uncertainty(value: object) -> float:
     return Table("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0)
 
 
-def _provenance(value: object) -> dict[str, Any]:
-    """Return the provenance, and the calibration's error, which the file keeps among it."""
-    provenance = dict(Table("provenance", value).table)
-    held_out = provenance.get(HELD_OUT_KEY)
-    if not isinstance(held_out, float):
-        return {"provenance": provenance}
-    del provenance[HELD_OUT_KEY]
-    return {"provenance": provenance, "held_out_rms_um": held_out}
+def _provenance(value: object) -> tuple[float | None, dict[str, float], dict[str, Any]]:
+    """Return the calibration's error and the standard errors of its gains, which the file keeps there, and the rest."""
+    rest = dict(Table("provenance", value).table)
+    held_out, stds = rest.pop(HELD_OUT_KEY, None), rest.pop(GAIN_STD_KEY, None)
+    if held_out is not None and not isinstance(held_out, float):
+        rest[HELD_OUT_KEY], held_out = held_out, None
+    known = isinstance(stds, dict) and all(isinstance(std, float) and 0.0 <= std < math.inf for std in stds.values())
+    if stds is not None and not known:
+        rest[GAIN_STD_KEY], stds = stds, None
+    return held_out, stds or {}, rest
 
 
 def _validity(value: object) -> dict[str, tuple[float, float]]:

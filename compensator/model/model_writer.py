@@ -15,7 +15,7 @@ import numpy as np
 from compensator.atomic_write import atomic_write
 from compensator.errors import ModelError
 from compensator.model.effects import Effect
-from compensator.model.model_file import HELD_OUT_KEY, load_model, parse_model
+from compensator.model.model_file import GAIN_STD_KEY, HELD_OUT_KEY, load_model, parse_model
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
@@ -120,8 +120,12 @@ def _lines(model: ThermalModel) -> Iterator[str]:
     yield from _pairs("uncertainty", {"y_std_um": model.y_std_um})
     for number, effect in enumerate(model.effects, start=1):
         yield from _effect(f"effect {number}", effect)
-    held_out = {} if model.held_out_rms_um is None else {HELD_OUT_KEY: model.held_out_rms_um}
-    if provenance := {**held_out, **model.provenance}:
+    kept: dict[str, Any] = {} if model.held_out_rms_um is None else {HELD_OUT_KEY: model.held_out_rms_um}
+    paths = {"TTF": model.ttf, "DTF": model.dtf, "TDTF": model.tdtf}
+    stds = {name: path.gain_std for name, path in paths.items() if path is not None and path.gain_std is not None}
+    if stds:
+        kept[GAIN_STD_KEY] = stds
+    if provenance := {**kept, **model.provenance}:
         yield from ("", "# Where the model comes from.", "[provenance]", *_pairs("provenance", provenance))
 
 
@@ -142,20 +146,16 @@ def _path(where: str, path: Path, purpose: str, extra: Mapping[str, Any]) -> Ite
 
 
 def _gain(where: str, path: Path) -> str:
-    """Write the gain at rest, Σb / Σa, with its standard error from the covariance of b and a_1 …."""
-    b, a = path.sampled.b, path.sampled.a
-    total = math.fsum(a)
-    gain = math.inf if total == 0.0 else (path.continuous or path.sampled).dc_gain
+    """Write the gain at rest, with its standard error where that is known."""
+    n = len(path.sampled.b) + len(path.sampled.a) - 1
+    if path.covariance is not None and (len(path.covariance) != n or any(len(row) != n for row in path.covariance)):
+        raise ModelError(f"{where}.covariance: expected {n} rows of {n} numbers")
+    gain, std = path.gain_with_std()
     if math.isinf(gain):
         return "No gain at rest: it integrates"
-    if path.covariance is None:
+    if math.isnan(std):
         return f"Gain at rest {gain:.5g} {path.unit}"
-    gradient = np.array([1.0 / total] * len(b) + [-gain / total] * (len(a) - 1))
-    n = gradient.size
-    if len(path.covariance) != n or any(len(row) != n for row in path.covariance):
-        raise ModelError(f"{where}.covariance: expected {n} rows of {n} numbers")
-    variance = float(gradient @ np.array(path.covariance) @ gradient)
-    return f"Gain at rest {gain:.5g} +- {math.sqrt(max(variance, 0.0)):.2g} {path.unit} (one standard error)"
+    return f"Gain at rest {gain:.5g} +- {std:.2g} {path.unit} (one standard error)"
 
 
 def _dynamics(path: Path) -> str:

@@ -17,6 +17,9 @@ from compensator.model.thermal_model import ThermalModel
 #: Columns of a free run in the order of its CSV.
 COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_tdtf_um", "y_std_um")
 
+#: Columns of `Scores.cells`.
+SCORE_HEAD = ("rms µm", "peak to peak µm", "fit %")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scores:
@@ -33,6 +36,10 @@ class Scores:
     fit_pct: float
     rms_um: float
     peak_to_peak_um: float
+
+    def cells(self) -> list[str]:
+        """Return them as cells of a table below `SCORE_HEAD`."""
+        return [f"{self.rms_um:.2f}", f"{self.peak_to_peak_um:.2f}", f"{self.fit_pct:.2f}"]
 
 
 def simulate(model: ThermalModel, record: Record, *, source: str = "") -> dict[str, Vector]:

@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from compensator.display import Shown, Table, Words, with_std
 from compensator.errors import ModelError
 from compensator.model.effects import Effect
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction, continuous_image
@@ -33,6 +34,8 @@ PATH_UNITS: Mapping[Kind, Mapping[str, str]] = {
     "direct": {"DTF": "um/K", "TDTF": "um/K"},
 }
 
+#: A variance at most this many times its own rounding error is not determined.
+_ROUNDING = 100.0
 #: An inverse pole closer to −1 than this rings for more than about a dozen samples.
 RINGING_LIMIT = -0.8
 
@@ -51,12 +54,15 @@ class Path:
         The function in s, where the file gives that form.
     covariance : tuple of tuple of float, optional
         Covariance of the sampled coefficients `b_0 … b_n, a_1 … a_n`, where an identification gives it.
+    gain_std : float, optional
+        Standard error of the gain at rest, where an identification gives it.
     """
 
     sampled: SampledTransferFunction
     unit: str
     continuous: TransferFunction | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
+    gain_std: float | None = None
 
     @classmethod
     def from_continuous(cls, function: TransferFunction, period_s: float) -> Path:
@@ -66,6 +72,23 @@ class Path:
     def in_s(self) -> TransferFunction:
         """Return the function in s, made by the inverse of Tustin's rule where the file has z."""
         return self.continuous or continuous_image(self.sampled, unit=self.unit)
+
+    def gain_with_std(self) -> tuple[float, float]:
+        """Return the gain at rest, Σb / Σa, and its standard error.
+
+        The gain is infinite for a path that integrates. The standard error is that of the identification; without it,
+        that of the covariance of b and a_1 …, and NaN where there is none or where rounding outweighs it: the slower
+        the path, the more of its covariance cancels in the gain.
+        """
+        total = math.fsum(self.sampled.a)
+        gain = math.inf if total == 0.0 else (self.continuous or self.sampled).dc_gain
+        if self.gain_std is not None or self.covariance is None or math.isinf(gain):
+            return gain, math.nan if self.gain_std is None else self.gain_std
+        gradient = np.array([1.0 / total] * len(self.sampled.b) + [-gain / total] * (len(self.sampled.a) - 1))
+        covariance = np.array(self.covariance)
+        variance = float(gradient @ covariance @ gradient)
+        rounding = gradient.size * np.finfo(float).eps * float(np.abs(gradient) @ np.abs(covariance) @ np.abs(gradient))
+        return gain, math.sqrt(variance) if variance > _ROUNDING * rounding else math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,8 +122,8 @@ class Estimator:
                 raise ModelError(f"estimator: {name} = {value!r}, expected a finite number above 0")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ThermalModel:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class ThermalModel(Shown):
     """A thermal model that the engine can run.
 
     Parameters
@@ -154,6 +177,20 @@ class ThermalModel:
     def __post_init__(self) -> None:
         check_runnable(self)
 
+    def contents(self) -> list[str | Table | Words]:
+        """Return what it shows: its paths, its effects, and where it is valid."""
+        paths = {"TTF": self.ttf, "DTF": self.dtf, "TDTF": self.tdtf}
+        rows = [[name, *_path_cells(path)] for name, path in paths.items() if path is not None]
+        head = ["path", "gain at rest", "unit", "time constants, min"]
+        parts: list[str | Table | Words] = [f"model {self.name}", Table(head=head, rows=rows)]
+        if self.effects:
+            lines = [" ".join(filter(None, (effect.kind, effect.explanation))) for effect in self.effects]
+            parts.append(Words(title="Effects", lines=lines))
+        if self.validity:
+            ranges = [[name, f"{low:g}", f"{high:g}"] for name, (low, high) in self.validity.items()]
+            parts.append(Table(head=["valid for", "from", "to"], rows=ranges))
+        return parts
+
     def with_alternative(self, name: str) -> ThermalModel:
         """Return the model with one of its alternative paths in place.
 
@@ -168,6 +205,13 @@ class ThermalModel:
         replaced, path = self.alternatives[name]
         changes: dict[str, Any] = {replaced.lower(): path}
         return dataclasses.replace(self, **changes)
+
+
+def _path_cells(path: Path) -> list[str]:
+    gain, std = path.gain_with_std()
+    shown = f"{gain:.4g}" if math.isnan(std) else with_std(gain, std)
+    taus = (path.continuous or path.sampled).time_constants_min()
+    return [shown, path.unit.replace("um", "µm"), ", ".join(f"{tau:.4g}" for tau in taus if tau)]
 
 
 def check_runnable(model: ThermalModel) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from compensator.arrays import Vector
+from compensator.identify.comparison import Row as Comparison
+from compensator.identify.summary import comparison_table
 from compensator.report.page import Block, Cell, Details, Figure, Line, Link, Page, Section, Table
 
 #: Names of the machines in text.
@@ -38,10 +41,10 @@ class MachineDay:
 
 def page_of(
     days: Sequence[MachineDay],
-    table: Sequence[Sequence[str]],
+    table: Table,
     loop: Mapping[str, Any],
     second_day: Mapping[str, tuple[Vector, Vector]],
-    paper: Mapping[str, Any],
+    paper: Sequence[Comparison],
 ) -> Page:
     """Make the page.
 
@@ -49,23 +52,18 @@ def page_of(
     ----------
     days : sequence of MachineDay
         One for each machine.
-    table : sequence of sequence of str
-        Errors of all machines; the first row is the head.
+    table : Table
+        Errors of all machines.
     loop : dict
         Effect drawn, effects found, remaining errors.
     second_day : dict of str to (numpy.ndarray, numpy.ndarray)
         Time in h and error in µm of the second day, by model.
-    paper : dict
-        The paper's case, the result of `identify`.
+    paper : sequence of Comparison
+        Coefficients of the paper's case, compared with the printed ones.
     """
     blocks: list[Block] = [_error(day) for day in days]
     blocks += [
-        Table(
-            title="Errors in Y",
-            head=table[0],
-            rows=table[1:],
-            note="Fit: of measured and predicted deformation, 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖).",
-        ),
+        table,
         _loop(loop, second_day),
         _pages(days),
         Details(title="Heat, true and estimated", blocks=[_heat(day) for day in days]),
@@ -174,14 +172,10 @@ def _pages(days: Sequence[MachineDay]) -> Table:
     return Table(title="Pages of this demo", head=["page", "subject"], rows=rows)
 
 
-def _comparison(paper: Mapping[str, Any]) -> Table:
-    rows = [
-        [f"{r['path']}: {r['figure']}", f"{r['found']:.4g}", f"{r['std']:.2g}", f"{r['reference']:.4g}"]
-        for r in paper["comparison"]
-    ]
-    return Table(
-        head=["path and figure", "identified", "standard error", "printed"],
-        rows=rows,
+def _comparison(paper: Sequence[Comparison]) -> Table:
+    return dataclasses.replace(
+        comparison_table(paper),
+        title="",
         note="Identified from a run with 1 % measuring error and one step of 90 W in still air: the TTF is recovered, "
         "the slow part of DTF and TDTF only within its standard errors.",
     )

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.outcome import Diagnosis, FoundEffect
-from compensator.diagnose.summary import name, verdict
-from compensator.identify.summary import with_std
+from compensator.diagnose.summary import (
+    SHOWN,
+    error_table,
+    explanation,
+    figures,
+    name,
+    parameter_table,
+    rivals,
+    verdict,
+)
 from compensator.model.thermal_model import ThermalModel
-from compensator.report.formats import write
 from compensator.report.page import (
     Block,
     Details,
@@ -24,38 +30,17 @@ from compensator.report.page import (
     Tone,
     Words,
     warnings_of,
-    write_page,
 )
 
-#: Parameters of an effect that are shown unfolded.
-SHOWN = 6
-
-#: Units in the names of parameters, and on the page.
-_UNITS = {
-    "um": "µm",
-    "k": "K",
-    "w": "W",
-    "min": "min",
-    "h": "h",
-    "s": "s",
-    "degc": "°C",
-    "rpm": "(1/min)",
-    "pct": "%",
-    "bar": "bar",
-}
-
-_TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
+#: Tone of each verdict.
+TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
 
 
-def write_report(
-    path: Path, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str], *, also: Path | None = None
-) -> Path:
-    """Write the page.
+def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Page:
+    """Make the page.
 
     Parameters
     ----------
-    path, also : pathlib.Path
-        The HTML file, and another file for the same page, with any suffix of `formats.SUFFIXES`.
     diagnosis : Diagnosis
         The diagnosis.
     model : ThermalModel
@@ -64,18 +49,14 @@ def write_report(
         Corrections made while reading the data.
     """
     t = _hours(diagnosis)
-    blocks: list[Block] = [_before_and_after(t, diagnosis), _errors(diagnosis)]
+    blocks: list[Block] = [_before_and_after(t, diagnosis), error_table(diagnosis)]
     blocks += [_effect(t, effect) for effect in diagnosis.effects]
-    if diagnosis.warnings:
-        blocks.append(warnings_of(diagnosis.warnings))
+    blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
     blocks.append(_details(t, diagnosis, model, remarks))
     title = f"Diagnosis: what {model.name} lacks"
-    page = Page(title=title, verdict=verdict(diagnosis), blocks=blocks, tone=_TONES[diagnosis.verdict])
-    if also is not None:
-        write(also, page)
-    return write_page(path, page)
+    return Page(title=title, verdict=verdict(figures(diagnosis)), blocks=blocks, tone=TONES[diagnosis.verdict])
 
 
 def _hours(diagnosis: Diagnosis) -> Vector:
@@ -99,28 +80,9 @@ def _before_and_after(t: Vector, diagnosis: Diagnosis) -> Figure:
     )
 
 
-def _errors(diagnosis: Diagnosis) -> Table:
-    rows = [
-        [label, f"{s.rms_um:.2f}", f"{s.peak_to_peak_um:.1f}", f"{s.fit_pct:.2f}"]
-        for label, s in (("base model", diagnosis.before), ("extended model", diagnosis.after))
-    ]
-    rows.append(["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""])
-    return Table(
-        title="Errors on held-out data",
-        head=["", "rms µm", "peak to peak µm", "fit %"],
-        rows=rows,
-        note=f"Held-out data: {diagnosis.held_out}.",
-    )
-
-
 def _effect(t: Vector, effect: FoundEffect) -> Section:
-    parameters = [[in_words(key), with_std(value, effect.std[key])] for key, value in effect.named.items()]
-    rows = parameters[:SHOWN]
-    rows.append(["residual of the fit without the effect, µm rms", f"{effect.rms_before_um:.2f}"])
-    rows.append(["residual of the fit with the effect, µm rms", f"{effect.rms_after_um:.2f}"])
-    deploy = "Deployed in the extended model." if effect.deployable else "Not deployable: not in the extended model."
     blocks: list[Block] = [
-        Words(title="Explanation", lines=[effect.explanation, deploy]),
+        explanation(effect),
         Figure(
             title=f"Contribution: {name(effect)}",
             x_label="time, h",
@@ -128,35 +90,14 @@ def _effect(t: Vector, effect: FoundEffect) -> Section:
             lines=(Line("effect", t, effect.signal),),
             height=2.6,
         ),
-        Table(head=["parameter", "value ± standard error"], rows=rows),
+        parameter_table(effect, count=SHOWN),
     ]
-    if len(parameters) > SHOWN:
-        head = ["parameter", "value ± standard error"]
-        blocks.append(Details(title=f"All {len(parameters)} parameters", blocks=[Table(head=head, rows=parameters)]))
+    count = len(effect.named)
+    if count > SHOWN:
+        blocks.append(Details(title=f"All {count} parameters", blocks=[parameter_table(effect)]))
     if effect.rivals:
-        blocks.append(
-            Words(
-                title="Rival explanations",
-                lines=[f"{r.label}: {r.rms_after_um:.2f} µm rms remain. {r.how_to_tell_apart}" for r in effect.rivals],
-            )
-        )
+        blocks.append(rivals(effect))
     return Section(title=name(effect), blocks=blocks)
-
-
-def in_words(key: str) -> str:
-    """Return the name of a parameter with its unit in the usual notation.
-
-    Examples
-    --------
-    >>> in_words("half_width_um"), in_words("gain_um_per_rpm2"), in_words("um_per_h"), in_words("change_per_100")
-    ('half width, µm', 'gain, µm/(1/min)²', 'rate, µm/h', 'change per 100')
-    """
-    words = key.split("_")
-    at = len(words)
-    while at and (words[at - 1].rstrip("2") in _UNITS or words[at - 1] == "per"):
-        at -= 1
-    unit = "".join("/" if word == "per" else _UNITS[word.rstrip("2")] + "²" * word.endswith("2") for word in words[at:])
-    return f"{' '.join(words[:at]) or 'rate'}{', ' if unit else ''}{unit}"
 
 
 def _ranking(diagnosis: Diagnosis) -> Details:

@@ -103,7 +103,7 @@ def write(path: Path, page: Page) -> Path:
     if suffix == ".html":
         return write_page(path, page)
     path = path.resolve()
-    # Beside the target: browsers in a sandbox of the system (snap) see no /tmp, and the last step is a rename.
+    # In the target's folder: browsers in a sandbox of the system (snap) see no /tmp, and the last step is a rename.
     with tempfile.TemporaryDirectory(
         dir=path.parent, prefix=f"{path.stem}-printing-", ignore_cleanup_errors=True
     ) as name:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.identify.calibration import Calibration, Part
+from compensator.display import with_std
+from compensator.identify.calibration import Calibration, Part, joined
 from compensator.identify.choice import Candidate
 from compensator.identify.comparison import Row as Comparison
 from compensator.identify.criticism import LAGS, Criticism, PathView, ResidualView
-from compensator.identify.summary import error_rows, verdict, with_std
+from compensator.identify.summary import (
+    comparison_table,
+    error_table,
+    errors_of,
+    parameter_table,
+    share_left,
+    verdict,
+)
 from compensator.model.thermal_model import ThermalModel
-from compensator.report.formats import write
 from compensator.report.page import (
     Block,
     Details,
@@ -31,25 +37,16 @@ from compensator.report.page import (
     Tone,
     Words,
     warnings_of,
-    write_page,
 )
 
 
-def write_report(
-    path: Path,
-    calibration: Calibration,
-    criticism: Criticism,
-    model: ThermalModel,
-    comparison: Sequence[Comparison],
-    *,
-    also: Path | None = None,
-) -> Path:
-    """Write the page.
+def page_of(
+    calibration: Calibration, criticism: Criticism, model: ThermalModel, comparison: Sequence[Comparison] = ()
+) -> Page:
+    """Make the page.
 
     Parameters
     ----------
-    path, also : pathlib.Path
-        The HTML file, and another file for the same page, with any suffix of `formats.SUFFIXES`.
     calibration : Calibration
         The calibration.
     criticism : Criticism
@@ -57,55 +54,32 @@ def write_report(
     model : ThermalModel
         As written, with its hash.
     comparison : sequence of Comparison
-        Coefficients compared with those of another model; may be empty.
+        Coefficients compared with those of another model.
     """
-    blocks: list[Block] = [_prediction(calibration), _residuals(calibration), _errors(calibration)]
-    if criticism.warnings:
-        blocks.append(warnings_of(criticism.warnings))
+    errors = errors_of(calibration)
+    blocks: list[Block] = [_prediction(calibration), _residuals(calibration), error_table(calibration)]
+    blocks += warnings_of(criticism.warnings)
     if comparison:
-        blocks.append(_compared(comparison))
-    blocks += [*_parameters(calibration, criticism), *(_path_section(view) for view in criticism.paths)]
+        blocks.append(comparison_table(comparison))
+    blocks += [parameter_table(calibration, criticism), _coefficients(calibration)]
+    blocks += [_path_section(view) for view in criticism.paths]
     blocks.append(Section(title="Residual analysis", blocks=[_correlations(view) for view in criticism.residuals]))
     blocks.append(_choice(calibration))
     blocks.append(_provenance(calibration, model))
-    page = Page(
-        title=f"Calibration: {model.name}", verdict=verdict(calibration), blocks=blocks, tone=_tone(calibration)
-    )
-    if also is not None:
-        write(also, page)
-    return write_page(path, page)
+    return Page(title=f"Calibration: {model.name}", verdict=verdict(errors), blocks=blocks, tone=tone_of(errors))
 
 
-def _tone(calibration: Calibration) -> Tone:
-    held_out = [part.model.rms_um / part.nothing.rms_um for part in calibration.parts if part.role == "held out"]
-    share = max(held_out) if held_out else calibration.folds_rms_um / calibration.parts[0].nothing.rms_um
-    if share >= 1.0:
-        return "bad"
-    return "good" if share < 0.1 else "warn"
+def tone_of(errors: Mapping[str, Any]) -> Tone:
+    """Return the tone of a calibration by its errors on held-out data; see `summary.errors_of`."""
+    share = share_left(errors)
+    return "bad" if share >= 1.0 else "good" if share < 0.1 else "warn"
 
 
 def _joined(parts: Sequence[Part]) -> tuple[Vector, Vector, Vector, tuple[Span, ...]]:
-    """Join the parts on one time axis in hours, with a gap between files and a span for each held-out part."""
-    t: list[Vector] = []
-    y: list[Vector] = []
-    predicted: list[Vector] = []
-    spans: list[Span] = []
-    shift, last_name = 0.0, ""
-    for part in parts:
-        hours = part.t_s / 3600.0
-        if t and part.name != last_name:
-            shift = t[-1][-1] + 0.5 - hours[0]
-            gap = np.array([np.nan])
-            t.append(np.array([t[-1][-1]]))
-            y.append(gap)
-            predicted.append(gap)
-        last_name = part.name
-        t.append(hours + shift)
-        y.append(part.y_um)
-        predicted.append(part.y_pred_um)
-        if part.role == "held out":
-            spans.append(Span("held out" if not spans else "", float(t[-1][0]), float(t[-1][-1])))
-    return np.concatenate(t), np.concatenate(y), np.concatenate(predicted), tuple(spans)
+    """Return the parts on one time axis, and a span for each held-out part, the first of them named."""
+    t, y, predicted, held_out = joined(parts)
+    spans = (Span("" if i else "held out", first, last) for i, (first, last) in enumerate(held_out))
+    return t, y, predicted, tuple(spans)
 
 
 def _prediction(calibration: Calibration) -> Figure:
@@ -132,56 +106,19 @@ def _residuals(calibration: Calibration) -> Figure:
     )
 
 
-def _errors(calibration: Calibration) -> Table:
-    return Table(
-        title="Errors in free run",
-        head=["data", "part", "h", "fit %", "rms µm", "peak to peak µm", "uncompensated µm", "persistence µm"],
-        rows=error_rows(
-            calibration,
-            folds="cross-validation over blocks of the fitted data",
-            arx="ARX of the same structure, for comparison",
-        ),
-        note="Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖). Persistence: the last value before the part is held. "
-        "Runs that were not fitted are zeroed on their first hour.",
-    )
-
-
-def _parameters(calibration: Calibration, criticism: Criticism) -> list[Block]:
-    main, coefficients = [], []
-    for view, path in zip(criticism.paths, calibration.paths, strict=True):
-        unit = view.unit.replace("um", "µm")
-        main.append([f"{view.name}: static gain", with_std(view.gain, view.gain_std), unit])
-        main += [
-            [f"{view.name}: time constant", with_std(t, s), "min"]
-            for t, s in zip(view.taus_min, view.taus_std_min, strict=True)
-        ]
+def _coefficients(calibration: Calibration) -> Details:
+    rows = []
+    for path in calibration.paths:
         values = [*path.function.b, *path.function.a[1:]]
         stds = np.zeros(len(values))
         if path.fit is not None:
             stds = np.sqrt(np.diag(path.fit.coefficient_covariance(path.column)))
         names = [f"b{i}" for i in range(len(path.function.b))] + [f"a{i}" for i in range(1, len(path.function.a))]
-        coefficients += [
-            [f"{view.name}: {name}", with_std(value, std)]
+        rows += [
+            [f"{path.name}: {name}", with_std(value, std)]
             for name, value, std in zip(names, values, stds.tolist(), strict=True)
         ]
-    if calibration.temperature is not None:
-        main.append(
-            [
-                "inverse TTF: heat noise for 1 K of temperature noise",
-                f"{calibration.temperature.noise_gain_w_per_k:.1f}",
-                "W",
-            ]
-        )
-        main.append(["TTF: fit in free run with known heat", f"{calibration.ttf_fit_pct:.2f}", "%"])
-    return [
-        Table(
-            title="Parameters and their standard errors",
-            head=["parameter", "value", "unit"],
-            rows=main,
-            note="± one standard error, which includes the low-frequency power of a residual that is not white.",
-        ),
-        Details(title="Coefficients of 1/z", blocks=[Table(head=["coefficient", "value"], rows=coefficients)]),
-    ]
+    return Details(title="Coefficients of 1/z", blocks=[Table(head=["coefficient", "value"], rows=rows)])
 
 
 def _path_section(view: PathView) -> Block:
@@ -257,18 +194,6 @@ def _choice(calibration: Calibration) -> Block:
     if calibration.deformation.etve_candidates:
         blocks.append(table("TDTF, on the ETVE", calibration.deformation.etve_candidates))
     return Details(title="Order selection", blocks=blocks)
-
-
-def _compared(rows: Sequence[Comparison]) -> Table:
-    return Table(
-        title="Comparison with the reference model",
-        head=["path and figure", "identified", "standard error", "reference", "difference / standard error"],
-        rows=[
-            [f"{r.path}: {r.figure}", f"{r.found:.4g}", f"{r.std:.2g}", f"{r.reference:.4g}", f"{r.deviations:+.1f}"]
-            for r in rows
-        ],
-        note="Functions of s (1/min), highest denominator coefficient 1.",
-    )
 
 
 def _provenance(calibration: Calibration, model: ThermalModel) -> Block:

@@ -8,7 +8,6 @@ action at the end of the page.
 from __future__ import annotations
 
 import html
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -17,17 +16,14 @@ from pathlib import Path
 from typing import Literal
 
 from compensator.atomic_write import atomic_write
-from compensator.reasons import Remark, explain
+from compensator.display import Cell, CodeLink, Link, Table, Words, sentence_of, text_of, warnings_of
+from compensator.reasons import explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 
 Tone = Literal["good", "warn", "bad"]
 #: Widths of a figure alone and of one in a row, inches: the text of both stays readable.
 _WIDE_IN, _NARROW_IN = 9.0, 4.8
-#: Cells of a column of numbers: digits, signs, errors, percent, and dashes for missing values.
-_NUMBER = re.compile(
-    r"[-+−±–]?\s*\d[\d.,\s]*([eE][-+−]?\d+)?(\s*±\s*\d[\d.,eE+−-]*)?\s*%?(\s*\(.*\))?|nan|[-+−]?(inf|∞)|[-–—]"
-)
 #: Longest cell that stays on one line, and longest word (a file name, a hash) that is not broken, letters.
 _LONGEST_CELL, _LONGEST_WORD = 36, 24
 TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "bad": "✗ Failed"}
@@ -35,88 +31,11 @@ TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
-@dataclass(frozen=True, slots=True)
-class CodeLink:
-    """A state, reason, quality or warning; links to its meaning and action at the end of the page.
-
-    Parameters
-    ----------
-    code : str
-        Such as `hold`, or `outside_validity:t_q_degc`.
-    """
-
-    code: str
-
-    @property
-    def word(self) -> str:
-        """The code without its subject."""
-        return self.code.split(":", maxsplit=1)[0]
-
-
-@dataclass(frozen=True, slots=True)
-class Link:
-    """A link to another page.
-
-    Parameters
-    ----------
-    text, href : str
-        Its text and a relative address.
-    """
-
-    text: str
-    href: str
-
-
-#: Content of a cell or line: text, codes and links.
-Cell = str | CodeLink | Link | tuple[str | CodeLink | Link, ...]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
     """Figures side by side where the page is wide enough."""
 
     figures: tuple[Figure, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Table:
-    """A table; it scrolls in its own box where it is too wide.
-
-    Parameters
-    ----------
-    title : str
-        A heading; may be empty.
-    head : sequence of str
-        Names of the columns; if all are empty, there is no header row.
-    rows : sequence of sequence of Cell
-        The first cell names the row. Columns of numbers are aligned right, others left.
-    note : str
-        A sentence below.
-    """
-
-    title: str = ""
-    head: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
-    note: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Words:
-    """A list of sentences, plain or as a warning."""
-
-    title: str
-    lines: Sequence[Cell]
-    kind: Literal["warning", "plain"] = "plain"
-
-
-def warnings_of(cautions: Iterable[Remark]) -> Words:
-    """Return warnings as a block with links to their codes."""
-    return Words(title="Warnings", lines=[sentence_of(caution) for caution in cautions], kind="warning")
-
-
-def sentence_of(caution: Remark) -> Cell:
-    """Return a warning or remark as a line with a link to its code."""
-    return (str(caution), " ", CodeLink(caution.code))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,13 +129,6 @@ def codes_of(blocks: Iterable[Block]) -> list[str]:
     return list(words)
 
 
-def _text(cell: Cell) -> str:
-    """Return the text of a cell."""
-    if isinstance(cell, tuple):
-        return "".join(map(_text, cell))
-    return cell if isinstance(cell, str) else cell.code if isinstance(cell, CodeLink) else cell.text
-
-
 def _cells(block: Block) -> Iterator[Cell]:
     if isinstance(block, Table):
         for row in block.rows:
@@ -284,11 +196,11 @@ def _table(table: Table, level: int) -> str:
 
 
 def _classes(table: Table) -> list[str]:
-    """Return the class of each column: words (the first column is always one), sentences, long names, or numbers."""
+    """Return the class of each column: words, sentences, long names, or numbers."""
     classes = []
-    for i in range(max(map(len, [table.head, *table.rows]))):
-        cells = [text for row in table.rows if i < len(row) and (text := _text(row[i]))]
-        if i and 2 * sum(bool(_NUMBER.fullmatch(cell)) for cell in cells) >= len(cells):
+    for i, numeric in enumerate(table.numeric()):
+        cells = [text_of(row[i]) for row in table.rows if i < len(row)]
+        if numeric:
             classes.append("")
         elif max(map(len, cells), default=0) > _LONGEST_CELL:
             classes.append("text long")

@@ -68,7 +68,7 @@ def page_of(history: History) -> Page:
     beyond = _beyond(history.whole)
     blocks: list[Block] = [
         _offset(history),
-        *([warnings_of([beyond])] if beyond else []),
+        *warnings_of([beyond] if beyond else []),
         _band(history),
         _figures(history),
         _states(history),

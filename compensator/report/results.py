@@ -1,55 +1,58 @@
-"""The pages that demo, identify and diagnose wrote to a folder, and an overview that links to them."""
+"""An overview of the pages of demo, identify and diagnose, with their results from the files next to them."""
 
 from __future__ import annotations
 
-import html
+import json
 import os
-import re
+import tomllib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 from urllib.parse import quote
 
+from compensator.diagnose.summary import verdict as diagnosis_verdict
+from compensator.identify.summary import verdict as calibration_verdict
+from compensator.model.model_file import HELD_OUT_KEY
+from compensator.report.diagnosis import TONES
+from compensator.report.identification import tone_of
 from compensator.report.page import Block, Cell, Link, Page, Table, Tone
-
-#: Title, tone and verdict of a page, as `page.html_of` writes them.
-_HEAD = re.compile(r'<h1>([^<]*)</h1><p class="verdict (good|warn|bad)"><b>[^<]*</b>([^<]*)</p>')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PageFile:
-    """A page of the compensator.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file.
-    title, verdict, tone : str
-        Read from it.
-    """
+    """A page and its result; without a result next to it, the title is the folder's name and there is no verdict."""
 
     path: Path
     title: str
-    verdict: str
-    tone: Tone
+    verdict: str = ""
+    tone: Tone = "good"
 
 
 def pages_in(folder: Path) -> list[PageFile]:
-    """Return the pages of a folder and its subfolders, the uppermost first.
+    """Return the pages `report.html` of a folder and its subfolders, the uppermost first."""
+    paths = sorted(folder.rglob("report.html"), key=lambda path: (len(path.parts), path))
+    return [_diagnosis(path) or _calibration(path) or PageFile(path=path, title=path.parent.name) for path in paths]
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Where to look; other HTML files are ignored.
-    """
-    found = []
-    for path in sorted(folder.rglob("report.html"), key=lambda path: (len(path.parts), path)):
-        head = _HEAD.search(path.read_text(encoding="utf-8", errors="replace"))
-        if head is not None:
-            title, tone, verdict = map(html.unescape, head.groups())
-            found.append(PageFile(path=path, title=title, verdict=verdict, tone=cast(Tone, tone)))
-    return found
+
+def _diagnosis(page: Path) -> PageFile | None:
+    """Return the page of a diagnosis, by its `diagnosis.json`."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        found = json.loads(page.with_name("diagnosis.json").read_text(encoding="utf-8"))
+        return PageFile(path=page, title="Diagnosis", verdict=diagnosis_verdict(found), tone=TONES[found["verdict"]])
+    return None
+
+
+def _calibration(page: Path) -> PageFile | None:
+    """Return the page of a calibration, by the model file that keeps its errors."""
+    for path in sorted(page.parent.glob("*.toml")):
+        with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
+            model = tomllib.loads(path.read_text(encoding="utf-8"))
+            origin = model["provenance"]
+            errors = {"parts": origin["parts"], "folds_rms_um": origin[HELD_OUT_KEY]}
+            title = f"Calibration: {model['name']}"
+            return PageFile(path=page, title=title, verdict=calibration_verdict(errors), tone=tone_of(errors))
+    return None
 
 
 def overview(folder: Path, pages: Sequence[PageFile], *, relative_to: Path) -> Page:
@@ -68,7 +71,7 @@ def overview(folder: Path, pages: Sequence[PageFile], *, relative_to: Path) -> P
     def link(path: Path) -> Link:
         return Link(str(path.relative_to(folder)), quote(Path(os.path.relpath(path, relative_to)).as_posix()))
 
-    first = pages[0]
+    first = next((page for page in pages if page.verdict), pages[0])
     rows: list[list[Cell]] = [[link(page.path), page.title, page.verdict] for page in pages]
     blocks: list[Block] = [Table(title="Pages", head=["page", "subject", "result"], rows=rows)]
     folders = sorted({path.parent for path in folder.rglob("*.mcap")})
@@ -81,4 +84,5 @@ def overview(folder: Path, pages: Sequence[PageFile], *, relative_to: Path) -> P
                 note="compensator report FOLDER makes a page of one.",
             )
         )
-    return Page(title=f"{folder.resolve().name}: {first.title}", verdict=first.verdict, tone=first.tone, blocks=blocks)
+    title = f"{folder.resolve().name}: {first.title}"
+    return Page(title=title, verdict=first.verdict or f"{len(pages)} page(s).", tone=first.tone, blocks=blocks)

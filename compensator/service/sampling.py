@@ -29,7 +29,7 @@ WAIT_PART = 0.5
 OUTLIER_SIGMA = 6.0
 #: Median absolute deviation of a normal distribution, as a fraction of its standard deviation.
 _MAD_OF_SIGMA = 0.6745
-_OUTLIER = "outlier"
+_OUTLIER = str(SampleQuality.OUTLIER)
 
 
 class Grid:

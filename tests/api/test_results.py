@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 from pathlib import Path
 
 import matplotlib
@@ -12,7 +13,8 @@ import pytest
 from matplotlib.figure import Figure
 
 import compensator as tc
-from compensator.api.simulation import SimulationResult
+from compensator.api.simulation_result import SimulationResult
+from compensator.display import with_std
 from tests.api.tables import arrays, frame, write_run
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W
 
@@ -56,6 +58,32 @@ def test_an_identification_shows_draws_and_writes_itself(tmp_path: Path, found: 
         found.page(tmp_path / "page.txt")
 
 
+def test_terminal_notebook_and_page_show_the_same_tables(tmp_path: Path, found: object) -> None:
+    page = found.page(tmp_path / "page.html").read_text(encoding="utf-8")
+    tables = found.tables()
+    assert [table.title for table in tables] == ["Gains and time constants", "Errors in free run"]
+    for shown in (page, found._repr_html_(), found.summary()):
+        for table in tables:
+            assert all(html.escape(cell) in shown for row in table.rows for cell in row)
+
+
+def test_a_model_shows_its_gains_as_its_file_does(tmp_path: Path, found: object) -> None:
+    gain, std = found.params["dtf_gain_um_per_w"], found.std_errors["dtf_gain_um_per_w"]
+    text = found.save(tmp_path / "model.toml").read_text(encoding="utf-8")
+    assert f"Gain at rest {gain:.5g} +- {std:.2g} um/W (one standard error)" in text
+    for model in (found.model, tc.load_model(tmp_path / "model.toml")):
+        assert model.dtf.gain_std == std
+        assert f"<td>{with_std(gain, std)}</td><td>µm/W</td>" in model._repr_html_()
+
+
+def test_what_the_data_do_not_determine_has_no_standard_error(found: object) -> None:
+    first, *paths = found.criticism.paths
+    wide = dataclasses.replace(first, gain_std=228246.0)
+    poor = dataclasses.replace(found, criticism=dataclasses.replace(found.criticism, paths=(wide, *paths)))
+    assert np.isnan(poor.std_errors["ttf_gain_k_per_w"]) and np.isfinite(poor.params["ttf_gain_k_per_w"])
+    assert "228246" not in poor.summary() and "(not determined)" in poor.summary()
+
+
 def test_the_predictions_are_those_that_the_errors_were_computed_of(found: object) -> None:
     table = found.predictions
     assert isinstance(table, pd.DataFrame)
@@ -84,7 +112,7 @@ def test_a_diagnosis_shows_draws_and_writes_itself(tmp_path: Path, run: Path) ->
 def test_a_free_run_shows_and_draws_itself(run: Path) -> None:
     out = tc.simulate("quill", arrays(run))
     assert isinstance(out, SimulationResult)
-    assert "720 samples" in repr(out) and "µm rms" in out._repr_html_()
+    assert "720 samples" in repr(out) and "rms µm" in out._repr_html_()
     assert len(shown(out)) > 5_000
     without = {name: values for name, values in arrays(run).items() if name != "y_um"}
     alone = tc.simulate("quill", without)

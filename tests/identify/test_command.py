@@ -67,6 +67,13 @@ def test_json_and_a_direct_model_where_nobody_knows_the_heat(tmp_path, capsys):
     assert result["model_sha256"] == load_model(out).sha256
 
 
+def test_the_pdf_is_named_as_well(tmp_path, calibration, capsys):
+    out, page = tmp_path / "model.toml", tmp_path / "p.pdf"
+    assert main(["identify", str(calibration), "--out", str(out), "--order", "1", "1", "1", "--page", str(page)]) == 0
+    assert capsys.readouterr().out.endswith(f"page: {tmp_path / 'report.html'}\npage: {page}\n")
+    assert page.read_bytes().startswith(b"%PDF-")
+
+
 def test_bad_data_gives_one_line_and_no_model(tmp_path, capsys):
     bad = write_run(tmp_path / "bad.csv", CALIBRATION_W, 1, y_um=np.zeros(720))
     out = tmp_path / "model.toml"

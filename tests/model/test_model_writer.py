@@ -171,6 +171,19 @@ def test_the_comment_gives_gain_and_standard_error():
     assert f"T_Q - AT to deformation. Gain at rest {gain(at):.5g} +- {std:.2g} um/K" in dump_model(direct_model())
 
 
+def test_a_standard_error_lost_to_rounding_is_not_written():
+    # Two slow poles: the variance of the gain is far below the rounding of the covariance of b and a.
+    a = tuple(np.poly([0.9999, 0.9998]).tolist())
+    b = (1e-8, 1e-8)
+    deviation = np.array([1e-9, 1e-9, 0.1, -0.1])
+    covariance = tuple(tuple(row) for row in np.outer(deviation, deviation).tolist())
+    path = Path(sampled=SampledTransferFunction(b=b, a=a, period_s=60.0), unit="um/K", covariance=covariance)
+    assert "Gain at rest 1 um/K." in dump_model(direct_model(dtf=path))
+    known = dataclasses.replace(path, gain_std=0.25)
+    assert "Gain at rest 1 +- 0.25 um/K (one standard error)." in dump_model(direct_model(dtf=known))
+    assert read_back(direct_model(dtf=known)).dtf == known
+
+
 def test_the_comment_gives_time_constants_and_zeros():
     text = dump_model(load_model("quill"))
     assert "Time constants: 12.82, 76.34 min. Zeros: s = -2, -0.01588 1/min." in text

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from compensator.cli import main
+from compensator.identify.comparison import Row
 from compensator.recording.reading import recordings
 from compensator.report.demonstration import MachineDay, page_of
-from compensator.report.page import write_page
+from compensator.report.page import Table, write_page
 from tests.audit.made import MACHINE, Service, other_model, readings
 from tests.audit.test_command import tampered
 from tests.identify.quill_runs import CALIBRATION_W, published
@@ -94,9 +95,7 @@ def _demo(path: Path) -> None:
         "adopted": True,
         "adopted_after_h": 1.0,
     }
-    paper = {
-        "comparison": [{"path": "TTF", "figure": "gain at rest, K/W", "found": 0.25, "std": 0.01, "reference": 0.25}]
-    }
+    paper = [Row(path="TTF", figure="gain at rest, K/W", found=0.25, std=0.01, reference=0.25)]
     second_day = dict.fromkeys(("first", "extended"), (t, errors["followed"]))
-    table = [["machine", "", "rms µm"], ["conduction", "no compensation", "62.74"]]
+    table = Table(head=["machine", "", "rms µm"], rows=[["conduction", "no compensation", "62.74"]])
     write_page(path, page_of(days, table, loop, second_day, paper))

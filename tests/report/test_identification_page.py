@@ -10,8 +10,10 @@ import pytest
 from compensator.identify.calibration import calibrate
 from compensator.identify.criticism import criticise
 from compensator.identify.settings import Settings
+from compensator.identify.summary import errors_of
 from compensator.model.simulation import Scores
-from compensator.report.identification import _joined, _tone, write_report
+from compensator.report.identification import _joined, page_of, tone_of
+from compensator.report.page import write_page
 from tests.identify.quill_runs import CALIBRATION_W, published, runs_from
 
 
@@ -39,7 +41,7 @@ def calibration():
 def page(calibration, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "report.html"
     model = dataclasses.replace(calibration.model, sha256="cd" * 32)
-    assert write_report(path, calibration, criticise(calibration), model, ()) == path
+    assert write_page(path, page_of(calibration, criticise(calibration), model)) == path
     return path.read_text(encoding="utf-8")
 
 
@@ -110,10 +112,11 @@ def test_the_tone_is_that_of_the_worst_held_out_part(calibration, rms, tone):
         dataclasses.replace(first, model=score(0.01), nothing=score(1.0)),
         dataclasses.replace(second, model=score(rms), nothing=score(1.0)),
     )
-    assert _tone(dataclasses.replace(calibration, parts=parts)) == tone
+    assert tone_of(errors_of(dataclasses.replace(calibration, parts=parts))) == tone
 
 
 @pytest.mark.parametrize(("rms", "tone"), [(0.09, "good"), (0.5, "warn"), (1.0, "bad")])
 def test_without_held_out_data_the_folds_set_the_tone(calibration, rms, tone):
     fitted = dataclasses.replace(calibration.parts[0], nothing=Scores(fit_pct=0.0, rms_um=2.0, peak_to_peak_um=0.0))
-    assert _tone(dataclasses.replace(calibration, parts=(fitted,), folds_rms_um=2.0 * rms)) == tone
+    folds_only = dataclasses.replace(calibration, parts=(fitted,), folds_rms_um=2.0 * rms)
+    assert tone_of(errors_of(folds_only)) == tone

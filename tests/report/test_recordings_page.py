@@ -211,14 +211,23 @@ def test_recordings_of_two_machines_are_refused(
 def test_a_folder_with_results_leads_to_its_pages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     inner = tmp_path / "demo out" / "calibration"
     inner.mkdir(parents=True)
-    write_page(inner.parent / "report.html", Page(title="The <day>", verdict="It & works.", tone="warn"))
-    write_page(inner / "report.html", Page(title="Calibration", verdict="0.5 µm rms."))
+    found = {"verdict": "partly_explained", "warning_codes": [], "noise_floor_um": 0.1}
+    found |= {"effects": [{"kind": "drift", "path": None, "channel": None}]}
+    found |= {"before": {"rms_um": 4.0}, "after": {"rms_um": 1.0}}
+    (inner.parent / "diagnosis.json").write_text(json.dumps(found), encoding="utf-8")
+    part = '{ name = "a", role = "fitted", rms_um = 0.4, no_compensation_rms_um = 9.0, fit_pct = 95.0 }'
+    model = f'name = "The <spindle>"\n[provenance]\nfolds_rms_um = 0.5\nparts = [{part}]\n'
+    (inner / "model.toml").write_text(model, encoding="utf-8")
+    for folder in (inner.parent, inner):
+        write_page(folder / "report.html", Page(title="a page", verdict="of ours"))
     (inner / "other.html").write_text("<h1>not ours</h1>")
     assert main(["report", str(inner.parent), "--out", str(tmp_path / "all.html")]) == 0
-    assert "It & works." in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "something is left. Drift." in said and "0.50 µm rms in free run (9.0 without compensation)" in said
     page = (tmp_path / "all.html").read_text(encoding="utf-8")
     assert re.findall(r'<a href="([^"]*)"', page) == ["demo%20out/report.html", "demo%20out/calibration/report.html"]
-    assert '<p class="verdict warn"><b>⚠ Caution</b>It &amp; works.</p>' in page and "not ours" not in page
+    assert '<p class="verdict warn"><b>⚠ Caution</b>Part of what' in page and "not ours" not in page
+    assert "Calibration: The &lt;spindle&gt;" in page
 
 
 # ---------------------------------------------------------------------------- memory

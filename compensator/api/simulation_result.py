@@ -1,0 +1,93 @@
+"""The result of `tc.simulate`: columns by name, with their errors."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from compensator.arrays import Vector
+from compensator.atomic_write import atomic_write
+from compensator.display import Shown, Table, Words, text_of_all, warnings_of
+from compensator.model.simulation import SCORE_HEAD, Scores, csv_rows
+from compensator.reasons import Remark
+
+if TYPE_CHECKING:
+    from compensator.api.plotting import Plot
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
+class SimulationResult(Shown, Mapping[str, Vector]):
+    """Columns of a free run by name, as `compensator simulate` writes them.
+
+    Parameters
+    ----------
+    table : dict of str to numpy.ndarray, shape (n,)
+        `t_s`, `heat_w`, `y_pred_um`, `y_std_um`, the share of each path; `y_um`, `residual_um` where Y was measured.
+    records : int
+        Number of stretches without a long gap.
+    remarks : tuple of Remark
+        What had to be corrected in the data, and what makes the prediction doubtful.
+    scores : Scores or None
+        Fit, rms and peak to peak of the residual, where Y was measured.
+    """
+
+    table: dict[str, Vector]
+    records: int
+    remarks: tuple[Remark, ...]
+    scores: Scores | None
+
+    def __getitem__(self, name: str) -> Vector:
+        return self.table[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.table)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures, as `compensator simulate --json` prints them."""
+        found: dict[str, Any] = {"samples": int(self["t_s"].size), "records": self.records}
+        if self.scores is not None:
+            found |= {name: getattr(self.scores, name) for name in ("fit_pct", "rms_um", "peak_to_peak_um")}
+        return found
+
+    def contents(self) -> list[str | Table | Words]:
+        """Return what it shows: its size and columns, the errors where Y was measured, remarks."""
+        size = f"{self['t_s'].size} samples in {self.records} record(s), columns {', '.join(self)}"
+        parts: list[str | Table | Words] = [size]
+        if self.scores is not None:
+            parts.append(Table(head=["", *SCORE_HEAD], rows=[["measured − predicted", *self.scores.cells()]]))
+        return [*parts, *warnings_of(self.remarks, "Remarks")]
+
+    def summary(self) -> str:
+        """Return it as text without the remarks, which `compensator simulate` writes to stderr."""
+        return text_of_all(part for part in self.contents() if not isinstance(part, Words))
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the columns as CSV.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written there.
+        """
+        with atomic_write(Path(path)) as file:
+            csv.writer(file, lineterminator="\n").writerows(csv_rows(self.table))
+        return Path(path)
+
+    def plot(self) -> Plot:
+        """Draw measured and predicted deformation, and the residual."""
+        from compensator.api.plotting import stacked
+
+        hours = self["t_s"] / 3600.0
+        curves = [("predicted", hours, self["y_pred_um"])]
+        if self.scores is None:
+            return stacked([("Y, µm", curves)])[0]
+        curves.insert(0, ("measured", hours, self["y_um"]))
+        residual = [("measured − predicted", hours, self["residual_um"])]
+        return stacked([("Y, µm", curves), ("residual, µm", residual)])[0]
