@@ -97,6 +97,8 @@ class IdentificationResult:
 
         Raises
         ------
+        UsageError
+            If there is no such folder.
         OSError
             If it cannot be written there.
         """

@@ -78,6 +78,8 @@ class SimulationResult(Mapping[str, Vector]):
 
         Raises
         ------
+        UsageError
+            If there is no such folder.
         OSError
             If it cannot be written there.
         """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-_COLUMN = "role of a column of another name"
+_COLUMN = "role (t_s or time_utc too) of a column of another name; may be repeated"
 _OPERATOR = "Zenoh configuration with the operator's certificate, such as operator.json5; needed over TLS"
 _SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (default: all cores of this machine)"
 

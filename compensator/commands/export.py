@@ -18,5 +18,6 @@ def run(arguments: argparse.Namespace) -> Answer:
         If the recording cannot be read, or the table cannot be written there.
     """
     out = checked_file(arguments.out, "--out", read=arguments.recording, ending=".csv")
+    out.parent.mkdir(parents=True, exist_ok=True)
     samples = export(arguments.recording, out, arguments.machine)
     return Answer({"samples": samples, "out": str(out)}, f"{samples} samples → {out}")

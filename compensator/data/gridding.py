@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from compensator.remarks import DataRemark
 
 #: Longest table, in samples of the model: eleven years of minutes.
 MOST_SAMPLES = 6_000_000
+#: Most stretches whose begin a remark names.
+_SHOWN = 3
 
 
 def to_grid(table: Table, period_s: float) -> Data:
@@ -63,6 +66,7 @@ def to_grid(table: Table, period_s: float) -> Data:
             records.append((start, first))
             start = last
     records.append((start, n))
+    remarks += _missing_inputs(table.name, columns, records, period_s)
     return Data(
         records=tuple(
             Record(
@@ -72,6 +76,22 @@ def to_grid(table: Table, period_s: float) -> Data:
         ),
         remarks=tuple(remarks),
     )
+
+
+def _missing_inputs(
+    name: str, columns: Mapping[str, Vector], records: Sequence[tuple[int, int]], period_s: float
+) -> Iterator[Remark]:
+    """Yield a remark on each temperature that is missing for longer than what is bridged."""
+    for column in [c for c in ("t_q_degc", "at_degc") if c in columns]:
+        known = ~np.isnan(columns[column])
+        gaps = [(a + first, a + last) for a, b in records for first, last in _gaps(known[a:b])]
+        long = [(first, last) for first, last in gaps if last - first > SHORT_GAP_SAMPLES]
+        if long:
+            hours = sum(last - first for first, last in long) * period_s / 3600.0
+            where = ", ".join(f"{first * period_s:g}" for first, _ in long[:_SHOWN])
+            more = f" and {len(long) - _SHOWN} more" if len(long) > _SHOWN else ""
+            words = f"{name}: {column} is missing for {hours:.1f} h from t_s = {where}{more}; not interpolated."
+            yield Remark(DataRemark.TEMPERATURE_MISSING, words)
 
 
 def _check_size(table: Table, period_s: float) -> None:

@@ -134,7 +134,7 @@ def read(data: Any, *, columns: Mapping[str, str] | None = None, name: str = "da
         A table (CSV or MAT), a recording or several that follow each other, or a table in memory. Its time is `t_s`, s,
         or `time_utc`; NaN is missing.
     columns : mapping of str to str, optional
-        Column name for each role that has another name: `{"t_q_degc": "t5"}`.
+        Column name for each role, or for the time, that has another name: `{"t_q_degc": "t5", "t_s": "seconds"}`.
     name : str
         What messages call data that is no file.
 
@@ -192,7 +192,7 @@ def measurements(
             found.append(source)
         elif isinstance(source, (str, os.PathLike)):
             path = Path(source)
-            if path.suffix == ".mcap":
+            if path.suffix.lower() == ".mcap":
                 recordings.append(path)
             else:
                 found.append(_of_file(path, roles))
@@ -214,13 +214,18 @@ def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
         data = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: {error.strerror or error}; expected a table or a recording") from error
-    table, remarks = (read_mat(path) if path.suffix == ".mat" else read_csv(path, data)).measurements_only()
+    left_out: tuple[Remark, ...] = ()
+    if path.suffix.lower() == ".mat":
+        table, left_out = read_mat(path, roles)
+    else:
+        table = read_csv(path, data, roles)
+    table, remarks = table.measurements_only()
     table, origins = table.with_roles(roles), (_origin(path, data),)
-    return Measurement(table=table, label=path.name, origins=origins, roles=roles, remarks=remarks)
+    return Measurement(table=table, label=path.name, origins=origins, roles=roles, remarks=(*left_out, *remarks))
 
 
 def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
-    table, remarks = table_in_memory(name, source).measurements_only()
+    table, remarks = table_in_memory(name, source, roles).measurements_only()
     origin = Origin(name=name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
     return Measurement(
         table=table.with_roles(roles),
@@ -229,7 +234,7 @@ def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
         roles=roles,
         remarks=remarks,
         in_frame=is_frame(source),
-        local_time=is_frame(source) and has_local_time(source),
+        local_time=is_frame(source) and has_local_time(source, roles),
     )
 
 
