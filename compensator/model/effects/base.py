@@ -11,9 +11,9 @@ import dataclasses
 import importlib
 import math
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
+from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from compensator.arrays import NAN, Matrix, Vector
 from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import Table
-
-if TYPE_CHECKING:
-    from compensator.model.effects.hypothesis import Context, Hypothesis
 
 #: `step` or `filter` of a block.
 Run = Callable[..., S]
@@ -146,11 +143,6 @@ class Effect:
     def explain(self, rms_um: float) -> str:
         """Return one or two sentences for an engineer; `rms_um` is its share of y."""
         raise NotImplementedError
-
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Yield the hypotheses that are worth a search on this data."""
-        yield from ()
 
     # ------------------------------------------------------------------ model file
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -190,9 +190,21 @@ class Context:
         return Free(name=name, low=low, high=high, grid=grid, key="tau_min")
 
 
+#: Yields the hypotheses of a kind that are worth a search on this data.
+Proposer = Callable[[Context], Iterator[Hypothesis]]
+_PROPOSERS: list[Proposer] = []
+
+
+def proposes(proposer: Proposer) -> Proposer:
+    """Register what proposes hypotheses of a kind (function decorator)."""
+    _PROPOSERS.append(proposer)
+    return proposer
+
+
 def proposals(context: Context, *, background: bool = False) -> list[Hypothesis]:
     """Return every hypothesis of every kind for this data: those that are named for themselves, or background ones."""
-    return [h for form in forms() if form.background == background for h in form.propose(context)]
+    forms()
+    return [h for propose in _PROPOSERS for h in propose(context) if h.effect.background == background]
 
 
 def numbered(name: str, count: int) -> tuple[str, ...]:

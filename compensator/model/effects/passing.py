@@ -14,7 +14,7 @@ import numpy as np
 from compensator.arrays import Matrix, Vector
 from compensator.model.effects.base import Effect, register
 from compensator.model.effects.blocks import Block
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
 from compensator.model.effects.signals import RecordSignals
 
 
@@ -42,7 +42,6 @@ class Drift(Passing):
     um_per_h: float = 1.0
 
     def course(self, record: RecordSignals) -> Vector:
-        """Return the ramp."""
         return self.um_per_h * (record.minutes / 60.0)
 
     def explain(self, rms_um: float) -> str:
@@ -50,11 +49,6 @@ class Drift(Passing):
             f"Y drifts by {digits(self.um_per_h)} µm per hour ({rms_um:.2g} µm rms) whatever the inputs do: a creeping "
             "probe mount is no error of the machine. Check the mount and measure against a fixed reference."
         )
-
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose a ramp."""
-        yield Hypothesis(effect=cls(), form="ramp", amplitudes=("um_per_h",))
 
 
 @register
@@ -67,7 +61,6 @@ class Settling(Passing):
     tau_min: float = 1.0
 
     def course(self, record: RecordSignals) -> Vector:
-        """Return 1 − exp(−t/τ), scaled."""
         return self.size_um * (1.0 - np.exp(-record.minutes / self.tau_min))
 
     def explain(self, rms_um: float) -> str:
@@ -76,13 +69,6 @@ class Settling(Passing):
             "µm rms) whatever the inputs do: a mount or joint that settles is no error of the machine. Check the mount "
             "and measure against a fixed reference."
         )
-
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose any time constant about the length of the record."""
-        taus = tuple(float(t) for t in np.geomspace(context.minutes / 8.0, 2.0 * context.minutes, 6))
-        free = Free(name="tau_min", low=context.minutes / 10.0, high=3.0 * context.minutes, grid=taus)
-        yield Hypothesis(effect=cls(), form="settling", free=(free,), amplitudes=("size_um",))
 
 
 @register
@@ -95,7 +81,6 @@ class Step(Passing):
     at_min: float = 0.0
 
     def course(self, record: RecordSignals) -> Vector:
-        """Return the jump, over one sample."""
         return self.jump_um * np.clip((record.minutes - self.at_min) / record.period_min + 1.0, 0.0, 1.0)
 
     def explain(self, rms_um: float) -> str:
@@ -103,14 +88,6 @@ class Step(Passing):
             f"Y jumps by {digits(self.jump_um)} µm at {self.at_min / 60.0:.2f} h ({rms_um:.2g} µm rms) and stays: "
             "something was knocked or slipped. Check the probe mount and the clamping, then zero again."
         )
-
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose a jump at any time."""
-        minutes, period = context.minutes, context.period_min
-        grid = np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0))
-        at = Free(name="at_min", low=period, high=minutes - period, grid=tuple(grid.tolist()), log=False)
-        yield Hypothesis(effect=cls(), form="jump", free=(at,), amplitudes=("jump_um",))
 
 
 @register
@@ -134,11 +111,20 @@ class Periodic(Passing):
             f"({rms_um:.2g} µm rms): air conditioning, lubrication, a cabinet cooler. Log a channel of it."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose every period that the record holds about twice."""
-        minutes, period = context.minutes, context.period_min
-        frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes
-        grid = tuple((1.0 / frequencies).tolist())
-        free = Free(name="period_min", low=4.0 * period, high=minutes / 1.9, grid=grid)
-        yield Hypothesis(effect=cls(), form="sine", free=(free,), amplitudes=("sine_um", "cosine_um"))
+
+@proposes
+def courses(context: Context) -> Iterator[Hypothesis]:
+    """Propose a ramp, a drift of any time constant about the record's length, a jump at any time, any period."""
+    minutes, period = context.minutes, context.period_min
+    yield Hypothesis(effect=Drift(), form="ramp", amplitudes=("um_per_h",))
+    taus = tuple(float(t) for t in np.geomspace(minutes / 8.0, 2.0 * minutes, 6))
+    tau = Free(name="tau_min", low=minutes / 10.0, high=3.0 * minutes, grid=taus)
+    yield Hypothesis(effect=Settling(), form="settling", free=(tau,), amplitudes=("size_um",))
+    times = np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0))
+    at = Free(name="at_min", low=period, high=minutes - period, grid=tuple(times.tolist()), log=False)
+    yield Hypothesis(effect=Step(), form="jump", free=(at,), amplitudes=("jump_um",))
+    # Of a period the record must hold about two.
+    frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes
+    grid = tuple((1.0 / frequencies).tolist())
+    length = Free(name="period_min", low=4.0 * period, high=minutes / 1.9, grid=grid)
+    yield Hypothesis(effect=Periodic(), form="sine", free=(length,), amplitudes=("sine_um", "cosine_um"))
