@@ -16,7 +16,7 @@ from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
 from compensator.blas import one_thread
 from compensator.data.measurement import measurements
-from compensator.data.record import Record, require
+from compensator.data.record import SampledRecord, require
 from compensator.data.screening import DEAD_SAMPLES, check_scale
 from compensator.display import html_table
 from compensator.model.simulation import COLUMNS, Scores, csv_rows, scores
@@ -167,7 +167,7 @@ def _scores(parts: list[dict[str, Vector]]) -> Scores | None:
     return scores(_joined(parts, "y_um"), _joined(parts, "y_pred_um"))
 
 
-def doubts(source: str, model: ThermalModel, record: Record) -> list[Remark]:
+def doubts(source: str, model: ThermalModel, record: SampledRecord) -> list[Remark]:
     """Return what makes a prediction from these temperatures doubtful.
 
     Parameters
@@ -176,7 +176,7 @@ def doubts(source: str, model: ThermalModel, record: Record) -> list[Remark]:
         Name of the data.
     model : ThermalModel
         What is run.
-    record : Record
+    record : SampledRecord
         What it is run over.
 
     Raises

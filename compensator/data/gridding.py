@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from compensator.arrays import LARGEST, Indices, Mask, Vector
-from compensator.data.record import SHORT_GAP_SAMPLES, Data, Record
+from compensator.data.record import SHORT_GAP_SAMPLES, SampledData, SampledRecord
 from compensator.data.table import Table
 from compensator.errors import DataError
 from compensator.reasons import Remark
@@ -20,7 +20,7 @@ MOST_SAMPLES = 6_000_000
 _SHOWN = 3
 
 
-def to_grid(table: Table, period_s: float) -> Data:
+def to_grid(table: Table, period_s: float) -> SampledData:
     """Average a table to a sample period; report gaps and rows out of order, split at long gaps.
 
     Parameters
@@ -67,9 +67,9 @@ def to_grid(table: Table, period_s: float) -> Data:
             start = last
     records.append((start, n))
     remarks += _missing_inputs(table.name, columns, records, period_s)
-    return Data(
+    return SampledData(
         records=tuple(
-            Record(
+            SampledRecord(
                 t_s=np.arange(a, b, dtype=np.float64) * period_s, columns={name: v[a:b] for name, v in columns.items()}
             )
             for a, b in records

@@ -14,7 +14,7 @@ import numpy as np
 from compensator.data.files import read_csv, read_mat, read_recordings
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
-from compensator.data.record import Data, require
+from compensator.data.record import SampledData, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.table import Table
 from compensator.display import html_table
@@ -94,7 +94,7 @@ class Measurement:
         """Time from the first row to the last, h."""
         return float(np.ptp(self.table.t_s)) / 3600.0
 
-    def at_period(self, period_s: float) -> Data:
+    def at_period(self, period_s: float) -> SampledData:
         """Return the records at a sample period, s, with what had to be corrected.
 
         Raises
@@ -103,7 +103,7 @@ class Measurement:
             If a value or the time cannot be a measurement's.
         """
         data = to_grid(self.table, period_s)
-        return Data(records=data.records, remarks=(*self.remarks, *data.remarks))
+        return SampledData(records=data.records, remarks=(*self.remarks, *data.remarks))
 
     def __repr__(self) -> str:
         rows = [": ".join(row) for row in self._rows()]
@@ -272,7 +272,7 @@ def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[li
     return runs, remarks
 
 
-def _without_runs(name: str, data: Data, period_s: float) -> str:
+def _without_runs(name: str, data: SampledData, period_s: float) -> str:
     """Return why data holds nothing to work with."""
     size = sum(record.t_s.size for record in data.records)
     for column in ("t_q_degc", "at_degc", "heat_w"):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from sim_hardware.physics.effects.base import Effect, overriding
+from sim_hardware.physics.effects.base import UndeclaredEffect, overriding
 from sim_hardware.physics.plant import REST_DEGC, Inputs
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ class PublishedQuill:
 
     Parameters
     ----------
-    effects : sequence of Effect
+    effects : sequence of UndeclaredEffect
         Undeclared effects that act on what leaves the machine (probe, joint, thermocouple).
 
     Raises
@@ -108,7 +108,7 @@ class PublishedQuill:
     114.3
     """
 
-    def __init__(self, effects: Sequence[Effect] = ()) -> None:
+    def __init__(self, effects: Sequence[UndeclaredEffect] = ()) -> None:
         for effect in effects:
             if effect.reveal().thermal:
                 raise ValueError(f"{effect!r} needs a machine of masses: use QuillMachine")

@@ -20,7 +20,7 @@ import numpy as np
 from compensator.arrays import NAN, Matrix, Vector
 from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.signals import RecordSignals, Signals
-from compensator.model.table import Table
+from compensator.model.table import TomlTable
 
 #: `step` or `filter` of a block.
 Run = Callable[..., S]
@@ -82,7 +82,7 @@ class Effect:
     #: Least share of the residual's sum of squares that it must explain.
     worth: ClassVar[float] = 0.05
     #: The same together with another effect where forms are approximate: what depends on time alone fits the rest.
-    worth_beside: ClassVar[float] = 0.05
+    worth_with_others: ClassVar[float] = 0.05
     #: Ridge weight on its linear parameters, against columns of norm 1; 0 leaves them free.
     ridge: ClassVar[float] = 0.0
 
@@ -267,7 +267,7 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
     """
     candidates = kinds()[kind]
     known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + ["form", *_FOUND])
-    keys = Table(f"effect {kind}", table, tuple(known))
+    keys = TomlTable(f"effect {kind}", table, tuple(known))
     choices = {choice: form for form in candidates for choice in _choices(form)}
     form = choices[keys.text("form", tuple(choices))] if choices else candidates[0]
     found = {key: table[key] for key in _FOUND if key in table}

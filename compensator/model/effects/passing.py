@@ -19,11 +19,11 @@ from compensator.model.effects.signals import RecordSignals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Passing(Effect):
+class TimeOnly(Effect):
     """What all of them share: they are not deployed, and must explain much where there is another effect."""
 
     deployable = False
-    worth_beside = 0.75
+    worth_with_others = 0.75
 
     def course(self, record: RecordSignals) -> Vector:
         """Return the addition to y over a record, µm, shape (n,)."""
@@ -34,7 +34,7 @@ class Passing(Effect):
 
 
 @register
-class Drift(Passing):
+class Drift(TimeOnly):
     """A ramp over the record."""
 
     kind = "drift"
@@ -52,7 +52,7 @@ class Drift(Passing):
 
 
 @register
-class Settling(Passing):
+class Settling(TimeOnly):
     """A drift that dies out."""
 
     kind = "drift"
@@ -72,7 +72,7 @@ class Settling(Passing):
 
 
 @register
-class Step(Passing):
+class Jump(TimeOnly):
     """A jump at a time."""
 
     kind = "step"
@@ -91,7 +91,7 @@ class Step(Passing):
 
 
 @register
-class Periodic(Passing):
+class Periodic(TimeOnly):
     """A period that no channel shows."""
 
     kind = "periodic"
@@ -122,7 +122,7 @@ def courses(context: Context) -> Iterator[Hypothesis]:
     yield Hypothesis(effect=Settling(), form="settling", free=(tau,), amplitudes=("size_um",))
     times = np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0))
     at = Free(name="at_min", low=period, high=minutes - period, grid=tuple(times.tolist()), log=False)
-    yield Hypothesis(effect=Step(), form="jump", free=(at,), amplitudes=("jump_um",))
+    yield Hypothesis(effect=Jump(), form="jump", free=(at,), amplitudes=("jump_um",))
     # Of a period the record must hold about two.
     frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes
     grid = tuple((1.0 / frequencies).tolist())
