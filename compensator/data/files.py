@@ -20,7 +20,7 @@ from compensator.reasons import Remark
 from compensator.recording.reading import messages
 from compensator.remarks import DataRemark
 
-#: How files begin that are mistaken for tables, and what to do with them.
+#: First bytes of files that are mistaken for tables, and what to do with such a file.
 _OTHER_FILES = (
     (b"PK\x03\x04", "a workbook (XLSX, ODS) or ZIP archive, expected a table; save it as CSV in UTF-8"),
     (b"\xd0\xcf\x11\xe0", "an old workbook (XLS), expected a table; save it as CSV in UTF-8"),
@@ -30,7 +30,7 @@ _OTHER_FILES = (
     (b"\xff\xfe", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
     (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
 )
-#: What scipy raises for a damaged MAT file, beside its own error.
+#: What scipy raises for a damaged MAT file, besides its own error.
 _DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
 #: How to save what only MATLAB can read.
 _AS_CSV = "in MATLAB, writetable(T, 'run.csv') saves a table T as CSV"
@@ -67,7 +67,7 @@ def read_csv(path: Path, data: bytes, roles: Mapping[str, str]) -> Table:
         if len(cells) != len(header):
             raise DataError(f"{path}: row {row}: {len(cells)} cells, expected {len(header)}")
     columns = zip(*(cells for _, cells in rows), strict=True) if rows else ([] for _ in header)
-    # Cells stay the text that they are: numpy would cut or convert them.
+    # Keep cells as text: numpy would truncate or convert them.
     arrays = {name: np.array(cells, dtype=object) for name, cells in zip(header, columns, strict=True)}
     return table_of(str(path), arrays, roles=roles, rows=[row for row, _ in rows], has="the header has")
 
@@ -87,7 +87,7 @@ def _header(path: Path, cells: Sequence[str], roles: Mapping[str, str]) -> list[
 def read_mat(path: Path, roles: Mapping[str, str]) -> tuple[Table, tuple[Remark, ...]]:
     """Read a table from a MAT file: vectors of equal length, or one struct of such vectors.
 
-    What is no column, a matrix or a vector of another length, is left out with a remark unless it has a role.
+    Matrices and vectors of another length are left out with a remark; one that has a role is refused.
     `roles` may give the time another name.
 
     Raises
@@ -100,7 +100,7 @@ def read_mat(path: Path, roles: Mapping[str, str]) -> tuple[Table, tuple[Remark,
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of objects that it cannot read; they are named below
+            warnings.simplefilter("ignore")  # about objects that it cannot read; the error below names them
             content = loadmat(path, squeeze_me=True, mat_dtype=False)
     except NotImplementedError as error:
         raise DataError(
@@ -130,7 +130,7 @@ def read_mat(path: Path, roles: Mapping[str, str]) -> tuple[Table, tuple[Remark,
 
 
 def _fields(value: Any) -> Mapping[str, Any]:
-    """Return the fields of a MATLAB struct, nothing of anything else."""
+    """Return the fields of a MATLAB struct, none of anything else."""
     names = getattr(getattr(value, "dtype", None), "names", None)
     return {name: value[name].item() for name in names} if names and value.size == 1 else {}
 
@@ -141,7 +141,7 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> Table:
     Raises
     ------
     DataError
-        If one is no recording, has no samples, or lacks a column; if the time is to be another column.
+        If one is no recording, has no samples, or lacks a column, or if a role names another time.
     """
     for role in TIMES:
         if role in roles:

@@ -16,7 +16,7 @@ from compensator.remarks import DataRemark
 
 #: Longest table, in samples of the model: eleven years of minutes.
 MOST_SAMPLES = 6_000_000
-#: Most stretches whose begin a remark names.
+#: Number of stretches that a remark lists.
 _SHOWN = 3
 
 
@@ -33,7 +33,7 @@ def to_grid(table: Table, period_s: float) -> SampledData:
     Raises
     ------
     DataError
-        If a value or the time cannot be a measurement's.
+        If a value or time cannot have been measured.
     """
     _check_size(table, period_s)
     remarks = []
@@ -95,12 +95,12 @@ def _missing_inputs(
 
 
 def _check_size(table: Table, period_s: float) -> None:
-    """Refuse values and times that are slips of the pen: their squares, or their rows, would not fit into memory.
+    """Refuse values whose squares would overflow, and times whose rows would not fit into memory.
 
     Raises
     ------
     DataError
-        Naming the row, or the rows' distance.
+        Naming the row, or the time between rows.
     """
     name, t_s = table.name, table.t_s
     for column, values in (("time", t_s), *table.columns.items()):

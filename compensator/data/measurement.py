@@ -1,4 +1,4 @@
-"""DATA: whatever holds measurements, read once and handed to every verb."""
+"""DATA: anything that holds measurements, read once for every verb."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from compensator.display import html_table
 from compensator.errors import DataError, UsageError
 from compensator.reasons import Remark
 
-#: Sample period of the models made, s: the service's.
+#: Sample period of identified models, s, as in the service.
 PERIOD_S = 60.0
 _NEEDED = ("t_q_degc", "at_degc", "y_um")
 
@@ -33,13 +33,13 @@ class Origin:
     Parameters
     ----------
     name : str
-        The file's name, or the role of what was in memory, such as `data 2`.
+        The file's name, or the role of a table in memory, such as `data 2`.
     sha256 : str
-        Of the file's bytes; of the values of what was in memory.
+        Of the file's bytes, or of the values of a table in memory.
     path : pathlib.Path, optional
         The file.
     size : tuple of (int, tuple of str)
-        Number of rows, and columns, of what was in memory.
+        Number of rows, and columns, of a table in memory.
     """
 
     name: str
@@ -73,7 +73,7 @@ class Measurement:
     in_frame : bool
         Whether it was a pandas DataFrame; tables of results then are, too.
     local_time : bool
-        Whether that had times without a zone.
+        Whether its times had no zone.
     """
 
     table: Table
@@ -100,7 +100,7 @@ class Measurement:
         Raises
         ------
         DataError
-            If a value or the time cannot be a measurement's.
+            If a value or time cannot have been measured.
         """
         data = to_grid(self.table, period_s)
         return SampledData(records=data.records, remarks=(*self.remarks, *data.remarks))
@@ -136,7 +136,7 @@ def read(data: Any, *, columns: Mapping[str, str] | None = None, name: str = "da
     columns : mapping of str to str, optional
         Column name for each role, or for the time, that has another name: `{"t_q_degc": "t5", "t_s": "seconds"}`.
     name : str
-        What messages call data that is no file.
+        Name in messages of data that is not a file.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def measurements(
     data, columns
         As :func:`read`, and lists of them.
     role : str
-        What messages call data that is no file; numbered where there are several.
+        Name in messages of data that is not a file; numbered where there are several.
     needed : bool
         Whether an empty list is refused.
 
@@ -273,7 +273,7 @@ def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[li
 
 
 def _without_runs(name: str, data: SampledData, period_s: float) -> str:
-    """Return why data holds nothing to work with."""
+    """Return the reason why data yields no run."""
     size = sum(record.t_s.size for record in data.records)
     for column in ("t_q_degc", "at_degc", "heat_w"):
         missing = sum(int(np.isnan(r.columns[column]).sum()) for r in data.records if column in r.columns)

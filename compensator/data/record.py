@@ -31,7 +31,7 @@ class SampledRecord:
 
 @dataclass(frozen=True, slots=True)
 class SampledData:
-    """What a DATA argument holds.
+    """Records at a sample period, with remarks on how they were made.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from compensator.remarks import DataRemark
 OUTLIER_DEVIATIONS = 12.0
 #: Longest stretch at the start of a run whose mean is its reference, samples.
 REST_SAMPLES = 30
-#: A signal whose standard deviation is less than this times its noise's holds nothing else.
+#: A signal whose standard deviation is below this multiple of its noise's is noise alone.
 NOISE_ALONE = 1.5
 #: Shortest stretch between two long gaps that makes a run, samples.
 SHORTEST_RUN = 30

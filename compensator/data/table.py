@@ -60,7 +60,7 @@ class Table:
     start_utc_s: float | None = None
 
     def with_roles(self, roles: Mapping[str, str]) -> Table:
-        """Return the table with a role's name for columns of other names; that of the time is left to `table_of`.
+        """Return the table with columns renamed to their roles; `table_of` has renamed the time.
 
         Raises
         ------
@@ -162,7 +162,7 @@ def time_names(roles: Mapping[str, str]) -> set[str]:
 
 
 def _with_time(name: str, cells: Mapping[str, Any], roles: Mapping[str, str]) -> Mapping[str, Any]:
-    """Return columns with the time by its own name; a time that is named replaces any other."""
+    """Return columns with the time renamed; a time that a role names replaces any other."""
     times = {role: column for role, column in roles.items() if role in TIMES}
     if not times:
         return cells

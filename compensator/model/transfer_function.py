@@ -1,7 +1,7 @@
 """Rational transfer functions with units, and their sampled form.
 
-A path of the thermal model is written the way the field writes it, as a quotient of polynomials in
-*s* with the time in **minutes**:
+A path of the thermal model is written, as usual in the field, as a quotient of polynomials in *s* with
+the time in **minutes**:
 
     G(s) = (n_0 + n_1 s + n_2 s² + …) / (d_0 + d_1 s + d_2 s² + …)
 

@@ -2,8 +2,8 @@
 
 M. Mareš, P. Bárta, Mechatronic approach in modeling, identification and control of thermal deformation of
 quill: equations (3) to (5). Time in them is in minutes; DTF is in µm/W, TDTF in µm/K of the ambient's change,
-TTF in K/W of T_Q − AT. The functions came out of a discrete identification at 60 s, and Tustin's rule at 60 s
-gives those polynomials back; they are what runs here.
+TTF in K/W of T_Q − AT. The functions were identified in discrete time at 60 s, and Tustin's rule at 60 s
+reproduces those polynomials, which are run here.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def step_responses(minutes: int, heat_w: float = 90.0) -> tuple[Array, Array, Ar
 
 
 class PublishedQuill:
-    """The quill as the paper's equations have it.
+    """The quill by the paper's equations.
 
     The functions step at the whole minutes, with the inputs given to the first piece of that minute, and
     their outputs hold until the next one: a sample of a minute's mean is exactly one step. T_Q is the present

@@ -81,7 +81,7 @@ class Effect:
     names_background: ClassVar[bool] = False
     #: Least share of the residual's sum of squares that it must explain.
     worth: ClassVar[float] = 0.05
-    #: The same together with another effect where forms are approximate: what depends on time alone fits the rest.
+    #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
     worth_with_others: ClassVar[float] = 0.05
     #: Ridge weight on its linear parameters, against columns of norm 1; 0 leaves them free.
     ridge: ClassVar[float] = 0.0
@@ -154,7 +154,7 @@ class Effect:
 
 
 class BankEffect:
-    """Law of an effect that ends in a filter bank, its last block; goes before `Effect`."""
+    """Law of an effect that ends in a filter bank, its last block; a base class that is listed before `Effect`."""
 
     __slots__ = ()
 
@@ -195,14 +195,14 @@ class EffectStream:
         self._steps = [block.step for block in self._blocks]
 
     def step(self, signals: Signals[float]) -> float:
-        """Advance by one sample and return the addition to y, µm; 0 before its channels were seen."""
+        """Advance by one sample and return the addition to y, µm; 0 until each of its channels has had a value."""
         for channel in self.channels:
             if math.isnan(signals.channels.get(channel, NAN)):
                 return 0.0
         return float(self.effect.law(signals, self._steps))
 
     def peek(self, signals: Signals[float]) -> float:
-        """Return what `step` would, and stay where it is."""
+        """Return what `step` would, without a change of state."""
         states = [block.state for block in self._blocks]
         y = self.step(signals)
         for block, state in zip(self._blocks, states, strict=True):
@@ -214,7 +214,7 @@ class EffectStream:
         return tuple(value for block in self._blocks for value in block.state)
 
     def restore(self, state: tuple[float, ...]) -> None:
-        """Go on from a snapshot."""
+        """Continue from a snapshot."""
         start = 0
         for block in self._blocks:
             end = start + len(block.state)

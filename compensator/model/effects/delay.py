@@ -16,7 +16,7 @@ from compensator.model.effects.blocks import Block, Delay, Lag, S, shifted
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
 from compensator.model.effects.signals import RecordSignals, Signals
 
-#: Samples that a path is run on beyond a record's end.
+#: Samples by which a path is continued beyond a record's end.
 AHEAD = 64
 DELAY = Free(name="delay_min", low=0.0, high=60.0, grid=(0.5, 1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 40.0), log=False)
 LAG = Free(name="lag_min", low=0.05, high=60.0, grid=(0.5, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0))
@@ -56,7 +56,7 @@ class DelayedSensor(DelayedPath):
 
     def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
         share, period_min = record.share(self.path), record.period_min
-        # Beyond the end of the record the path goes on with its drive as it is.
+        # Beyond the end of the record the path continues with its last drive.
         drive = record.source(self.path)
         longer = record.function(self.path).response(np.concatenate((drive, np.full(AHEAD, drive[-1]))))
         early = shifted(longer, -self.delay_min / period_min)

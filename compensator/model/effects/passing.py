@@ -20,7 +20,7 @@ from compensator.model.effects.signals import RecordSignals
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimeOnly(Effect):
-    """What all of them share: they are not deployed, and must explain much where there is another effect."""
+    """Base of effects of time alone: not deployed, and next to another effect they must explain more."""
 
     deployable = False
     worth_with_others = 0.75
@@ -53,7 +53,7 @@ class Drift(TimeOnly):
 
 @register
 class Settling(TimeOnly):
-    """A drift that dies out."""
+    """A drift that decays."""
 
     kind = "drift"
     linear = ("size_um",)

@@ -27,7 +27,7 @@ from compensator.model.transfer_function import SampledTransferFunction
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scheduled(Effect):
-    """What all forms share: the channel as a share of its span."""
+    """Base of all forms: the channel as a share of its span."""
 
     kind = "scheduled"
     linear: ClassVar[tuple[str, ...]] = ("change",)

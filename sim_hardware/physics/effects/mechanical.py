@@ -13,7 +13,7 @@ from sim_hardware.physics.effects.base import Action, UndeclaredEffect
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WrongStrength(UndeclaredEffect):
-    """The quill expands more or less than it did at the calibration.
+    """The quill expands more or less than during the calibration.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class LateSensor(UndeclaredEffect):
     delay_s : float
         Dead time, s.
     lag_s : float
-        Time constant of the couple in its pad, s.
+        Time constant of the thermocouple in its pad, s.
     """
 
     kind: ClassVar[str] = "delay"
