@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
+from compensator.errors import UsageError
+
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[TextIO]:
@@ -17,13 +19,18 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
     Parameters
     ----------
     path : pathlib.Path
-        The file; its folder is created. The present file stays until it is replaced. A link stays a link, and what is
+        The file; its folder must exist. The present file stays until it is replaced. A link stays a link, and what is
         not a regular file (`/dev/null`, a pipe) is written to directly.
 
     Yields
     ------
     typing.TextIO
         Open for UTF-8 text; line ends are written as they are given.
+
+    Raises
+    ------
+    UsageError
+        If there is no such folder.
 
     Examples
     --------
@@ -35,7 +42,7 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
     ['a.csv']
     """
     path = path.resolve()
-    path.parent.mkdir(parents=True, exist_ok=True)
+    require_folder(path)
     if path.exists() and not path.is_file():
         with path.open("w", newline="", encoding="utf-8") as file:
             yield file
@@ -49,6 +56,18 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
         os.fsync(descriptor)
         # Root's umask may be narrower, and then the service could not read its own model.
         os.fchmod(descriptor, 0o644)
+
+
+def require_folder(path: Path) -> None:
+    """Refuse a path whose folder does not exist.
+
+    Raises
+    ------
+    UsageError
+        Naming the path.
+    """
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f"{path}: no such folder")
 
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = True) -> None:

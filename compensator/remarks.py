@@ -123,6 +123,16 @@ class DataRemark(Code):
         "Samples are missing; the gap is too long to interpolate and splits the record.",
         "Check the logger; use data without such gaps if the fit needs long records.",
     )
+    TEMPERATURE_MISSING = (
+        "temperature_missing",
+        "T_Q or AT is missing for too long to interpolate: no model is fitted there, and predictions are less certain.",
+        "Check the sensor and the logger.",
+    )
+    VARIABLES_LEFT_OUT = (
+        "variables_left_out",
+        "Variables of a MAT file that have not one value for each row, such as matrices, are not read.",
+        "Nothing, unless they are needed: save each as a vector of the length of the time.",
+    )
     WILD_READINGS = (
         "wild_readings",
         "Single readings far from their neighbours were left out.",

@@ -16,6 +16,7 @@ import numpy as np
 from compensator import __version__
 from compensator.api.files import ModelLike, Paged, as_in_file, model_of
 from compensator.arrays import Vector
+from compensator.atomic_write import require_folder
 from compensator.blas import in_one_thread, one_thread
 from compensator.data.measurement import DataLike, Measurement, measurements, runs_in
 from compensator.data.screening import screen_temperatures
@@ -79,12 +80,18 @@ class DiagnosisResult(Paged):
         ----------
         path : path
             A name that ends in .toml: the model file. Any other: a folder for `model.toml`, `diagnosis.json` and
-            `report.html`.
+            `report.html`, which is made if it does not exist.
+
+        Raises
+        ------
+        UsageError
+            If the folder around it does not exist.
         """
         target = Path(path)
-        if target.suffix == ".toml":
+        if target.suffix.lower() == ".toml":
             write_model(target, self.model)
         else:
+            require_folder(target)
             self.save_all(target)
         return target
 

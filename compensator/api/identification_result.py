@@ -90,6 +90,8 @@ class IdentificationResult(Paged):
 
         Raises
         ------
+        UsageError
+            If there is no such folder.
         OSError
             If it cannot be written there.
         """

@@ -12,7 +12,7 @@ from compensator.api.simulation_result import SimulationResult
 from compensator.arrays import Vector
 from compensator.blas import one_thread
 from compensator.data.measurement import DataLike, measurements
-from compensator.data.record import Record, require
+from compensator.data.record import SampledRecord, require
 from compensator.data.screening import DEAD_SAMPLES, check_scale
 from compensator.model.simulation import COLUMNS, Scores, scores
 from compensator.model.simulation import simulate as run_free
@@ -85,7 +85,7 @@ def _scores(parts: list[dict[str, Vector]]) -> Scores | None:
     return scores(_joined(parts, "y_um"), _joined(parts, "y_pred_um"))
 
 
-def doubts(source: str, model: ThermalModel, record: Record) -> list[Remark]:
+def doubts(source: str, model: ThermalModel, record: SampledRecord) -> list[Remark]:
     """Return what makes a prediction from these temperatures doubtful.
 
     Parameters
@@ -94,7 +94,7 @@ def doubts(source: str, model: ThermalModel, record: Record) -> list[Remark]:
         Name of the data.
     model : ThermalModel
         What is run.
-    record : Record
+    record : SampledRecord
         What it is run over.
 
     Raises

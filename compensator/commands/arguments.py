@@ -10,7 +10,7 @@ _SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (defaul
 
 
 def _column(parser: argparse.ArgumentParser) -> None:
-    words = "role of a column of another name"
+    words = "role (t_s or time_utc too) of a column of another name"
     parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME", help=words)
 
 

@@ -12,5 +12,6 @@ from compensator.data.export import export
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     out = checked_file(arguments.out, "--out", read=arguments.recording, ending=".csv")
+    out.parent.mkdir(parents=True, exist_ok=True)
     samples = export(arguments.recording, out, arguments.machine)
     return Answer({"samples": samples, "out": str(out)}, f"{samples} samples → {out}")

@@ -46,6 +46,7 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 def write(found: IdentificationResult, out: Path, *, also: Path | None = None) -> Answer:
     """Write the model file, and the page into its folder."""
+    out.parent.mkdir(parents=True, exist_ok=True)
     found.save(out)
     page = found.write_page(out.parent / "report.html", also=also)
     files = {"model": str(out), "model_sha256": found.model.sha256, "report": str(page)}

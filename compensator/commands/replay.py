@@ -61,6 +61,8 @@ def _compare(paths: list[Path], name: str, out: Path | None, page: Path | None) 
         from compensator.audit.pages import Curves
 
         curves = Curves()
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar("comparing") as progress, atomic_write(out) if out else nullcontext() as file:
         row = None
         if file is not None:

@@ -21,5 +21,6 @@ def run(arguments: argparse.Namespace) -> Answer:
     found = simulate(given.model, given.data, columns=roles_of(given.column))
     for remark in found.remarks:
         log.warning("%s", remark.marked)
+    out.parent.mkdir(parents=True, exist_ok=True)
     found.save(out)
     return Answer(found.to_dict() | {"out": str(out)}, f"{found.summary()}\ntable: {out}")

@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from compensator.data.table import Table, table_of
+from compensator.config import ROLES
+from compensator.data.table import TIMES, Table, table_of, time_names
 from compensator.errors import DataError
 from compensator.messages import number
+from compensator.reasons import Remark
 from compensator.recording.reading import messages
+from compensator.remarks import DataRemark
 
-#: How files begin that are mistaken for tables, and what to do with them.
+#: First bytes of files that are mistaken for tables, and what to do with such a file.
 _OTHER_FILES = (
     (b"PK\x03\x04", "a workbook (XLSX, ODS) or ZIP archive, expected a table; save it as CSV in UTF-8"),
     (b"\xd0\xcf\x11\xe0", "an old workbook (XLS), expected a table; save it as CSV in UTF-8"),
@@ -27,14 +30,14 @@ _OTHER_FILES = (
     (b"\xff\xfe", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
     (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
 )
-#: How to save what only MATLAB can read.
-#: What scipy raises for a damaged MAT file, beside its own error.
+#: What scipy raises for a damaged MAT file, besides its own error.
 _DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
+#: How to save what only MATLAB can read.
 _AS_CSV = "in MATLAB, writetable(T, 'run.csv') saves a table T as CSV"
 
 
-def read_csv(path: Path, data: bytes) -> Table:
-    """Read a table from the bytes of a CSV file.
+def read_csv(path: Path, data: bytes, roles: Mapping[str, str]) -> Table:
+    """Read a table from the bytes of a CSV file; `roles` may give the time another name.
 
     Raises
     ------
@@ -58,31 +61,34 @@ def read_csv(path: Path, data: bytes) -> Table:
         raise DataError(f"{path}: not a CSV table: {error}") from error
     if len(lines) < 2:
         raise DataError(f"{path}: {len(lines)} row(s), expected a header and data")
-    header = _header(path, lines[0])
+    header = _header(path, lines[0], roles)
     rows = [(row, cells) for row, cells in enumerate(lines[1:], start=2) if cells]
     for row, cells in rows:
         if len(cells) != len(header):
             raise DataError(f"{path}: row {row}: {len(cells)} cells, expected {len(header)}")
     columns = zip(*(cells for _, cells in rows), strict=True) if rows else ([] for _ in header)
-    # Cells stay the text that they are: numpy would cut or convert them.
+    # Keep cells as text: numpy would truncate or convert them.
     arrays = {name: np.array(cells, dtype=object) for name, cells in zip(header, columns, strict=True)}
-    return table_of(str(path), arrays, rows=[row for row, _ in rows], has="the header has")
+    return table_of(str(path), arrays, roles=roles, rows=[row for row, _ in rows], has="the header has")
 
 
-def _header(path: Path, cells: Sequence[str]) -> list[str]:
+def _header(path: Path, cells: Sequence[str], roles: Mapping[str, str]) -> list[str]:
     header = [name.strip() for name in cells]
     for name in header:
         if header.count(name) > 1:
             raise DataError(f"{path}: the header names column {name!r} twice, expected each name once")
-    if "t_s" not in header and "time_utc" not in header:
+    if not time_names(roles) & set(header):
         for separator, word in ((";", "semicolons"), ("\t", "tabs")):
             if cells and separator in cells[0]:
                 raise DataError(f"{path}: {word} between its cells, expected commas, and a dot in numbers: 20.5")
     return header
 
 
-def read_mat(path: Path) -> Table:
+def read_mat(path: Path, roles: Mapping[str, str]) -> tuple[Table, tuple[Remark, ...]]:
     """Read a table from a MAT file: vectors of equal length, or one struct of such vectors.
+
+    Matrices and vectors of another length are left out with a remark; one that has a role is refused.
+    `roles` may give the time another name.
 
     Raises
     ------
@@ -94,7 +100,7 @@ def read_mat(path: Path) -> Table:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of objects that it cannot read; they are named below
+            warnings.simplefilter("ignore")  # about objects that it cannot read; the error below names them
             content = loadmat(path, squeeze_me=True, mat_dtype=False)
     except NotImplementedError as error:
         raise DataError(
@@ -105,18 +111,26 @@ def read_mat(path: Path) -> Table:
     columns: Mapping[str, Any] = {name: value for name, value in content.items() if not name.startswith("__")}
     while len(columns) == 1 and (fields := _fields(next(iter(columns.values())))):
         columns = fields
-    vectors = {name: value for name, value in columns.items() if getattr(value, "ndim", 0) and value.size > 1}
-    if "t_s" not in vectors and "time_utc" not in vectors:
+    arrays = {name: value for name, value in columns.items() if getattr(value, "ndim", 0) and value.size > 1}
+    time = next((arrays[name] for name in time_names(roles) if name in arrays), None)
+    if time is None:
         raise DataError(
             f"{path}: no vector t_s or time_utc; it has: {', '.join(columns)[:100] or 'no variables'}. Save each "
             "column as a vector, a table by S = table2struct(T, 'ToScalar', true); save(FILE, '-struct', 'S'); or as "
             f"CSV: {_AS_CSV}"
         )
-    return table_of(str(path), vectors)
+    needed = (*ROLES, *TIMES, *roles.values())
+    others = [name for name, value in arrays.items() if value.shape != time.shape and name not in needed]
+    table = table_of(str(path), {name: arrays[name] for name in arrays if name not in others}, roles=roles)
+    if not others:
+        return table, ()
+    shown = ", ".join(f"{name} ({' × '.join(map(str, arrays[name].shape))})" for name in others)
+    words = f"{path}: left out, not one value for each of {time.size} rows: {shown}."
+    return table, (Remark(DataRemark.VARIABLES_LEFT_OUT, words),)
 
 
 def _fields(value: Any) -> Mapping[str, Any]:
-    """Return the fields of a MATLAB struct, nothing of anything else."""
+    """Return the fields of a MATLAB struct, none of anything else."""
     names = getattr(getattr(value, "dtype", None), "names", None)
     return {name: value[name].item() for name in names} if names and value.size == 1 else {}
 
@@ -127,8 +141,11 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> Table:
     Raises
     ------
     DataError
-        If one is no recording, has no samples, or lacks a column.
+        If one is no recording, has no samples, or lacks a column, or if a role names another time.
     """
+    for role in TIMES:
+        if role in roles:
+            raise DataError(f"{paths[0]}: --column {role}={roles[role]}: a recording has a time of its own")
     tables = [_read_recording(path).with_roles(roles) for path in paths]
     names = dict.fromkeys(name for table in tables for name in table.columns)
     t_s = np.concatenate([table.t_s for table in tables])

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.data.table import Table, table_of
+from compensator.data.table import Table, table_of, time_names
 from compensator.errors import DataError
 
 
@@ -23,14 +23,15 @@ def is_frame(data: object) -> bool:
     return pandas is not None and isinstance(data, pandas.DataFrame)
 
 
-def has_local_time(frame: Any) -> bool:
+def has_local_time(frame: Any, roles: Mapping[str, str]) -> bool:
     """Whether the time of a DataFrame is a date and time without a zone; it is taken as UTC."""
     pandas = sys.modules["pandas"]
-    time = frame["time_utc"] if "time_utc" in frame.columns else frame.index
+    name = roles.get("time_utc", "time_utc")
+    time = frame[name] if name in frame.columns else frame.index
     return bool(pandas.api.types.is_datetime64_dtype(time.dtype))
 
 
-def table_in_memory(name: str, data: Any) -> Table:
+def table_in_memory(name: str, data: Any, roles: Mapping[str, str]) -> Table:
     """Make a table of a DataFrame or a mapping of arrays.
 
     Parameters
@@ -40,26 +41,30 @@ def table_in_memory(name: str, data: Any) -> Table:
     data : pandas.DataFrame or mapping of str to array_like
         With the column names of a table. A DatetimeIndex, or an index of the name `t_s` or `time_utc`, is the time of a
         DataFrame without a column of that name.
+    roles : mapping of str to str
+        Column name for each role; those of the time are used here.
 
     Raises
     ------
     DataError
         As :func:`table_of`.
     """
-    return table_of(name, _frame_columns(name, data) if is_frame(data) else {str(k): v for k, v in data.items()})
+    cells = _frame_columns(name, data, roles) if is_frame(data) else {str(k): v for k, v in data.items()}
+    return table_of(name, cells, roles=roles)
 
 
-def _frame_columns(name: str, frame: Any) -> dict[str, Any]:
+def _frame_columns(name: str, frame: Any, roles: Mapping[str, str]) -> dict[str, Any]:
     pandas = sys.modules["pandas"]
     names = [str(column) for column in frame.columns]
     for column in names:
         if names.count(column) > 1:
             raise DataError(f"{name}: column {column!r} is there twice, expected each name once")
     series = {column: frame.iloc[:, i] for i, column in enumerate(names)}
-    if not {"t_s", "time_utc"} & series.keys():
-        index = frame.index
-        time = "time_utc" if isinstance(index, pandas.DatetimeIndex) else index.name
-        if time in ("t_s", "time_utc"):
+    times, index = time_names(roles), frame.index
+    if not times & series.keys():
+        dated = isinstance(index, pandas.DatetimeIndex) and index.name != roles.get("time_utc", "time_utc")
+        time = "time_utc" if dated else index.name
+        if time in times:
             series[time] = index.to_series()
     return {column: _cells(pandas, values) for column, values in series.items()}
 

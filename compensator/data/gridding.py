@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from compensator.arrays import LARGEST, Indices, Mask, Vector
-from compensator.data.record import SHORT_GAP_SAMPLES, Data, Record
+from compensator.data.record import SHORT_GAP_SAMPLES, SampledData, SampledRecord
 from compensator.data.table import Table
 from compensator.errors import DataError
 from compensator.reasons import Remark
@@ -15,9 +16,11 @@ from compensator.remarks import DataRemark
 
 #: Longest table, in samples of the model: eleven years of minutes.
 MOST_SAMPLES = 6_000_000
+#: Number of stretches that a remark lists.
+_SHOWN = 3
 
 
-def to_grid(table: Table, period_s: float) -> Data:
+def to_grid(table: Table, period_s: float) -> SampledData:
     """Average a table to a sample period; report gaps and rows out of order, split at long gaps.
 
     Parameters
@@ -30,7 +33,7 @@ def to_grid(table: Table, period_s: float) -> Data:
     Raises
     ------
     DataError
-        If a value or the time cannot be a measurement's.
+        If a value or time cannot have been measured.
     """
     _check_size(table, period_s)
     remarks = []
@@ -63,9 +66,10 @@ def to_grid(table: Table, period_s: float) -> Data:
             records.append((start, first))
             start = last
     records.append((start, n))
-    return Data(
+    remarks += _missing_inputs(table.name, columns, records, period_s)
+    return SampledData(
         records=tuple(
-            Record(
+            SampledRecord(
                 t_s=np.arange(a, b, dtype=np.float64) * period_s, columns={name: v[a:b] for name, v in columns.items()}
             )
             for a, b in records
@@ -74,13 +78,29 @@ def to_grid(table: Table, period_s: float) -> Data:
     )
 
 
+def _missing_inputs(
+    name: str, columns: Mapping[str, Vector], records: Sequence[tuple[int, int]], period_s: float
+) -> Iterator[Remark]:
+    """Yield a remark on each temperature that is missing for longer than what is bridged."""
+    for column in [c for c in ("t_q_degc", "at_degc") if c in columns]:
+        known = ~np.isnan(columns[column])
+        gaps = [(a + first, a + last) for a, b in records for first, last in _gaps(known[a:b])]
+        long = [(first, last) for first, last in gaps if last - first > SHORT_GAP_SAMPLES]
+        if long:
+            hours = sum(last - first for first, last in long) * period_s / 3600.0
+            where = ", ".join(f"{first * period_s:g}" for first, _ in long[:_SHOWN])
+            more = f" and {len(long) - _SHOWN} more" if len(long) > _SHOWN else ""
+            words = f"{name}: {column} is missing for {hours:.1f} h from t_s = {where}{more}; not interpolated."
+            yield Remark(DataRemark.TEMPERATURE_MISSING, words)
+
+
 def _check_size(table: Table, period_s: float) -> None:
-    """Refuse values and times that are slips of the pen: their squares, or their rows, would not fit into memory.
+    """Refuse values whose squares would overflow, and times whose rows would not fit into memory.
 
     Raises
     ------
     DataError
-        Naming the row, or the rows' distance.
+        Naming the row, or the time between rows.
     """
     name, t_s = table.name, table.t_s
     for column, values in (("time", t_s), *table.columns.items()):

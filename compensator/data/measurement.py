@@ -1,4 +1,4 @@
-"""DATA: whatever holds measurements, read once and handed to every verb."""
+"""DATA: anything that holds measurements, read once for every verb."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from compensator import display
 from compensator.data.files import read_csv, read_mat, read_recordings
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
-from compensator.data.record import Data, require
+from compensator.data.record import SampledData, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.table import Table
 from compensator.errors import DataError, UsageError
@@ -25,7 +25,7 @@ from compensator.reasons import Remark
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: Sample period of the models made, s: the service's.
+#: Sample period of identified models, s, as in the service.
 PERIOD_S = 60.0
 _NEEDED = ("t_q_degc", "at_degc", "y_um")
 
@@ -37,13 +37,13 @@ class Origin:
     Parameters
     ----------
     name : str
-        The file's name, or the role of what was in memory, such as `data 2`.
+        The file's name, or the role of a table in memory, such as `data 2`.
     sha256 : str
-        Of the file's bytes; of the values of what was in memory.
+        Of the file's bytes, or of the values of a table in memory.
     path : pathlib.Path, optional
         The file.
     size : tuple of (int, tuple of str)
-        Number of rows, and columns, of what was in memory.
+        Number of rows, and columns, of a table in memory.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Measurement(display.Shown):
     in_frame : bool
         Whether it was a pandas DataFrame; tables of results then are, too.
     local_time : bool
-        Whether that had times without a zone.
+        Whether its times had no zone.
     """
 
     table: Table
@@ -98,16 +98,16 @@ class Measurement(display.Shown):
         """Time from the first row to the last, h."""
         return float(np.ptp(self.table.t_s)) / 3600.0
 
-    def at_period(self, period_s: float) -> Data:
+    def at_period(self, period_s: float) -> SampledData:
         """Return the records at a sample period, s, with what had to be corrected.
 
         Raises
         ------
         DataError
-            If a value or the time cannot be a measurement's.
+            If a value or time cannot have been measured.
         """
         data = to_grid(self.table, period_s)
-        return Data(records=data.records, remarks=(*self.remarks, *data.remarks))
+        return SampledData(records=data.records, remarks=(*self.remarks, *data.remarks))
 
     def contents(self) -> list[display.Table]:
         """Return what it shows: span, samples, columns, remarks."""
@@ -144,9 +144,9 @@ def read(data: DataLike, *, columns: Mapping[str, str] | None = None, name: str 
     data : DataLike
         One table, or recordings that follow each other.
     columns : mapping of str to str, optional
-        Column name for each role that has another name: `{"t_q_degc": "t5"}`.
+        Column name for each role, or for the time, that has another name: `{"t_q_degc": "t5", "t_s": "seconds"}`.
     name : str
-        What messages call data that is no file.
+        Name in messages of data that is not a file.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def measurements(
     data, columns
         As :func:`read`; several tables, too.
     role : str
-        What messages call data that is no file; numbered where there are several.
+        Name in messages of data that is not a file; numbered where there are several.
     needed : bool
         Whether an empty list is refused.
 
@@ -203,7 +203,7 @@ def measurements(
             found.append(source)
         elif isinstance(source, (str, os.PathLike)):
             path = Path(source)
-            if path.suffix == ".mcap":
+            if path.suffix.lower() == ".mcap":
                 recordings.append(path)
             else:
                 found.append(_of_file(path, roles))
@@ -225,13 +225,18 @@ def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
         data = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: {error.strerror or error}; expected a table or a recording") from error
-    table, remarks = (read_mat(path) if path.suffix == ".mat" else read_csv(path, data)).measurements_only()
+    left_out: tuple[Remark, ...] = ()
+    if path.suffix.lower() == ".mat":
+        table, left_out = read_mat(path, roles)
+    else:
+        table = read_csv(path, data, roles)
+    table, remarks = table.measurements_only()
     table, origins = table.with_roles(roles), (_origin(path, data),)
-    return Measurement(table=table, label=path.name, origins=origins, roles=roles, remarks=remarks)
+    return Measurement(table=table, label=path.name, origins=origins, roles=roles, remarks=(*left_out, *remarks))
 
 
 def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
-    table, remarks = table_in_memory(name, source).measurements_only()
+    table, remarks = table_in_memory(name, source, roles).measurements_only()
     origin = Origin(name=name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
     return Measurement(
         table=table.with_roles(roles),
@@ -240,7 +245,7 @@ def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
         roles=roles,
         remarks=remarks,
         in_frame=is_frame(source),
-        local_time=is_frame(source) and has_local_time(source),
+        local_time=is_frame(source) and has_local_time(source, roles),
     )
 
 
@@ -278,8 +283,8 @@ def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[li
     return runs, remarks
 
 
-def _without_runs(name: str, data: Data, period_s: float) -> str:
-    """Return why data holds nothing to work with."""
+def _without_runs(name: str, data: SampledData, period_s: float) -> str:
+    """Return the reason why data yields no run."""
     size = sum(record.t_s.size for record in data.records)
     for column in ("t_q_degc", "at_degc", "heat_w"):
         missing = sum(int(np.isnan(r.columns[column]).sum()) for r in data.records if column in r.columns)

@@ -14,7 +14,7 @@ SHORT_GAP_SAMPLES = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class SampledRecord:
     """A measured run at the model's sample period.
 
     Parameters
@@ -30,22 +30,22 @@ class Record:
 
 
 @dataclass(frozen=True, slots=True)
-class Data:
-    """What a DATA argument holds.
+class SampledData:
+    """Records at a sample period, with remarks on how they were made.
 
     Parameters
     ----------
-    records : tuple of Record
+    records : tuple of SampledRecord
         In order of time; a long gap starts a new one.
     remarks : tuple of Remark
         Corrections: gaps, rows out of order.
     """
 
-    records: tuple[Record, ...]
+    records: tuple[SampledRecord, ...]
     remarks: tuple[Remark, ...]
 
 
-def require(name: str, record: Record, columns: Sequence[str]) -> None:
+def require(name: str, record: SampledRecord, columns: Sequence[str]) -> None:
     """Refuse a record that lacks a column.
 
     Raises

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import Mask, Vector
-from compensator.data.record import SHORT_GAP_SAMPLES, Record
+from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
 from compensator.reasons import Remark
 from compensator.remarks import DataRemark
 
 #: A single reading this many noise deviations away from both neighbours is an outlier.
-WILD_DEVIATIONS = 12.0
+OUTLIER_DEVIATIONS = 12.0
 #: Longest stretch at the start of a run whose mean is its reference, samples.
 REST_SAMPLES = 30
-#: A signal whose standard deviation is less than this times its noise's holds nothing else.
+#: A signal whose standard deviation is below this multiple of its noise's is noise alone.
 NOISE_ALONE = 1.5
 #: Shortest stretch between two long gaps that makes a run, samples.
 SHORTEST_RUN = 30
@@ -64,14 +64,14 @@ class Run:
         return np.asarray(self.ambient_k + self.reference[1])
 
 
-def runs_of(name: str, record: Record) -> Iterator[tuple[Run, tuple[Remark, ...]]]:
+def runs_of(name: str, record: SampledRecord) -> Iterator[tuple[Run, tuple[Remark, ...]]]:
     """Yield the runs of a record with remarks on its corrections.
 
     Parameters
     ----------
     name : str
         Name for messages.
-    record : Record
+    record : SampledRecord
         Needs `t_q_degc`, `at_degc`, `y_um`; `heat_w` where it is known.
     """
     columns, remarks = {}, []
@@ -157,7 +157,7 @@ def without_outliers(values: Vector) -> tuple[Vector, int]:
     if v.size < 7:
         return values, 0
     # A fast signal reverses within a sample, too: what it does in one of twenty steps is no outlier.
-    limit = WILD_DEVIATIONS * noise_std(v) + 3.0 * float(np.quantile(np.abs(np.diff(v)), 0.95)) + 1e-9
+    limit = OUTLIER_DEVIATIONS * noise_std(v) + 3.0 * float(np.quantile(np.abs(np.diff(v)), 0.95)) + 1e-9
     before, after = v[1:-1] - v[:-2], v[1:-1] - v[2:]
     across = np.abs(v[2:] - v[:-2])
     apart = (np.abs(before) > limit) & (np.abs(after) > limit) & (before * after > 0)

@@ -1,4 +1,4 @@
-"""Refuses data that allows no model, with the reason in one line."""
+"""Refuses data from which no model can be made, with the reason in one line."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def _check_temperature(name: str, column: str, values: Vector, *, still: bool) -
 
 
 def _check_pair(name: str, t_q: Vector, at: Vector) -> None:
-    """Refuse a pair of which one is in another unit: both start within some kelvin of each other."""
+    """Refuse a pair in different units: at rest both are within a few kelvin of each other."""
     coldest = float(np.quantile(t_q - at, 0.02))
     as_celsius = float(np.quantile((t_q - 32.0) / 1.8 - at, 0.02))
     if coldest > 25.0 and abs(as_celsius) < 10.0:

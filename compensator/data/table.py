@@ -16,6 +16,8 @@ from compensator.errors import DataError, UsageError
 from compensator.reasons import Remark
 from compensator.remarks import DataRemark
 
+#: Columns that hold the time: s from the start, or date and time. With both, the first is used.
+TIMES = ("t_s", "time_utc")
 #: Columns of an exported recording that the service computed.
 EXPORTED = (
     "seq",
@@ -58,21 +60,21 @@ class Table:
     start_utc_s: float | None = None
 
     def with_roles(self, roles: Mapping[str, str]) -> Table:
-        """Return the table with a role's name for columns of other names.
+        """Return the table with columns renamed to their roles; `table_of` has renamed the time.
 
         Raises
         ------
         DataError
             If there is no such role or column.
         """
-        for role, name in roles.items():
-            where = f"{self.name}: --column {role}={name}: "
+        given = {role: name for role, name in roles.items() if role not in TIMES}
+        for role, name in given.items():
             if role not in ROLES:
-                raise DataError(f"{where}expected a role of {', '.join(ROLES)}")
-            if name not in self.columns:
-                raise DataError(f"{where}no such column, expected one of: {', '.join(self.columns)}")
-        others = {name: values for name, values in self.columns.items() if name not in roles.values()}
-        return replace(self, columns=others | {role: self.columns[name] for role, name in roles.items()})
+                expected = ", ".join((*ROLES, *TIMES))
+                raise DataError(f"{self.name}: --column {role}={name}: expected a role of {expected}")
+            _check_named(self.name, role, name, self.columns)
+        others = {name: values for name, values in self.columns.items() if name not in given.values()}
+        return replace(self, columns=others | {role: self.columns[name] for role, name in given.items()})
 
     def measurements_only(self) -> tuple[Table, tuple[Remark, ...]]:
         """Leave out of an exported recording what the service computed.
@@ -88,7 +90,19 @@ class Table:
         return replace(self, columns=kept), (Remark(DataRemark.ESTIMATES_LEFT_OUT, words),)
 
 
-def table_of(name: str, cells: Mapping[str, Any], *, rows: Sequence[int] | None = None, has: str = "it has") -> Table:
+def _check_named(table: str, role: str, name: str, columns: Mapping[str, Any]) -> None:
+    if name not in columns:
+        raise DataError(f"{table}: --column {role}={name}: no such column, expected one of: {', '.join(columns)}")
+
+
+def table_of(
+    name: str,
+    cells: Mapping[str, Any],
+    *,
+    roles: Mapping[str, str] | None = None,
+    rows: Sequence[int] | None = None,
+    has: str = "it has",
+) -> Table:
     """Make a table of columns of cells: text as in a CSV, numbers, or times.
 
     Parameters
@@ -96,7 +110,9 @@ def table_of(name: str, cells: Mapping[str, Any], *, rows: Sequence[int] | None 
     name : str
         Name for messages.
     cells : mapping of str to array_like, shape (n,)
-        Columns by name; `t_s` or `time_utc` among them. A column that is not numeric is left out unless it has a role.
+        Columns by name; the time among them. A column that is not numeric is left out unless it has a role.
+    roles : mapping of str to str, optional
+        Column name for each role; those of `t_s` and `time_utc` are used here, the others by `Table.with_roles`.
     rows : sequence of int, optional
         Number of each row for messages; from 0 where it is not given.
     has : str
@@ -113,9 +129,11 @@ def table_of(name: str, cells: Mapping[str, Any], *, rows: Sequence[int] | None 
     >>> table.t_s, table.columns["y_um"]
     (array([ 0., 60.]), array([1.5, nan]))
     """
-    time_column = next((column for column in ("t_s", "time_utc") if column in cells), None)
+    cells = _with_time(name, cells, roles or {})
+    time_column = next((column for column in TIMES if column in cells), None)
     if time_column is None:
-        raise DataError(f"{name}: no column t_s or time_utc; {has}: {', '.join(cells)[:100]}")
+        names = ", ".join(cells)[:100]
+        raise DataError(f"{name}: no column t_s or time_utc; {has}: {names}. Name it with --column t_s=NAME")
     arrays = {column: _flat(name, column, values) for column, values in cells.items()}
     size = arrays[time_column].size
     if size == 0:
@@ -136,6 +154,22 @@ def table_of(name: str, cells: Mapping[str, Any], *, rows: Sequence[int] | None 
         raise DataError(f"{name}: row {rows[int(np.argmax(np.isnan(time)))]}: time is missing")
     start = float(time[0]) if time_column == "time_utc" else None
     return Table(name=name, t_s=time - time[0], columns=numbers, rows=rows, start_utc_s=start)
+
+
+def time_names(roles: Mapping[str, str]) -> set[str]:
+    """Return the names that the column of the time may have."""
+    return {roles.get(time, time) for time in TIMES}
+
+
+def _with_time(name: str, cells: Mapping[str, Any], roles: Mapping[str, str]) -> Mapping[str, Any]:
+    """Return columns with the time renamed; a time that a role names replaces any other."""
+    times = {role: column for role, column in roles.items() if role in TIMES}
+    if not times:
+        return cells
+    for role, column in times.items():
+        _check_named(name, role, column, cells)
+    others = {column: values for column, values in cells.items() if column not in (*times.values(), *TIMES)}
+    return {role: cells[column] for role, column in times.items()} | others
 
 
 def _flat(name: str, column: str, values: Any) -> np.ndarray[Any, Any]:

@@ -35,7 +35,7 @@ from compensator.service.composition import run_service
 from compensator.service.loading import load
 from compensator.service.session import session_config
 from sim_hardware.physics import Duty, World, usual_sensors
-from sim_hardware.physics.effects.base import Effect
+from sim_hardware.physics.effects.base import UndeclaredEffect
 
 #: 2026-01-05 06:00 UTC, a Monday's early shift.
 START_NS = 1_767_592_800 * NS
@@ -75,7 +75,7 @@ def run_day(
     hours: float,
     seed: int,
     model: str = "quill",
-    effects: Sequence[Effect] = (),
+    effects: Sequence[UndeclaredEffect] = (),
     adopt: Path | None = None,
 ) -> Day:
     """Run one simulated machine through its devices, the service, disk and Zenoh.
@@ -92,7 +92,7 @@ def run_day(
         Seed of duty and sensors.
     model : str
         Name of a model, or path of its file from the folder.
-    effects : sequence of Effect
+    effects : sequence of UndeclaredEffect
         Effects in the machine that are absent from its calibration.
     adopt : pathlib.Path, optional
         A model that the running service adopts after `ADOPT_AFTER_S`.

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from compensator.arrays import Vector
 from compensator.data.runs import Run, noise_of
@@ -106,4 +105,4 @@ def drive_of(model: ThermalModel, difference_k: Vector) -> Vector:
     """Return what drives the DTF: the heat by the plain inverse, or T_Q − AT itself in a direct model."""
     if model.ttf is None:
         return difference_k
-    return np.asarray(lfilter(model.ttf.sampled.a, model.ttf.sampled.b, difference_k))
+    return model.ttf.sampled.inverse_response(difference_k)

@@ -219,7 +219,7 @@ class Search:
     def _is_worth(self, hypothesis: Hypothesis, without: Fit, fit: Fit) -> bool:
         """Return whether an effect explains enough, the base model's own error counted as still there."""
         allowance, effect = self.evidence.noise.allowance, hypothesis.effect
-        share = effect.worth_beside if self.approximate and _foreground(without) else effect.worth
+        share = effect.worth_with_others if self.approximate and _foreground(without) else effect.worth
         return fit.cost + allowance < (1.0 - share) * (without.cost + allowance)
 
     # ------------------------------------------------------------------ steps

@@ -26,7 +26,7 @@ def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: floa
     segments : sequence of Segment
         Data; rows that need a missing y are left out.
     structure : Structure
-        Orders and delays; an offset is fitted too.
+        Orders; an offset is fitted too.
     period_s : float
         Sample period, s.
 
@@ -49,12 +49,12 @@ def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: floa
     rows, targets = [], []
     for segment in segments:
         size = segment.y.size
-        reach = max(n, *(t + d - 1 for t, d in zip(structure.terms, structure.delays, strict=True)))
+        reach = max(n, *(terms - 1 for terms in structure.terms))
         index = np.arange(reach, size)
         y = np.where(segment.used, segment.y, np.nan)
         columns = [-y[index - i] for i in range(1, n + 1)]
-        for u, terms, delay in zip(segment.inputs, structure.terms, structure.delays, strict=True):
-            columns += [u[index - delay - i] for i in range(terms)]
+        for u, terms in zip(segment.inputs, structure.terms, strict=True):
+            columns += [u[index - i] for i in range(terms)]
         columns.append(np.ones(index.size))
         table = np.stack(columns, axis=1)
         good = np.isfinite(table).all(axis=1) & np.isfinite(y[index])
@@ -63,8 +63,8 @@ def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: floa
     solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(targets), rcond=None)[0]
     a = (1.0, *solution[:n].tolist())
     functions, at = [], n
-    for terms, delay in zip(structure.terms, structure.delays, strict=True):
-        b = (*([0.0] * delay), *solution[at : at + terms].tolist())
+    for terms in structure.terms:
+        b = tuple(solution[at : at + terms].tolist())
         functions.append(SampledTransferFunction(b=b, a=a, period_s=period_s))
         at += terms
     return functions

@@ -28,7 +28,7 @@ class Candidate:
     Parameters
     ----------
     structure : Structure
-        Orders and delays.
+        Orders.
     rms : float
         Root mean square of the free-run error on the held-out folds.
     fold_rms : tuple of float

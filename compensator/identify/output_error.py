@@ -83,23 +83,17 @@ class Structure:
         Number of poles, nf.
     terms : tuple of int
         Numerator terms of each input, nb.
-    delays : tuple of int
-        Samples of delay of each input, nk; 0 is direct feed-through.
     offset : bool
         Whether the output has an unknown zero.
     """
 
     order: int
     terms: tuple[int, ...]
-    delays: tuple[int, ...] = ()
     offset: bool = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "delays", self.delays or (0,) * len(self.terms))
-        if self.order < 0 or not self.terms or min(self.terms) < 1 or min(self.delays) < 0:
-            raise DataError(f"structure nb {self.terms} nf {self.order} nk {self.delays}: expected nb > 0, nf, nk >= 0")
-        if len(self.delays) != len(self.terms):
-            raise DataError(f"structure: {len(self.delays)} delays for {len(self.terms)} inputs")
+        if self.order < 0 or not self.terms or min(self.terms) < 1:
+            raise DataError(f"structure nb {self.terms} nf {self.order}: expected nb > 0, nf >= 0")
 
     @property
     def amplitudes(self) -> int:
@@ -112,7 +106,7 @@ class Structure:
         return self.order + self.amplitudes
 
     def __str__(self) -> str:
-        nb, nk = " ".join(map(str, self.terms)), " ".join(map(str, self.delays))
+        nb, nk = " ".join(map(str, self.terms)), " ".join("0" for _ in self.terms)
         return f"nb {nb}, nf {self.order}, nk {nk}"
 
 
@@ -123,7 +117,7 @@ class OutputErrorFit:
     Parameters
     ----------
     structure : Structure
-        Orders and delays.
+        Orders.
     period_s : float
         Sample period, s.
     taus_min : numpy.ndarray, shape (order,)
@@ -218,11 +212,11 @@ class OutputErrorFit:
     def _coefficients(self, j: int) -> tuple[Vector, Vector, Matrix]:
         """Return b, a_1 …, and their derivatives by (log τ, c)."""
         poles = poles_of(self.taus_min, self.period_s)
-        n, m, nk = poles.size, self.structure.terms[j], self.structure.delays[j]
-        differences = np.zeros((m + nk, m))
+        n, m = poles.size, self.structure.terms[j]
+        differences = np.zeros((m, m))
         row = np.array([1.0])
         for k in range(m):
-            differences[nk : nk + row.size, k] = row
+            differences[: row.size, k] = row
             row = np.convolve(row, [1.0, -1.0])
         scale = float(np.prod(1.0 - poles))
         first = self._first(j)
@@ -264,11 +258,11 @@ def _difference(u: Matrix) -> Matrix:
 
 def _input_columns(u: Matrix, poles: Vector, structure: Structure) -> Matrix:
     columns = []
-    for signal, terms, delay in zip(_through(poles, u), structure.terms, structure.delays, strict=True):
-        late = signal if delay == 0 else np.concatenate((np.zeros(delay), signal[:-delay]))
+    for signal, terms in zip(_through(poles, u), structure.terms, strict=True):
+        difference = signal
         for _ in range(terms):
-            columns.append(late)
-            late = _difference(late)
+            columns.append(difference)
+            difference = _difference(difference)
     return np.stack(columns, axis=1)
 
 
@@ -398,7 +392,7 @@ def fit_output_error(
         One or several stretches of data; time constants and numerators are common, initial state and
         offset are each stretch's own.
     structure : Structure
-        Orders and delays.
+        Orders.
     period_s : float
         Sample period, s.
     starts : sequence of sequence of float

@@ -23,7 +23,7 @@ def settle_starts(segments: Sequence[Segment], structure: Structure, period_s: f
     segments : sequence of Segment
         Data.
     structure : Structure
-        Orders and delays of the fit.
+        Orders of the fit.
     period_s : float
         Sample period, s.
     folds : int

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from compensator.arrays import Mask, Vector
 from compensator.data.runs import Run
@@ -49,8 +48,7 @@ class TemperatureFit:
 
     def heat(self, difference_k: Vector) -> Vector:
         """Return the heat from T_Q − AT by the inverse, from rest, W."""
-        f = self.function
-        return np.asarray(lfilter(f.a, f.b, difference_k))
+        return self.function.inverse_response(difference_k)
 
 
 def fit_temperature(
@@ -122,4 +120,4 @@ def noise_gain(function: SampledTransferFunction) -> float:
     """
     impulse = np.zeros(5000)
     impulse[0] = 1.0
-    return float(np.linalg.norm(lfilter(function.a, function.b, impulse)))
+    return float(np.linalg.norm(function.inverse_response(impulse)))

@@ -95,7 +95,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class EngineState:
-    """Everything the engine must remember to continue with the same bits.
+    """Everything that the engine needs to continue with the same bits.
 
     Parameters
     ----------
@@ -136,8 +136,8 @@ class Gap:
     limit : int
         A gap of more samples than this is left as predicted.
     held : bool
-        Whether the missing values are assumed to have been those after the gap all along, instead of on a straight
-        line between its ends.
+        Whether the missing values are taken to be those after the gap throughout, instead of on a straight line
+        between its ends.
     """
 
     state: EngineState
@@ -228,7 +228,7 @@ class Engine:
         )
 
     def restore(self, state: EngineState) -> None:
-        """Go on from a snapshot.
+        """Continue from a snapshot.
 
         Raises
         ------
@@ -348,8 +348,8 @@ class Engine:
         samples : int
             How many, at least 1; there is no limit to what is repeated.
         held : bool
-            Whether the machine is assumed to have been all along as it is found after the gap, instead of on a straight
-            line between its ends: the state before a long gap says nothing about its end.
+            Whether the machine is assumed to have been throughout the gap as it is found after it, instead of on a
+            straight line between its ends: the state before a long gap says nothing about its end.
 
         Returns
         -------

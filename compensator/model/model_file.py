@@ -17,7 +17,7 @@ from typing import Any
 
 from compensator.errors import CompensatorError, ModelError
 from compensator.model.effects import Effect, effect_from, kinds
-from compensator.model.table import Table, shown
+from compensator.model.table import TomlTable, shown
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
 
@@ -117,13 +117,13 @@ def parse_model(data: bytes, *, source: str) -> ThermalModel:
 
 
 def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
-    top = Table("model", table, _TOP)
+    top = TomlTable("model", table, _TOP)
     if table.get("schema") != 1:
         raise ModelError(f"schema = {shown(table.get('schema'))}, expected 1")
     kind = top.text("kind", ("heat", "direct"))
     period_s = top.number("sample_period_s", low=0.1, high=3600.0)
     names = ("TTF", "DTF", "TDTF") if kind == "heat" else ("DTF", "TDTF")
-    paths_table = Table("paths", table.get("paths", {}), names)
+    paths_table = TomlTable("paths", table.get("paths", {}), names)
     held_out, stds, provenance = _provenance(table.get("provenance", {}))
     paths = {name: _path(f"paths.{name}", value, period_s) for name, value in paths_table.table.items()}
     paths |= {name: replace(path, gain_std=stds[name]) for name, path in paths.items() if name in stds}
@@ -150,10 +150,10 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
 
 
 def _path(where: str, value: object, period_s: float, extra: Sequence[str] = ()) -> Path:
-    table = Table(where, value)
+    table = TomlTable(where, value)
     form = table.text("form", tuple(_FORMS))
     upper, lower = _FORMS[form]
-    table = Table(where, value, ("unit", "form", upper, lower, "covariance", *extra))
+    table = TomlTable(where, value, ("unit", "form", upper, lower, "covariance", *extra))
     unit = table.text("unit")
     top, bottom = table.numbers(upper), table.numbers(lower)
     try:
@@ -165,18 +165,18 @@ def _path(where: str, value: object, period_s: float, extra: Sequence[str] = ())
     return Path(sampled=sampled, unit=unit, covariance=_covariance(table, len(top) + len(bottom) - 1))
 
 
-def _covariance(table: Table, size: int) -> tuple[tuple[float, ...], ...] | None:
+def _covariance(table: TomlTable, size: int) -> tuple[tuple[float, ...], ...] | None:
     rows = table.table.get("covariance")
     if rows is None:
         return None
     if not isinstance(rows, list) or len(rows) != size:
         raise ModelError(f"{table.where}: covariance, expected {size} rows of {size} numbers")
-    return tuple(Table(table.where, {"covariance": row}).numbers("covariance", length=size) for row in rows)
+    return tuple(TomlTable(table.where, {"covariance": row}).numbers("covariance", length=size) for row in rows)
 
 
 def _estimator(value: object, kind: str) -> Estimator:
     walk = "heat_walk_std_w" if kind == "heat" else "difference_walk_std_k"
-    table = Table("estimator", value if value is not None else {}, (*_ESTIMATOR, walk))
+    table = TomlTable("estimator", value if value is not None else {}, (*_ESTIMATOR, walk))
     return Estimator(
         method=table.text("method", ("kalman", "inverse")),  # type: ignore[arg-type]
         t_q_noise_std_k=table.number("t_q_noise_std_k"),
@@ -187,12 +187,12 @@ def _estimator(value: object, kind: str) -> Estimator:
 
 
 def _uncertainty(value: object) -> float:
-    return Table("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0)
+    return TomlTable("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0)
 
 
 def _provenance(value: object) -> tuple[float | None, dict[str, float], dict[str, Any]]:
     """Return the calibration's error and the standard errors of its gains, which the file keeps there, and the rest."""
-    rest = dict(Table("provenance", value).table)
+    rest = dict(TomlTable("provenance", value).table)
     held_out, stds = rest.pop(HELD_OUT_KEY, None), rest.pop(GAIN_STD_KEY, None)
     if held_out is not None and not isinstance(held_out, float):
         rest[HELD_OUT_KEY], held_out = held_out, None
@@ -203,7 +203,7 @@ def _provenance(value: object) -> tuple[float | None, dict[str, float], dict[str
 
 
 def _validity(value: object) -> dict[str, tuple[float, float]]:
-    table = Table("validity", value)
+    table = TomlTable("validity", value)
     ranges: dict[str, tuple[float, float]] = {}
     for key in table.table:
         low, high = table.numbers(key, length=2)
@@ -218,7 +218,7 @@ def _effects(model_name: str, value: object) -> tuple[Effect, ...]:
         raise ModelError("effect: expected a list of tables, [[effect]]")
     result = []
     for i, entry in enumerate(value, start=1):
-        table = Table(f"effect {i}", entry)
+        table = TomlTable(f"effect {i}", entry)
         kind = table.text("kind")
         if kind not in kinds():
             known = ", ".join(sorted(kinds()))
@@ -229,8 +229,8 @@ def _effects(model_name: str, value: object) -> tuple[Effect, ...]:
 
 def _alternatives(value: object, names: Sequence[str], period_s: float) -> dict[str, tuple[str, Path]]:
     result = {}
-    for name, entry in Table("alternatives", value).table.items():
+    for name, entry in TomlTable("alternatives", value).table.items():
         where = f"alternatives.{name}"
-        replaces = Table(where, entry).text("replaces", names)
+        replaces = TomlTable(where, entry).text("replaces", names)
         result[name] = (replaces, _path(where, entry, period_s, ("replaces",)))
     return result

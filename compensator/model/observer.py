@@ -10,10 +10,10 @@ T_Q − AT, K, in a direct model) and the ambient change *a* as random walks:
 
 Both ways to estimate the heat are observers of this system; only their gains differ:
 
-- `inverse`: a = AT and q = (T_Q − AT − C₁ x₁) / D₁, which is the paper's TTF⁻¹ to the letter;
+- `inverse`: a = AT and q = (T_Q − AT − C₁ x₁) / D₁, which is exactly the paper's TTF⁻¹;
 - `kalman`: the optimal gains for white sensor noise.
 
-A missing measurement skips its update: the drive stays where it was, the state moves on, and the
+A missing measurement skips its update: the drive keeps its value, the state moves on, and the
 covariance *P* grows. Arithmetic is scalar float or element-wise, never a matrix product of a BLAS, whose
 order of summation depends on the processor: the same inputs give the same bits on every machine, which is
 what lets an audit compare bit by bit. Once *P* has settled, its recursion is skipped until a sample is
@@ -42,7 +42,7 @@ _ZERO = SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=60.0)
 
 @dataclass(frozen=True, slots=True)
 class ObserverState:
-    """What the observer must remember between two samples.
+    """What the observer keeps between two samples.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ class Observer:
     # ------------------------------------------------------------------ covariance
 
     def _recurse(self, r_at: float | None, r_tq: float | None, complete: bool) -> tuple[list[float], list[float]]:
-        """Move the covariance on by one sample and return the gains for AT and T_Q (None: missing)."""
+        """Propagate the covariance by one sample and return the gains for AT and T_Q (None: missing)."""
         before = self._P
         p = self._moved_covariance(before) if self._started else before
         gain_at: list[float] = []
@@ -258,7 +258,7 @@ class Observer:
                 total += wi * wj * float(self._P[i, j])
         return max(total, 0.0)
 
-    # ------------------------------------------------------------------ what it knows
+    # ------------------------------------------------------------------ estimates
 
     @property
     def drive(self) -> float:
@@ -336,7 +336,7 @@ class Observer:
         )
 
     def restore(self, state: ObserverState) -> None:
-        """Go on from a snapshot.
+        """Continue from a snapshot.
 
         Raises
         ------

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.data.record import Record
+from compensator.data.record import SampledRecord
 from compensator.errors import DataError
 from compensator.model.engine import Engine
 from compensator.model.thermal_model import ThermalModel
@@ -42,7 +42,7 @@ class Scores:
         return [f"{self.rms_um:.2f}", f"{self.peak_to_peak_um:.2f}", f"{self.fit_pct:.2f}"]
 
 
-def simulate(model: ThermalModel, record: Record, *, source: str = "") -> dict[str, Vector]:
+def simulate(model: ThermalModel, record: SampledRecord, *, source: str = "") -> dict[str, Vector]:
     """Run a model over a record.
 
     The first sample with both temperatures is the reference; measured deformation counts from its first value.
@@ -51,7 +51,7 @@ def simulate(model: ThermalModel, record: Record, *, source: str = "") -> dict[s
     ----------
     model : ThermalModel
         The model.
-    record : Record
+    record : SampledRecord
         Needs `t_q_degc` and `at_degc`.
     source : str
         Name of the data, for the message.

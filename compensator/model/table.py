@@ -10,7 +10,7 @@ from compensator.arrays import LARGEST
 from compensator.errors import ModelError
 
 
-class Table:
+class TomlTable:
     """Typed access to a table of the model file.
 
     Parameters

@@ -145,7 +145,7 @@ class ThermalModel(Shown):
     validity : mapping of str to (float, float)
         Range of `t_q_degc`, `at_degc`, `heat_w`, … on which the model was made.
     y_std_um : float
-        Standard deviation of the model's own error in y, µm, over and above sensor noise.
+        Standard deviation of the model's own error in y, µm, in addition to sensor noise.
     held_out_rms_um : float, optional
         Free-run error of the calibration on held-out data, µm; None for a model that no calibration on a machine made.
     effects : tuple of Effect
@@ -155,7 +155,7 @@ class ThermalModel(Shown):
     provenance : mapping
         Where it comes from: source, date, hash of the data, fits.
     sha256 : str
-        Hash of the model file's bytes; empty for a model that never was a file.
+        Hash of the model file's bytes; empty for a model that was not read from a file.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Rational transfer functions with units, and their sampled form.
 
-A path of the thermal model is written the way the field writes it, as a quotient of polynomials in
-*s* with the time in **minutes**:
+A path of the thermal model is written, as usual in the field, as a quotient of polynomials in *s* with
+the time in **minutes**:
 
     G(s) = (n_0 + n_1 s + n_2 s² + …) / (d_0 + d_1 s + d_2 s² + …)
 
@@ -153,9 +153,33 @@ class SampledTransferFunction:
         >>> SampledTransferFunction(b=(0.5,), a=(1.0, -0.5), period_s=60.0).response([1, 1, 1])
         array([0.5  , 0.75 , 0.875])
         """
-        from scipy.signal import lfilter  # here, because the service never needs it and it costs 40 MB
+        return _filtered(self.b, self.a, u)
 
-        return np.asarray(lfilter(self.b, self.a, np.asarray(u, dtype=float)), dtype=np.float64)
+    def inverse_response(self, y: npt.ArrayLike) -> Vector:
+        """Compute the input, from rest, that gives an output record; needs `b[0]` other than 0.
+
+        Parameters
+        ----------
+        y : array_like, shape (n,)
+            Output at each sample.
+
+        Returns
+        -------
+        numpy.ndarray, shape (n,)
+            Input at each sample.
+
+        Examples
+        --------
+        >>> SampledTransferFunction(b=(0.5,), a=(1.0, -0.5), period_s=60.0).inverse_response([0.5, 0.75, 0.875])
+        array([1., 1., 1.])
+        """
+        return _filtered(self.a, self.b, y)
+
+
+def _filtered(b: Sequence[float], a: Sequence[float], values: npt.ArrayLike) -> Vector:
+    from scipy.signal import lfilter  # here, because the service never needs it and it costs 40 MB
+
+    return np.asarray(lfilter(b, a, np.asarray(values, dtype=float)), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

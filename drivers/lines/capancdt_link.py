@@ -107,7 +107,7 @@ class CapancdtLink:
         self._skipped = self._blocks.skipped
 
     def _why_nothing(self, wait_s: float) -> DriverError:
-        """Return why there is nothing new: a new error each time, as a raised one grows a traceback."""
+        """Return why nothing new came, in a new object each time, because a raised error keeps its traceback."""
         if self._failure is not None:
             return type(self._failure)(self._name, self._failure.message)
         if self._repeated:
@@ -143,7 +143,7 @@ class CapancdtLink:
                 self._failure = DeviceTimeout(self._name, f"no connection to {host} within {self.timeout_s} s")
             except (OSError, ValueError) as error:  # ValueError: a host that is no name
                 self._failure = DeviceDisconnected(self._name, f"{self.config.host}: {error}")
-            # A controller that accepts connections but sends nothing is left longer and longer pauses.
+            # A controller that accepts connections but sends nothing is retried at growing intervals.
             tries = 0 if self._heard else tries
             self._heard = False
             self._infos = {}

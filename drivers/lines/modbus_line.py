@@ -26,7 +26,7 @@ from drivers.lines.settings import SerialLine, TcpLine
 from drivers.lines.shared_line import Place, SharedLine
 from drivers.protocols.modbus import Request, WrongAnswerError, exception_text
 
-# Consecutive timeouts after which a TCP connection is made again: its other end may be long gone.
+# Consecutive timeouts after which a TCP connection is reopened, because its peer may be gone.
 MOST_TIMEOUTS = 2
 
 

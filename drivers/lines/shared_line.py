@@ -46,7 +46,7 @@ class Place:
 
     @property
     def generation(self) -> tuple[int, int]:
-        """Connections and settlings so far; after a new one the device may have been exchanged."""
+        """Number of times the line was connected or cleared; after each the device may be another one."""
         return self.line.generation, self.settlings
 
     async def close(self) -> None:
@@ -131,7 +131,7 @@ class SharedLine(ABC, Generic[PlaceT]):
         return [place.backoff]
 
     def _check_turn(self, place: PlaceT, asked_at_s: float) -> None:
-        """Refuse a device in its turn, where another one has found meanwhile that the host is not reachable."""
+        """Refuse a waiting device where another one has meanwhile found the host unreachable."""
 
     @abstractmethod
     async def _open(self, place: PlaceT) -> None:

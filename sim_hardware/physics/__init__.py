@@ -3,7 +3,7 @@
 from sim_hardware.physics.conduction import QuillMachine
 from sim_hardware.physics.design import QuillDesign
 from sim_hardware.physics.duty import Duty
-from sim_hardware.physics.effects import Effect, draw_effect
+from sim_hardware.physics.effects import UndeclaredEffect, draw_effect
 from sim_hardware.physics.plant import Inputs, Plant
 from sim_hardware.physics.published import PublishedQuill
 from sim_hardware.physics.sensors import Sensor, SensorSpec, usual_sensors
@@ -11,7 +11,6 @@ from sim_hardware.physics.world import World
 
 __all__ = [
     "Duty",
-    "Effect",
     "Inputs",
     "Plant",
     "PublishedQuill",
@@ -19,6 +18,7 @@ __all__ = [
     "QuillMachine",
     "Sensor",
     "SensorSpec",
+    "UndeclaredEffect",
     "World",
     "draw_effect",
     "usual_sensors",

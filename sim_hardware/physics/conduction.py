@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_hardware.physics.design import QuillDesign
-from sim_hardware.physics.effects.base import Effect, overriding
+from sim_hardware.physics.effects.base import UndeclaredEffect, overriding
 from sim_hardware.physics.film import Film
 from sim_hardware.physics.layout import Layout
 from sim_hardware.physics.plant import REST_DEGC, Inputs
@@ -38,7 +38,7 @@ class QuillMachine:
     ----------
     design : QuillDesign, optional
         Dimensions; the sized ones if left out.
-    effects : sequence of Effect
+    effects : sequence of UndeclaredEffect
         Undeclared effects at work.
     longest_substep_s : float
         Bound for the splitting, s.
@@ -55,7 +55,7 @@ class QuillMachine:
     def __init__(
         self,
         design: QuillDesign | None = None,
-        effects: Sequence[Effect] = (),
+        effects: Sequence[UndeclaredEffect] = (),
         longest_substep_s: float = 10.0,
     ) -> None:
         design = design or QuillDesign()

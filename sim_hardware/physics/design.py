@@ -1,6 +1,6 @@
 """The sized quill: dimensions, masses, films and lever arms of :class:`QuillMachine`.
 
-The machine of the experiment was never drawn with dimensions. These values are plausible for a hollow steel
+The dimensions of the machine in the experiment were not published. These values are plausible for a hollow steel
 quill of that size in a cast headstock on a column, and were sized by ``sizing.py`` so that the responses come
 near the functions published by M. Mareš and P. Bárta.
 """

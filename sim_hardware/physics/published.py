@@ -2,8 +2,8 @@
 
 M. Mareš, P. Bárta, Mechatronic approach in modeling, identification and control of thermal deformation of
 quill: equations (3) to (5). Time in them is in minutes; DTF is in µm/W, TDTF in µm/K of the ambient's change,
-TTF in K/W of T_Q − AT. The functions came out of a discrete identification at 60 s, and Tustin's rule at 60 s
-gives those polynomials back; they are what runs here.
+TTF in K/W of T_Q − AT. The functions were identified in discrete time at 60 s, and Tustin's rule at 60 s
+reproduces those polynomials, which are run here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from sim_hardware.physics.effects.base import Effect, overriding
+from sim_hardware.physics.effects.base import UndeclaredEffect, overriding
 from sim_hardware.physics.plant import REST_DEGC, Inputs
 
 Array = NDArray[np.float64]
@@ -83,7 +83,7 @@ def step_responses(minutes: int, heat_w: float = 90.0) -> tuple[Array, Array, Ar
 
 
 class PublishedQuill:
-    """The quill as the paper's equations have it.
+    """The quill by the paper's equations.
 
     The functions step at the whole minutes, with the inputs given to the first piece of that minute, and
     their outputs hold until the next one: a sample of a minute's mean is exactly one step. T_Q is the present
@@ -91,7 +91,7 @@ class PublishedQuill:
 
     Parameters
     ----------
-    effects : sequence of Effect
+    effects : sequence of UndeclaredEffect
         Undeclared effects that act on what leaves the machine (probe, joint, thermocouple).
 
     Raises
@@ -108,7 +108,7 @@ class PublishedQuill:
     114.3
     """
 
-    def __init__(self, effects: Sequence[Effect] = ()) -> None:
+    def __init__(self, effects: Sequence[UndeclaredEffect] = ()) -> None:
         for effect in effects:
             if effect.reveal().thermal:
                 raise ValueError(f"{effect!r} needs a machine of masses: use QuillMachine")

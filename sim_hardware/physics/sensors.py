@@ -29,8 +29,8 @@ class SensorSpec:
         Step of the converter; 0: none.
     lag_s : float
         Time constant, s.
-    wild_share, wild_size : float
-        Share of readings that are off by up to `wild_size`, and that size.
+    outlier_share, outlier_size : float
+        Share of readings that are off by up to `outlier_size`, and that size.
     dropout_share : float
         Share of readings that are missing (NaN).
     """
@@ -39,8 +39,8 @@ class SensorSpec:
     noise_std: float = 0.0
     quantum: float = 0.0
     lag_s: float = 0.0
-    wild_share: float = 0.0
-    wild_size: float = 0.0
+    outlier_share: float = 0.0
+    outlier_size: float = 0.0
     dropout_share: float = 0.0
 
 
@@ -65,7 +65,7 @@ class Sensor:
     def __init__(self, spec: SensorSpec, seed: int = 0, name: str = "") -> None:
         self.spec = spec
         self._random = np.random.default_rng([seed, zlib.crc32(name.encode())])
-        self._plain = spec.noise_std == spec.wild_share == spec.dropout_share == 0.0
+        self._plain = spec.noise_std == spec.outlier_share == spec.dropout_share == 0.0
         self._drawn: list[tuple[float, float, float]] = []
         self._lagged = math.nan
         self._last_s = math.nan
@@ -91,7 +91,7 @@ class Sensor:
             noise_1, chance_1, size_1 = self._drawn.pop()
             if chance_1 < spec.dropout_share:
                 return math.nan
-            value += noise_1 + (size_1 if chance_1 > 1.0 - spec.wild_share else 0.0)
+            value += noise_1 + (size_1 if chance_1 > 1.0 - spec.outlier_share else 0.0)
         return round(value / spec.quantum) * spec.quantum if spec.quantum else value
 
     def read_many(self, true_values: Array, period_s: float) -> Array:
@@ -103,14 +103,14 @@ class Sensor:
         values = values + spec.bias
         if not self._plain:
             noise, chance, size = self._draw(len(values))
-            values = values + noise + np.where(chance > 1.0 - spec.wild_share, size, 0.0)
+            values = values + noise + np.where(chance > 1.0 - spec.outlier_share, size, 0.0)
             values[chance < spec.dropout_share] = np.nan
         return np.round(values / spec.quantum) * spec.quantum if spec.quantum else values
 
     def _draw(self, n: int) -> tuple[Array, Array, Array]:
         noise = self.spec.noise_std * self._random.standard_normal(n)
         chance = self._random.random(n)
-        size = self.spec.wild_size * self._random.uniform(-1.0, 1.0, n)
+        size = self.spec.outlier_size * self._random.uniform(-1.0, 1.0, n)
         return noise, chance, size
 
     def _lag(self, true_value: float, t_s: float) -> float:

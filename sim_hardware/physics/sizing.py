@@ -3,8 +3,8 @@
 Run ``python -m sim_hardware.physics.sizing`` to see how near the stored dimensions come, with ``--fit`` to
 search again (some minutes) and print the new ones, rounded. Least squares over three responses: displacement
 and T_Q − AT after 90 W from rest, and the displacement after the air has become 1 K warmer; dimensions are
-searched in their logarithms (masses, films and contacts are positive) within bounds that a workshop would
-believe.
+searched in their logarithms (masses, films and contacts are positive) within plausible
+bounds.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def fit(start: QuillDesign, evaluations: int = 40) -> QuillDesign:
 
     def errors(x: Array) -> Array:
         y_m, t_m, a_m = responses(design(x))
-        # 1 µm, 0.2 K and 0.3 µm weigh the same; a weak pull keeps what the responses do not determine.
+        # 1 µm, 0.2 K and 0.3 µm weigh the same; a weak prior holds what the responses do not determine.
         return np.concatenate([(y_m - y)[at], (t_m - t)[at] / 0.2, (a_m - a)[at] / 0.3, 0.15 * (x - x0)])
 
     found = least_squares(

@@ -27,7 +27,7 @@ class World:
     plant : Plant
         :class:`QuillMachine` or :class:`PublishedQuill`, at rest.
     duty : Duty
-        What it is made to do.
+        Its inputs over time.
     sensors : mapping of str to SensorSpec, optional
         Sensors by channel; :func:`usual_sensors` if left out. Channels without one have no reading.
     seed : int

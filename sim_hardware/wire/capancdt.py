@@ -26,7 +26,7 @@ DRAIN_S = 2.0
 class CapaNcdt(Server):
     """Serve a displacement controller.
 
-    Only the client that has been connected to the data port longest is sent values; others hear nothing.
+    Only the client that has been connected to the data port longest is sent values; others receive nothing.
     Faults act on the data port, "exception" and "silence" on the command port too.
 
     Parameters

@@ -50,9 +50,9 @@ class CommandConnection(Connection):
     Parameters
     ----------
     execute : callable
-        Gives what follows the echo of a command.
+        Returns what follows the echo of a command.
     mute : callable
-        Tells whether the controller is to stay silent.
+        Returns whether the controller is to stay silent.
     """
 
     def __init__(self, port: TcpPort, execute: Callable[[str], str], mute: Callable[[], bool]) -> None:

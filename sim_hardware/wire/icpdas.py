@@ -130,7 +130,7 @@ class IcpDas(RangedModule):
         return self._spec.type_per_channel
 
     def bad(self, channel: int) -> bool:
-        """Tell whether the module sees an input outside its range or open."""
+        """Return whether the module sees an input outside its range or open."""
         state = self.sample(channel).state
         if state is State.OPEN:
             return self._spec.detects_open and self.ranges[channel].thermocouple

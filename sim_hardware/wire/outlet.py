@@ -30,7 +30,7 @@ class Outlet:
         self._timers: set[asyncio.TimerHandle] = set()
 
     def send(self, frame: bytes, layers: Layers) -> None:
-        """Send a frame, unless a fault changes, delays or swallows it."""
+        """Send a frame, unless a fault changes, delays or drops it."""
         if layers.quiet and not self._held:
             self._write(frame)
             return

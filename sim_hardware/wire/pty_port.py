@@ -16,7 +16,7 @@ CHUNK = 4096
 
 
 class PtyPort:
-    """Be the far end of a serial line.
+    """The far end of a serial line.
 
     The near end, for the program under test, is a pseudo-terminal that a symbolic link names. The link stays
     where it is when the line is unplugged and comes back as another pseudo-terminal.

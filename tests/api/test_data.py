@@ -80,6 +80,48 @@ def test_columns_give_roles_in_files_and_in_memory(tmp_path: Path) -> None:
         tc.read(renamed, columns={"t_q_degc": "t9"})
 
 
+def test_the_time_may_have_another_name(tmp_path: Path) -> None:
+    wanted = records(SMALL)
+    renamed = pd.DataFrame(SMALL).rename(columns={"t_s": "clock"})
+    renamed.to_csv(tmp_path / "run.csv", index=False)
+    savemat(tmp_path / "run.mat", renamed.to_dict("list"))
+    columns = {"t_s": "clock"}
+    for data in (tmp_path / "run.csv", tmp_path / "run.mat", renamed, renamed.to_dict("list")):
+        same(records(data, columns=columns), wanted)
+        with pytest.raises(tc.CompensatorError, match=r"no .* t_s or time_utc; "):
+            tc.read(data)
+    same(records(renamed.set_index("clock"), columns=columns), wanted)
+    # A time that is named is used, whatever else looks like one.
+    same(records(renamed.assign(t_s=[5.0, 4.0, 3.0], time_utc="never"), columns=columns), wanted)
+    with pytest.raises(tc.CompensatorError, match=r"^data: --column t_s=watch: no such column, expected one of: clock"):
+        tc.read(renamed, columns={"t_s": "watch"})
+
+
+@pytest.mark.parametrize("as_index", [False, True])
+def test_a_date_and_time_of_another_name_gives_results_by_time(run: Path, as_index: bool) -> None:
+    by_date = by_time(run)
+    stamped = by_date.rename_axis("stamp") if as_index else by_date.rename_axis("stamp").reset_index()
+    columns = {"time_utc": "stamp"}
+    same(records(stamped, columns=columns), records(run))
+    assert tc.simulate("quill", stamped, columns=columns).index[0] == START
+    local = stamped.tz_localize(None) if as_index else stamped.assign(stamp=stamped["stamp"].dt.tz_localize(None))
+    assert tc.simulate("quill", local, columns=columns).index[0] == START.tz_localize(None)
+
+
+def test_a_temperature_that_is_missing_for_long_is_remarked_and_not_interpolated() -> None:
+    n = 600
+    table = {"t_s": 60.0 * np.arange(n), "t_q_degc": 20.0 + np.arange(n) / 50.0, "at_degc": np.full(n, 20.0)}
+    for first, last in ((100, 160), (200, 290), (400, 461)):  # the first is bridged
+        table["t_q_degc"][first:last] = np.nan
+    data = tc.read(table).at_period(60.0)
+    assert [remark.code for remark in data.remarks] == ["temperature_missing"]
+    assert "data: t_q_degc is missing for 2.5 h from t_s = 12000, 24000; not interpolated" in data.remarks[0]
+    assert np.isnan(data.records[0].columns["t_q_degc"][200:290]).all()
+    found = tc.simulate("quill", table)
+    assert "temperature_missing" in [remark.code for remark in found.remarks]
+    assert found["y_std_um"][280] > 1.5 * found["y_std_um"][190]
+
+
 def test_a_run_shows_itself() -> None:
     table = pd.DataFrame(SMALL | {"y_um": [1.0, np.nan, 2.0]})
     table.loc[3] = {"t_s": 720.0, "t_q_degc": 22.0, "at_degc": 20.0, "y_um": 2.0}
@@ -140,6 +182,29 @@ def test_vectors_and_structs_of_matlab_are_tables(tmp_path: Path, run: Path, as_
     path = tmp_path / "run.mat"
     savemat(path, {"run": wanted} if as_struct else {**wanted, "Ts": 60.0, "note": "a scalar and a text beside them"})
     same(records(path), records(run))
+
+
+def test_matrices_among_vectors_are_left_out_with_a_remark(tmp_path: Path) -> None:
+    others = {"A": np.eye(3), "frames": np.zeros((3, 2, 2)), "b": [1.0, 2.0], "Ts": 60.0}
+    savemat(tmp_path / "run.mat", SMALL | others)
+    found = tc.read(tmp_path / "run.mat")
+    assert set(found.table.columns) == {"t_q_degc", "at_degc"}
+    assert [remark.code for remark in found.remarks] == ["variables_left_out"]
+    assert "3 rows: A (3 × 3), frames (3 × 2 × 2), b (2)." in found.remarks[0]
+    savemat(tmp_path / "run.mat", SMALL | {"y_um": np.eye(3)})
+    with pytest.raises(tc.CompensatorError, match=r"y_um has the shape \(3, 3\), expected one value for each row"):
+        tc.read(tmp_path / "run.mat")
+    savemat(tmp_path / "run.mat", SMALL | {"A": np.eye(3)})
+    with pytest.raises(tc.CompensatorError, match=r"A has the shape \(3, 3\)"):
+        tc.read(tmp_path / "run.mat", columns={"y_um": "A"})
+
+
+def test_suffixes_may_be_in_capitals(tmp_path: Path) -> None:
+    savemat(tmp_path / "RUN.mat", SMALL)
+    (tmp_path / "RUN.mat").rename(tmp_path / "RUN.MAT")
+    pd.DataFrame(SMALL).to_csv(tmp_path / "RUN.CSV", index=False)
+    same(records(tmp_path / "RUN.MAT"), records(SMALL))
+    same(records(tmp_path / "RUN.CSV"), records(SMALL))
 
 
 def test_matlab_s_times_in_text_are_read(tmp_path: Path) -> None:

@@ -94,3 +94,12 @@ def test_a_broken_mat_file_is_named(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(tc.CompensatorError, match=r"run\.mat: not a MAT file that can be read"):
         tc.read(path)
+
+
+def test_a_folder_that_does_not_exist_is_refused_and_not_made(table: pd.DataFrame, tmp_path: Path) -> None:
+    found = tc.identify(table, order=(2, 2, 2))
+    for save in (tc.simulate("quill", table).save, found.save, found.page):
+        for name in ("model.toml", "out.html"):
+            with pytest.raises(tc.CompensatorError, match=r"absent/\S+: (no such folder|expected a name)"):
+                save(tmp_path / "absent" / name)
+    assert list(tmp_path.iterdir()) == []

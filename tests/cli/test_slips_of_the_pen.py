@@ -89,6 +89,12 @@ def test_where_nothing_can_be_written_is_said_before_the_work(
     refused(capsys, ["diagnose", run, "--model", "quill", "--out", str(file)], "is a file, expected a folder")
 
 
+def test_a_command_makes_the_folder_of_its_table(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "folder" / "o.csv"
+    assert main(["simulate", str(table(tmp_path / "run.csv")), "--model", "quill", "--out", str(out)]) == 0
+    assert out.exists()
+
+
 def test_a_folder_without_permission(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

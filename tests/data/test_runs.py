@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from compensator.data.record import SHORT_GAP_SAMPLES, Record
+from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
 from compensator.data.runs import SHORTEST_RUN, is_noise, noise_of, noise_std, runs_of, walk_std, without_outliers
 
 N = 600
@@ -19,7 +19,7 @@ def columns(seed=0):
 
 
 def runs(c, name="day.csv"):
-    return list(runs_of(name, Record(t_s=np.arange(N) * 60.0, columns=c)))
+    return list(runs_of(name, SampledRecord(t_s=np.arange(N) * 60.0, columns=c)))
 
 
 @pytest.mark.parametrize("column", ["t_q_degc", "at_degc", "heat_w"])

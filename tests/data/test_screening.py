@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from compensator.data.record import Record
+from compensator.data.record import SampledRecord
 from compensator.data.runs import noise_std, runs_of, without_outliers
 from compensator.data.screening import screen, screen_temperatures
 from compensator.errors import DataError
@@ -137,7 +137,7 @@ def test_a_wild_reading_goes_and_a_step_stays():
 def test_remarks_name_the_column():
     c = columns()
     c["y_um"][400] += 60.0
-    said = [remark for _, remarks in runs_of("day.csv", Record(np.arange(720) * 60.0, c)) for remark in remarks]
+    said = [remark for _, remarks in runs_of("day.csv", SampledRecord(np.arange(720) * 60.0, c)) for remark in remarks]
     assert [one.code for one in said] == ["wild_readings"] and "day.csv: y_um: 1 outlier(s) left out" in said[0]
 
 

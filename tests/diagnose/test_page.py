@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from compensator.model.effects import base, effect_from, kinds
+from compensator.model.effects import base, effect_from, hypothesis, kinds
 from compensator.model.engine import Engine
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
@@ -25,6 +25,7 @@ def stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """Add the page's file, and take everything back afterwards."""
     kinds()
     monkeypatch.setattr(base, "_FORMS", list(base._FORMS))
+    monkeypatch.setattr(hypothesis, "_PROPOSERS", list(hypothesis._PROPOSERS))
     imported("compensator.model.effects.stop", "compensator/model/effects/stop.py", monkeypatch)
 
 

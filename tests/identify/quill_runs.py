@@ -5,7 +5,7 @@ import functools
 import numpy as np
 from scipy.signal import lfilter
 
-from compensator.data.record import Record
+from compensator.data.record import SampledRecord
 from compensator.data.runs import runs_of
 from compensator.model.model_file import load_model
 from sim_hardware.physics import World, usual_sensors
@@ -41,5 +41,5 @@ def simulated(plant, duty, seed, heat=True):
 
 def runs_from(columns, t_s=None, name="run"):
     n = next(iter(columns.values())).size
-    record = Record(t_s=np.arange(n) * 60.0 if t_s is None else t_s, columns=columns)
+    record = SampledRecord(t_s=np.arange(n) * 60.0 if t_s is None else t_s, columns=columns)
     return [run for run, _ in runs_of(name, record)]

@@ -65,16 +65,6 @@ def test_what_is_left_of_the_initial_state_dies_out():
     assert np.array_equal(fit([Segment.of(u, y, rest=True)], TRUE, 60.0).free_decay(0, 50), np.zeros(50))
 
 
-def test_a_delay_is_a_delay():
-    u = inputs(800, 3)[:1]
-    y = np.concatenate((np.zeros(4), lfilter([0.1], [1.0, -0.9], u[0])[:-4]))
-    right, wrong = (fit([Segment.of(u, y)], Structure(order=1, terms=(1,), delays=(nk,)), 60.0) for nk in (4, 0))
-    assert right.sigma < 1e-6
-    assert wrong.sigma > 0.1
-    assert right.function().b == pytest.approx((0.0, 0.0, 0.0, 0.0, 0.1), abs=1e-7)
-    assert right.function().response(u[0]) == pytest.approx(y, abs=1e-5)
-
-
 def test_kaufman_s_jacobian_gives_the_gradient_of_the_cost():
     """The term it leaves out is orthogonal to the residual, so that the gradient is exact and not an approximation."""
     heat, ambient, _, y, _, _ = published(CALIBRATION_W, 2)
@@ -176,8 +166,6 @@ def test_too_few_samples_counts_the_nuisances():
     [
         {"terms": ()},
         {"terms": (0,)},
-        {"terms": (1,), "delays": (-1,)},
-        {"terms": (1, 1), "delays": (0,)},
         {"terms": (1,), "order": -1},
     ],
 )

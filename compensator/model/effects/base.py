@@ -11,19 +11,16 @@ import dataclasses
 import importlib
 import math
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
+from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
 from compensator.arrays import NAN, Matrix, Vector
 from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.signals import RecordSignals, Signals
-from compensator.model.table import Table
-
-if TYPE_CHECKING:
-    from compensator.model.effects.hypothesis import Context, Hypothesis
+from compensator.model.table import TomlTable
 
 #: `step` or `filter` of a block.
 Run = Callable[..., S]
@@ -84,8 +81,8 @@ class Effect:
     names_background: ClassVar[bool] = False
     #: Least share of the residual's sum of squares that it must explain.
     worth: ClassVar[float] = 0.05
-    #: The same together with another effect where forms are approximate: what depends on time alone fits the rest.
-    worth_beside: ClassVar[float] = 0.05
+    #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
+    worth_with_others: ClassVar[float] = 0.05
     #: Ridge weight on its linear parameters, against columns of norm 1; 0 leaves them free.
     ridge: ClassVar[float] = 0.0
 
@@ -147,11 +144,6 @@ class Effect:
         """Return one or two sentences for an engineer; `rms_um` is its share of y."""
         raise NotImplementedError
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Yield the hypotheses that are worth a search on this data."""
-        yield from ()
-
     # ------------------------------------------------------------------ model file
 
     def to_table(self) -> dict[str, Any]:
@@ -162,7 +154,7 @@ class Effect:
 
 
 class BankEffect:
-    """Law of an effect that ends in a filter bank, its last block; goes before `Effect`."""
+    """Law of an effect that ends in a filter bank, its last block; a base class that is listed before `Effect`."""
 
     __slots__ = ()
 
@@ -203,14 +195,14 @@ class EffectStream:
         self._steps = [block.step for block in self._blocks]
 
     def step(self, signals: Signals[float]) -> float:
-        """Advance by one sample and return the addition to y, µm; 0 before its channels were seen."""
+        """Advance by one sample and return the addition to y, µm; 0 until each of its channels has had a value."""
         for channel in self.channels:
             if math.isnan(signals.channels.get(channel, NAN)):
                 return 0.0
         return float(self.effect.law(signals, self._steps))
 
     def peek(self, signals: Signals[float]) -> float:
-        """Return what `step` would, and stay where it is."""
+        """Return what `step` would, without a change of state."""
         states = [block.state for block in self._blocks]
         y = self.step(signals)
         for block, state in zip(self._blocks, states, strict=True):
@@ -222,7 +214,7 @@ class EffectStream:
         return tuple(value for block in self._blocks for value in block.state)
 
     def restore(self, state: tuple[float, ...]) -> None:
-        """Go on from a snapshot."""
+        """Continue from a snapshot."""
         start = 0
         for block in self._blocks:
             end = start + len(block.state)
@@ -275,7 +267,7 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
     """
     candidates = kinds()[kind]
     known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + ["form", *_FOUND])
-    keys = Table(f"effect {kind}", table, tuple(known))
+    keys = TomlTable(f"effect {kind}", table, tuple(known))
     choices = {choice: form for form in candidates for choice in _choices(form)}
     form = choices[keys.text("form", tuple(choices))] if choices else candidates[0]
     found = {key: table[key] for key in _FOUND if key in table}

@@ -1,7 +1,7 @@
 """Blocks that the laws of effects are composed of.
 
 A block advances by one sample (`step`) or returns its response to a whole record from rest (`filter`). A law is given
-the one or the other of its blocks, so that the same law serves the engine and the fit.
+either of them, so that the same law serves the engine and the fit.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class FilterBank(Block):
 
 
 class Delay(Block):
-    """A delay of any number of samples, between two of them by a straight line; the ends of a record hold."""
+    """A delay of any number of samples, interpolated linearly; the ends of a record hold."""
 
     def __init__(self, delay_min: float, period_min: float) -> None:
         self._samples = delay_min / period_min
@@ -156,12 +156,12 @@ class Delay(Block):
         return kept[whole] if part == 0.0 else kept[whole] + part * (kept[whole + 1] - kept[whole])
 
     def filter(self, u: Vector) -> Vector:
-        """Return a record that comes later."""
+        """Return the delayed record."""
         return shifted(u, self._samples)
 
 
 def shifted(u: Vector, samples: float) -> Vector:
-    """Return a record that comes later by a number of samples (earlier, if negative); the ends hold."""
+    """Return a record delayed by a number of samples (advanced, if negative); the ends hold."""
     k = np.arange(u.size, dtype=np.float64)
     return np.interp(k - samples, k, u)
 

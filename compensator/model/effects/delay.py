@@ -13,10 +13,10 @@ import numpy as np
 from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Block, Delay, Lag, S, shifted
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
 from compensator.model.effects.signals import RecordSignals, Signals
 
-#: Samples that a path is run on beyond a record's end.
+#: Samples by which a path is continued beyond a record's end.
 AHEAD = 64
 DELAY = Free(name="delay_min", low=0.0, high=60.0, grid=(0.5, 1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 40.0), log=False)
 LAG = Free(name="lag_min", low=0.05, high=60.0, grid=(0.5, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0))
@@ -35,7 +35,6 @@ class DelayedPath(Effect):
         return Lag(self.lag_min, period_min), Delay(self.delay_min, period_min)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return the difference that the delay makes."""
         lag, delay = run
         share = signals.share(self.path)
         moved = delay(share)
@@ -48,12 +47,6 @@ class DelayedPath(Effect):
         times = (("a dead time", self.delay_min), ("a lag", self.lag_min))
         return " and ".join(f"{what} of {digits(value)} min" for what, value in times if value)
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose a dead time of every path."""
-        for path in context.paths:
-            yield Hypothesis(effect=cls(path=path, delay_min=0.0, lag_min=0.0), form="dead time", free=(DELAY,))
-
 
 @register
 class DelayedSensor(DelayedPath):
@@ -62,9 +55,8 @@ class DelayedSensor(DelayedPath):
     deployable = False
 
     def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
-        """Return what the share would have been with an immediate sensor, less what it is."""
         share, period_min = record.share(self.path), record.period_min
-        # Beyond the end of the record the path goes on with its drive as it is.
+        # Beyond the end of the record the path continues with its last drive.
         drive = record.source(self.path)
         longer = record.function(self.path).response(np.concatenate((drive, np.full(AHEAD, drive[-1]))))
         early = shifted(longer, -self.delay_min / period_min)
@@ -79,14 +71,17 @@ class DelayedSensor(DelayedPath):
             "or mount it with better thermal contact."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose T_Q with a dead time, a lag or both; in a direct model AT with one of them."""
-        if "DTF" not in context.paths:
-            return
-        path, prefix = ("TTF", "") if context.has_ttf else ("DTF", "sensor, ")
-        delayed = cls(path=path, delay_min=0.0, lag_min=0.0)
-        yield Hypothesis(effect=delayed, form=f"{prefix}dead time", free=(DELAY,))
-        yield Hypothesis(effect=delayed, form=f"{prefix}lag", free=(LAG,))
-        if context.has_ttf:
-            yield Hypothesis(effect=delayed, form="dead time and lag", free=(DELAY, LAG))
+
+@proposes
+def delays(context: Context) -> Iterator[Hypothesis]:
+    """Propose a dead time of every path; T_Q with a dead time, a lag or both; in a direct model AT with one of them."""
+    for path in context.paths:
+        yield Hypothesis(effect=DelayedPath(path=path, delay_min=0.0, lag_min=0.0), form="dead time", free=(DELAY,))
+    if "DTF" not in context.paths:
+        return
+    path, prefix = ("TTF", "") if context.has_ttf else ("DTF", "sensor, ")
+    sensor = DelayedSensor(path=path, delay_min=0.0, lag_min=0.0)
+    yield Hypothesis(effect=sensor, form=f"{prefix}dead time", free=(DELAY,))
+    yield Hypothesis(effect=sensor, form=f"{prefix}lag", free=(LAG,))
+    if context.has_ttf:
+        yield Hypothesis(effect=sensor, form="dead time and lag", free=(DELAY, LAG))

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, Lag, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered, proposes
 from compensator.model.effects.signals import Signals
 
 
@@ -34,7 +34,6 @@ class MissingMode(Effect):
         return (Lag(self.tau_min, period_min),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return the response of the mode."""
         return self.gain * run[0](signals.source(self.path))
 
     def explain(self, rms_um: float) -> str:
@@ -42,14 +41,6 @@ class MissingMode(Effect):
             f"The {self.path} lacks a mode with a time constant of {digits(self.tau_min)} min ({rms_um:.2g} µm rms): a "
             "thermal mass that the calibration did not excite, or not for long enough."
         )
-
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose a mode of every path."""
-        for path in context.paths:
-            mode = cls(path=path, tau_min=0.0, gain=1.0)
-            name = f"gain_um_per_{context.drive_unit(path)}"
-            yield Hypothesis(effect=mode, form="missing", free=(context.tau(),), amplitudes=(name,))
 
 
 @register
@@ -66,7 +57,6 @@ class MistimedMode(Effect):
         return (Lag(self.tau_min, period_min),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return the difference that the other time constant makes."""
         share = signals.share(self.path)
         # (1 + τ₀ s) / (1 + τ s) − 1 = (τ₀/τ − 1) (1 − L(τ))
         return (self.instead_of_min / self.tau_min - 1.0) * (share - run[0](share))
@@ -77,15 +67,6 @@ class MistimedMode(Effect):
             f"{digits(self.instead_of_min)} min ({rms_um:.2g} µm rms): heat is stored or lost differently than during "
             "calibration."
         )
-
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose each mode of every path that is slow enough to be seen."""
-        for path in context.paths:
-            for tau in context.taus_min.get(path, ()):
-                if tau > 2.0 * context.period_min:
-                    mode = cls(path=path, tau_min=tau, instead_of_min=tau)
-                    yield Hypothesis(effect=mode, form=f"mistimed {tau:.3g}", free=(context.tau(),))
 
 
 @register
@@ -122,12 +103,22 @@ class ChangedPaths(BankEffect, Effect):
             "added, removed or altered."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose any change of both paths."""
-        taus = context.bank_min
-        ones = (1.0,) * len(taus)
-        names = f"change_um_per_{context.drive_unit('DTF')}", "change_ambient_um_per_k"
-        amplitudes = tuple(n for name in names for n in numbered(name, len(taus)))
-        both = cls(tau_min=taus, gain=ones, gain_ambient=ones)
-        yield Hypothesis(effect=both, form="changed", amplitudes=amplitudes)
+
+@proposes
+def modes(context: Context) -> Iterator[Hypothesis]:
+    """Propose a further mode of every path, each of its modes that is slow enough to be seen, any change of both."""
+    for path in context.paths:
+        missing = MissingMode(path=path, tau_min=0.0, gain=1.0)
+        name = f"gain_um_per_{context.drive_unit(path)}"
+        yield Hypothesis(effect=missing, form="missing", free=(context.tau(),), amplitudes=(name,))
+    for path in context.paths:
+        for tau in context.taus_min.get(path, ()):
+            if tau > 2.0 * context.period_min:
+                mistimed = MistimedMode(path=path, tau_min=tau, instead_of_min=tau)
+                yield Hypothesis(effect=mistimed, form=f"mistimed {tau:.3g}", free=(context.tau(),))
+    taus = context.bank_min
+    ones = (1.0,) * len(taus)
+    names = f"change_um_per_{context.drive_unit('DTF')}", "change_ambient_um_per_k"
+    amplitudes = tuple(n for name in names for n in numbered(name, len(taus)))
+    both = ChangedPaths(tau_min=taus, gain=ones, gain_ambient=ones)
+    yield Hypothesis(effect=both, form="changed", amplitudes=amplitudes)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import S
-from compensator.model.effects.hypothesis import Context, Hypothesis, digits
+from compensator.model.effects.hypothesis import Context, Hypothesis, digits, proposes
 from compensator.model.effects.signals import Signals
 
 
@@ -21,7 +21,6 @@ class Gain(Effect):
     change: float = number(-10.0, 10.0)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return the part of the path's share that is missing."""
         return self.change * signals.share(self.path)
 
     def explain(self, rms_um: float) -> str:
@@ -31,8 +30,9 @@ class Gain(Effect):
             "during calibration."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose every path."""
-        for path in context.paths:
-            yield Hypothesis(effect=cls(path=path, change=1.0), amplitudes=("change",))
+
+@proposes
+def gains(context: Context) -> Iterator[Hypothesis]:
+    """Propose every path."""
+    for path in context.paths:
+        yield Hypothesis(effect=Gain(path=path, change=1.0), amplitudes=("change",))

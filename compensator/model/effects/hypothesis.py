@@ -1,15 +1,15 @@
-"""Hypotheses: ways in which the model could lack something, and what proposals may build on.
+"""Hypotheses: ways in which the model could lack something, and the context in which they are proposed.
 
 The searched parameters θ of an effect have bounds and a grid; its linear parameters are solved for:
 
-    residual = fixed(θ) + Σ_j amplitude_j · column_j(θ) + what else there is
+    residual = fixed(θ) + Σ_j amplitude_j · column_j(θ) + other terms + noise
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,7 +58,7 @@ class Hypothesis:
     Parameters
     ----------
     effect : Effect
-        What acts, its linear parameters 1 and its searched ones still open.
+        The effect with linear parameters of 1; its searched ones are set by `with_values`.
     form : str
         Tells variants of the same kind and place apart.
     free : tuple of Free
@@ -126,7 +126,7 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Context:
-    """What proposals may build on.
+    """What is known of model and data when hypotheses are proposed.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class Context:
     functions : mapping of str to (tuple of float, tuple of float)
         Coefficients b and a of each path.
     approximate : bool
-        Whether effects have only approximately any of the forms, as on a machine that the model was identified on:
+        Whether effects match the forms only approximately, as on a machine that the model was identified on:
         filter banks are then proposed in addition to the exact forms.
     """
 
@@ -190,9 +190,21 @@ class Context:
         return Free(name=name, low=low, high=high, grid=grid, key="tau_min")
 
 
+#: Yields the hypotheses of a kind that are worth a search on this data.
+Proposer = Callable[[Context], Iterator[Hypothesis]]
+_PROPOSERS: list[Proposer] = []
+
+
+def proposes(proposer: Proposer) -> Proposer:
+    """Register what proposes hypotheses of a kind (function decorator)."""
+    _PROPOSERS.append(proposer)
+    return proposer
+
+
 def proposals(context: Context, *, background: bool = False) -> list[Hypothesis]:
-    """Return every hypothesis of every kind for this data: those that are named for themselves, or background ones."""
-    return [h for form in forms() if form.background == background for h in form.propose(context)]
+    """Return every hypothesis of every kind for this data: the background ones, or all others."""
+    forms()
+    return [h for propose in _PROPOSERS for h in propose(context) if h.effect.background == background]
 
 
 def numbered(name: str, count: int) -> tuple[str, ...]:

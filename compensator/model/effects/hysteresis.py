@@ -6,13 +6,14 @@ stick   the same, but it jumps all the way once it is off by more than w
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Block, Play, S, Stick
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
 from compensator.model.effects.signals import Signals
 
 FORMS = ("play", "stick")
@@ -31,7 +32,6 @@ class Hysteresis(Effect):
         return ((Play if self.form == "play" else Stick)(self.half_width_um),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return how far it lags behind."""
         share = signals.share(self.path)
         return run[0](share) - share
 
@@ -42,17 +42,16 @@ class Hysteresis(Effect):
             "a joint or guideway with play or friction."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose play and stick-slip of every path, and of both together."""
-        for path in context.paths:
-            size = context.sizes_um[path]
-            for law in FORMS:
-                # With stick-slip the residual is not a smooth function of the width: try many.
-                grid = tuple(float(w) for w in size * np.geomspace(0.002, 0.4, 14 if law == "play" else 90))
-                free = (Free(name="half_width_um", low=size * 5e-4, high=size * 0.5, grid=grid),)
-                own = cls(path=path, form=law, half_width_um=0.0)
-                yield Hypothesis(effect=own, form=law, free=free)
-                if path == "DTF" and len(context.paths) > 1:
-                    both = cls(path="all", form=law, half_width_um=0.0)
-                    yield Hypothesis(effect=both, form=f"{law}, both", free=free, path=path)
+
+@proposes
+def plays(context: Context) -> Iterator[Hypothesis]:
+    """Propose play and stick-slip of every path, and of both together."""
+    for path, form in itertools.product(context.paths, FORMS):
+        size = context.sizes_um[path]
+        # With stick-slip the residual is not a smooth function of the width: try many.
+        grid = tuple(float(w) for w in size * np.geomspace(0.002, 0.4, 14 if form == "play" else 90))
+        free = (Free(name="half_width_um", low=size * 5e-4, high=size * 0.5, grid=grid),)
+        yield Hypothesis(effect=Hysteresis(path=path, form=form, half_width_um=0.0), form=form, free=free)
+        if path == "DTF" and len(context.paths) > 1:
+            both = Hysteresis(path="all", form=form, half_width_um=0.0)
+            yield Hypothesis(effect=both, form=f"{form}, both", free=free, path=path)

@@ -8,6 +8,7 @@ lubricated one (Palmgren, Ball and Roller Bearing Engineering), by the speed its
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
 from compensator.model.effects.blocks import Block, Delay, FilterBank, FromStart, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, digits, numbered
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, digits, numbered, proposes
 from compensator.model.effects.signals import Signals
 
 #: Curves by name: of one sample, or of a record.
@@ -59,23 +60,6 @@ class Input(BankEffect, Effect):
             "The base model lacks this input; the extended model needs the channel."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose every channel: one lag, one lag and a delay, two lags, and the square."""
-        tau, two = (context.tau(),), (context.tau("tau_1_min"), context.tau("tau_2_min"))
-        delay = Free(name="delay_min", low=0.0, high=60.0, grid=(2.0, 5.0, 10.0, 20.0, 40.0), log=False)
-        for channel in context.channels:
-            unit = unit_of(channel)
-            gain = (f"gain_um_per_{unit}",)
-            gains = (f"gain_1_um_per_{unit}", f"gain_2_um_per_{unit}")
-            one = cls(channel=channel, curve="linear", tau_min=(0.0,), gain=(1.0,), delay_min=0.0)
-            both = cls(channel=channel, curve="linear", tau_min=(0.0, 0.0), gain=(1.0, 1.0), delay_min=0.0)
-            square = cls(channel=channel, curve="square", tau_min=(0.0,), gain=(1.0,), delay_min=0.0)
-            yield Hypothesis(effect=one, form="lag", free=tau, amplitudes=gain)
-            yield Hypothesis(effect=one, form="lag and delay", free=(*tau, delay), amplitudes=gain)
-            yield Hypothesis(effect=both, form="two lags", free=two, amplitudes=gains, ordered=True)
-            yield Hypothesis(effect=square, form="square", free=tau, amplitudes=(f"{gain[0]}2",))
-
 
 @register
 class InputBank(Input):
@@ -109,11 +93,24 @@ class InputBank(Input):
             return float(t[0])
         return float(np.exp(np.interp(0.5, part[there - 1 : there + 1], np.log(t[there - 1 : there + 1]))))
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose every channel where forms are approximate."""
-        if context.approximate:
-            yield from banks(context)
+
+@proposes
+def inputs(context: Context) -> Iterator[Hypothesis]:
+    """Propose every channel: one lag, one lag and a delay, two lags, the square; filter banks if approximate."""
+    one, two = (context.tau(),), (context.tau("tau_1_min"), context.tau("tau_2_min"))
+    delay = Free(name="delay_min", low=0.0, high=60.0, grid=(2.0, 5.0, 10.0, 20.0, 40.0), log=False)
+    for channel in context.channels:
+        unit = unit_of(channel)
+        gain, gains = (f"gain_um_per_{unit}",), (f"gain_1_um_per_{unit}", f"gain_2_um_per_{unit}")
+        linear = Input(channel=channel, curve="linear", tau_min=(0.0,), gain=(1.0,), delay_min=0.0)
+        both = dataclasses.replace(linear, tau_min=(0.0, 0.0), gain=(1.0, 1.0))
+        square = dataclasses.replace(linear, curve="square")
+        yield Hypothesis(effect=linear, form="lag", free=one, amplitudes=gain)
+        yield Hypothesis(effect=linear, form="lag and delay", free=(*one, delay), amplitudes=gain)
+        yield Hypothesis(effect=both, form="two lags", free=two, amplitudes=gains, ordered=True)
+        yield Hypothesis(effect=square, form="square", free=one, amplitudes=(f"{gain[0]}2",))
+    if context.approximate:
+        yield from banks(context)
 
 
 def banks(context: Context) -> list[Hypothesis]:

@@ -8,11 +8,12 @@ drive        y += change · G · (drive · |drive|) / 100, the size of what driv
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 from compensator.model.effects.base import Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, Function, S
-from compensator.model.effects.hypothesis import Context, Hypothesis, digits
+from compensator.model.effects.hypothesis import Context, Hypothesis, digits, proposes
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -30,7 +31,6 @@ class Nonlinear(Effect):
     change: float = number()
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return the curve of the share."""
         share = signals.share(self.path)
         part = share / 100.0
         if self.form == "cube":
@@ -43,14 +43,6 @@ class Nonlinear(Effect):
             f"The gain of the {self.path} changes with its own size, by {digits(100.0 * self.change)} % per {per} "
             f"({rms_um:.2g} µm rms): a joint that yields, or surfaces that lose more heat when hot."
         )
-
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose every curve of every path."""
-        for path in context.paths:
-            for form in FORMS:
-                curve = cls(path=path, form=form, change=1.0)
-                yield Hypothesis(effect=curve, form=form, amplitudes=("change_per_100",))
 
 
 @register
@@ -65,14 +57,17 @@ class NonlinearDrive(Nonlinear):
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return the response to the curved drive."""
         drive = signals.source(self.path)
         return self.change * run[0](drive * abs(drive) / 100.0)
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose every path."""
-        for path in context.paths:
-            b, a = context.functions[path]
-            drive = cls(path=path, change=1.0, b=b, a=a)
-            yield Hypothesis(effect=drive, form="drive", amplitudes=("change_per_100",))
+
+@proposes
+def curves(context: Context) -> Iterator[Hypothesis]:
+    """Propose every curve of every path, and of its drive."""
+    for path, form in itertools.product(context.paths, FORMS):
+        effect = Nonlinear(path=path, form=form, change=1.0)
+        yield Hypothesis(effect=effect, form=form, amplitudes=("change_per_100",))
+    for path in context.paths:
+        b, a = context.functions[path]
+        effect = NonlinearDrive(path=path, change=1.0, b=b, a=a)
+        yield Hypothesis(effect=effect, form="drive", amplitudes=("change_per_100",))

@@ -14,16 +14,16 @@ import numpy as np
 from compensator.arrays import Matrix, Vector
 from compensator.model.effects.base import Effect, register
 from compensator.model.effects.blocks import Block
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
 from compensator.model.effects.signals import RecordSignals
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Passing(Effect):
-    """What all of them share: they are not deployed, and must explain much where there is another effect."""
+class TimeOnly(Effect):
+    """Base of effects of time alone: not deployed, and next to another effect they must explain more."""
 
     deployable = False
-    worth_beside = 0.75
+    worth_with_others = 0.75
 
     def course(self, record: RecordSignals) -> Vector:
         """Return the addition to y over a record, µm, shape (n,)."""
@@ -34,7 +34,7 @@ class Passing(Effect):
 
 
 @register
-class Drift(Passing):
+class Drift(TimeOnly):
     """A ramp over the record."""
 
     kind = "drift"
@@ -42,7 +42,6 @@ class Drift(Passing):
     um_per_h: float = 1.0
 
     def course(self, record: RecordSignals) -> Vector:
-        """Return the ramp."""
         return self.um_per_h * (record.minutes / 60.0)
 
     def explain(self, rms_um: float) -> str:
@@ -51,15 +50,10 @@ class Drift(Passing):
             "probe mount is no error of the machine. Check the mount and measure against a fixed reference."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose a ramp."""
-        yield Hypothesis(effect=cls(), form="ramp", amplitudes=("um_per_h",))
-
 
 @register
-class Settling(Passing):
-    """A drift that dies out."""
+class Settling(TimeOnly):
+    """A drift that decays."""
 
     kind = "drift"
     linear = ("size_um",)
@@ -67,7 +61,6 @@ class Settling(Passing):
     tau_min: float = 1.0
 
     def course(self, record: RecordSignals) -> Vector:
-        """Return 1 − exp(−t/τ), scaled."""
         return self.size_um * (1.0 - np.exp(-record.minutes / self.tau_min))
 
     def explain(self, rms_um: float) -> str:
@@ -77,16 +70,9 @@ class Settling(Passing):
             "and measure against a fixed reference."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose any time constant about the length of the record."""
-        taus = tuple(float(t) for t in np.geomspace(context.minutes / 8.0, 2.0 * context.minutes, 6))
-        free = Free(name="tau_min", low=context.minutes / 10.0, high=3.0 * context.minutes, grid=taus)
-        yield Hypothesis(effect=cls(), form="settling", free=(free,), amplitudes=("size_um",))
-
 
 @register
-class Step(Passing):
+class Jump(TimeOnly):
     """A jump at a time."""
 
     kind = "step"
@@ -95,7 +81,6 @@ class Step(Passing):
     at_min: float = 0.0
 
     def course(self, record: RecordSignals) -> Vector:
-        """Return the jump, over one sample."""
         return self.jump_um * np.clip((record.minutes - self.at_min) / record.period_min + 1.0, 0.0, 1.0)
 
     def explain(self, rms_um: float) -> str:
@@ -104,17 +89,9 @@ class Step(Passing):
             "something was knocked or slipped. Check the probe mount and the clamping, then zero again."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose a jump at any time."""
-        minutes, period = context.minutes, context.period_min
-        grid = np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0))
-        at = Free(name="at_min", low=period, high=minutes - period, grid=tuple(grid.tolist()), log=False)
-        yield Hypothesis(effect=cls(), form="jump", free=(at,), amplitudes=("jump_um",))
-
 
 @register
-class Periodic(Passing):
+class Periodic(TimeOnly):
     """A period that no channel shows."""
 
     kind = "periodic"
@@ -134,11 +111,20 @@ class Periodic(Passing):
             f"({rms_um:.2g} µm rms): air conditioning, lubrication, a cabinet cooler. Log a channel of it."
         )
 
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose every period that the record holds about twice."""
-        minutes, period = context.minutes, context.period_min
-        frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes
-        grid = tuple((1.0 / frequencies).tolist())
-        free = Free(name="period_min", low=4.0 * period, high=minutes / 1.9, grid=grid)
-        yield Hypothesis(effect=cls(), form="sine", free=(free,), amplitudes=("sine_um", "cosine_um"))
+
+@proposes
+def courses(context: Context) -> Iterator[Hypothesis]:
+    """Propose a ramp, a drift of any time constant about the record's length, a jump at any time, any period."""
+    minutes, period = context.minutes, context.period_min
+    yield Hypothesis(effect=Drift(), form="ramp", amplitudes=("um_per_h",))
+    taus = tuple(float(t) for t in np.geomspace(minutes / 8.0, 2.0 * minutes, 6))
+    tau = Free(name="tau_min", low=minutes / 10.0, high=3.0 * minutes, grid=taus)
+    yield Hypothesis(effect=Settling(), form="settling", free=(tau,), amplitudes=("size_um",))
+    times = np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0))
+    at = Free(name="at_min", low=period, high=minutes - period, grid=tuple(times.tolist()), log=False)
+    yield Hypothesis(effect=Jump(), form="jump", free=(at,), amplitudes=("jump_um",))
+    # Of a period the record must hold about two.
+    frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes
+    grid = tuple((1.0 / frequencies).tolist())
+    length = Free(name="period_min", low=4.0 * period, high=minutes / 1.9, grid=grid)
+    yield Hypothesis(effect=Periodic(), form="sine", free=(length,), amplitudes=("sine_um", "cosine_um"))

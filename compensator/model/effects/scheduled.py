@@ -20,14 +20,14 @@ from typing import Any, ClassVar
 from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered, proposes
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scheduled(Effect):
-    """What all forms share: the channel as a share of its span."""
+    """Base of all forms: the channel as a share of its span."""
 
     kind = "scheduled"
     linear: ClassVar[tuple[str, ...]] = ("change",)
@@ -64,26 +64,7 @@ class ShareScheduled(Scheduled):
     change: float = number()
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return the share times the channel."""
         return self.change * self.scale(signals, run) * signals.share(self.path)
-
-    @classmethod
-    def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose every form for every channel that moves and every path."""
-        taus, change = context.bank_min, ("change",)
-        ones = (1.0,) * len(taus)
-        gains = (*numbered("gain", len(taus)), *numbered("gain_share", len(taus)))
-        for channel, path in itertools.product(context.channels, context.paths):
-            origin, (b, a) = "zero" if channel in context.zeroed else "start", context.functions[path]
-            place: dict[str, Any] = {"path": path, "channel": channel, "origin": origin, "span": context.spans[channel]}
-            if context.approximate:
-                dc_gain = math.fsum(b) / math.fsum(a)
-                bank = BankScheduled(**place, tau_min=taus, gain=ones, gain_share=ones, dc_gain=dc_gain)
-                yield Hypothesis(effect=bank, form="row", amplitudes=gains)
-            speed = SpeedScheduled(**place, change=1.0, tau_min=0.0)
-            yield Hypothesis(effect=cls(**place, change=1.0), form="share", amplitudes=change)
-            yield Hypothesis(effect=DriveScheduled(**place, change=1.0, b=b, a=a), form="drive", amplitudes=change)
-            yield Hypothesis(effect=speed, form="speed", free=(context.tau(),), amplitudes=change)
 
 
 @register
@@ -99,7 +80,6 @@ class DriveScheduled(Scheduled):
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return the response to the drive times the channel."""
         return self.change * run[1](self.scale(signals, run) * signals.source(self.path))
 
 
@@ -116,7 +96,6 @@ class SpeedScheduled(Scheduled):
         return (Lag(self.tau_min, period_min),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        """Return what the lag takes off the share, times the channel."""
         share = signals.share(self.path)
         return self.change * self.scale(signals, run) * (run[1](share) - share)
 
@@ -152,3 +131,22 @@ class BankScheduled(BankEffect, Scheduled):
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the change of the gain at rest over the channel's span, as a share of it."""
         return {"change": math.fsum(self.gain) / self.dc_gain + math.fsum(self.gain_share)}
+
+
+@proposes
+def schedules(context: Context) -> Iterator[Hypothesis]:
+    """Propose every form for every channel that moves and every path."""
+    taus, change = context.bank_min, ("change",)
+    ones = (1.0,) * len(taus)
+    gains = (*numbered("gain", len(taus)), *numbered("gain_share", len(taus)))
+    for channel, path in itertools.product(context.channels, context.paths):
+        origin, (b, a) = "zero" if channel in context.zeroed else "start", context.functions[path]
+        place: dict[str, Any] = {"path": path, "channel": channel, "origin": origin, "span": context.spans[channel]}
+        if context.approximate:
+            dc_gain = math.fsum(b) / math.fsum(a)
+            bank = BankScheduled(**place, tau_min=taus, gain=ones, gain_share=ones, dc_gain=dc_gain)
+            yield Hypothesis(effect=bank, form="row", amplitudes=gains)
+        yield Hypothesis(effect=ShareScheduled(**place, change=1.0), form="share", amplitudes=change)
+        yield Hypothesis(effect=DriveScheduled(**place, change=1.0, b=b, a=a), form="drive", amplitudes=change)
+        speed = SpeedScheduled(**place, change=1.0, tau_min=0.0)
+        yield Hypothesis(effect=speed, form="speed", free=(context.tau(),), amplitudes=change)

@@ -1,6 +1,6 @@
 """Undeclared effects: what a machine may have that its calibration never saw."""
 
-from sim_hardware.physics.effects.base import Action, Effect
+from sim_hardware.physics.effects.base import Action, UndeclaredEffect
 from sim_hardware.physics.effects.draw import SealedEffect, draw_effect
 from sim_hardware.physics.effects.mechanical import (
     Cycle,
@@ -25,7 +25,6 @@ __all__ = [
     "BearingFriction",
     "CoolantJacket",
     "Cycle",
-    "Effect",
     "FanOnFilm",
     "HiddenSource",
     "LateSensor",
@@ -35,6 +34,7 @@ __all__ = [
     "SecondMass",
     "SizeDependent",
     "StickSlip",
+    "UndeclaredEffect",
     "WetGuide",
     "WrongStrength",
     "draw_effect",

@@ -39,7 +39,7 @@ class Action:
         return t_q_degc
 
 
-class Effect(Action):
+class UndeclaredEffect(Action):
     """An undeclared effect: a frozen dataclass of its parameters, units in their names.
 
     ``kind``, ``path`` and ``channel`` say in the words of the project's diagnosis what a model calibrated
@@ -59,7 +59,7 @@ class Effect(Action):
         """Return the acting effect in its initial state; itself where it has no state."""
         return self
 
-    def reveal(self) -> Effect:
+    def reveal(self) -> UndeclaredEffect:
         """Return the effect itself."""
         return self
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sim_hardware.physics.design import QuillDesign
-from sim_hardware.physics.effects.base import Action, Effect
+from sim_hardware.physics.effects.base import Action, UndeclaredEffect
 from sim_hardware.physics.effects.mechanical import (
     Cycle,
     LateSensor,
@@ -29,16 +29,16 @@ from sim_hardware.physics.effects.thermal import (
 HOUR_S = 3600.0
 
 
-class SealedEffect(Effect):
+class SealedEffect(UndeclaredEffect):
     """An effect whose kind is secret until :meth:`reveal`.
 
     Parameters
     ----------
-    effect : Effect
+    effect : UndeclaredEffect
         What is inside.
     """
 
-    def __init__(self, effect: Effect) -> None:
+    def __init__(self, effect: UndeclaredEffect) -> None:
         self.__effect = effect
 
     def __repr__(self) -> str:
@@ -52,7 +52,7 @@ class SealedEffect(Effect):
         """Return the acting effect."""
         return self.__effect.begin()
 
-    def reveal(self) -> Effect:
+    def reveal(self) -> UndeclaredEffect:
         """Return the effect."""
         return self.__effect
 
@@ -76,51 +76,51 @@ class _Draw:
         self.hours = hours
         self.sign = float(random.choice([-1.0, 1.0]))
 
-    def jacket(self) -> Effect:
+    def jacket(self) -> UndeclaredEffect:
         place = str(self.random.choice(["jacket", "quill", "front"]))
         um_per_w_per_k = {"jacket": 0.46, "quill": 2.1, "front": 0.6}[place]
         return CoolantJacket(w_per_k=self.size_um / um_per_w_per_k, place=place)
 
-    def bearing(self) -> Effect:
+    def bearing(self) -> UndeclaredEffect:
         exponent = float(self.random.choice([1.0, 2.0]))
         return BearingFriction(full_speed_w=self.size_um / 0.83, exponent=exponent)
 
-    def fan(self) -> Effect:
+    def fan(self) -> UndeclaredEffect:
         return FanOnFilm(full_speed_factor=1.0 + self.size_um / 7.0)
 
-    def guide(self) -> Effect:
+    def guide(self) -> UndeclaredEffect:
         return WetGuide(w_per_k=self.size_um / 1.3)
 
-    def second(self) -> Effect:
+    def second(self) -> UndeclaredEffect:
         j_per_k, w_per_k = self.random.uniform(20e3, 60e3), self.random.uniform(2.0, 6.0)
         return SecondMass(j_per_k=j_per_k, w_per_k=w_per_k, lever_m=self.sign * self.size_um / 9.5)
 
-    def strength(self) -> Effect:
+    def strength(self) -> UndeclaredEffect:
         return WrongStrength(factor=1.0 + self.sign * self.size_um / 43.0)
 
-    def nonlinear(self) -> Effect:
+    def nonlinear(self) -> UndeclaredEffect:
         return SizeDependent(per_100_um=self.sign * self.size_um / 68.0)
 
-    def play(self) -> Effect:
+    def play(self) -> UndeclaredEffect:
         return StickSlip(play_um=self.size_um / 0.47)
 
-    def late(self) -> Effect:
+    def late_sensor(self) -> UndeclaredEffect:
         late_s = min(max(60.0 * self.size_um, 20.0), 900.0)
         share = self.random.uniform(0.3, 1.0)
         return LateSensor(delay_s=late_s * share, lag_s=late_s * (1.0 - share))
 
-    def drift(self) -> Effect:
+    def drift(self) -> UndeclaredEffect:
         return ProbeDrift(um_per_h=self.sign * self.size_um * 12.0**0.5 / self.hours)
 
-    def slip(self) -> Effect:
+    def slip(self) -> UndeclaredEffect:
         at_s = HOUR_S * self.hours * self.random.uniform(0.25, 0.75)
         return MountSlip(at_s=at_s, jump_um=self.sign * 2.0 * self.size_um)
 
-    def cycle(self) -> Effect:
+    def cycle(self) -> UndeclaredEffect:
         period_s, phase = self.random.uniform(900.0, 7200.0), self.random.uniform(0.0, 6.28)
         return Cycle(amplitude_um=self.size_um * 2.0**0.5, period_s=period_s, phase_rad=phase)
 
-    def hidden(self) -> Effect:
+    def unobserved(self) -> UndeclaredEffect:
         place = str(self.random.choice(["nose", "housing", "front"]))
         um_per_w = {"nose": 1.3, "housing": 0.2, "front": 0.42}[place]
         switch_s, t_s = [], 0.0
@@ -130,7 +130,7 @@ class _Draw:
         return HiddenSource(heat_w=self.size_um / um_per_w, switch_s=tuple(switch_s), place=place)
 
 
-_DRAWS: tuple[Callable[[_Draw], Effect], ...] = (
+_DRAWS: tuple[Callable[[_Draw], UndeclaredEffect], ...] = (
     _Draw.jacket,
     _Draw.bearing,
     _Draw.fan,
@@ -139,11 +139,11 @@ _DRAWS: tuple[Callable[[_Draw], Effect], ...] = (
     _Draw.strength,
     _Draw.nonlinear,
     _Draw.play,
-    _Draw.late,
+    _Draw.late_sensor,
     _Draw.drift,
     _Draw.slip,
     _Draw.cycle,
-    _Draw.hidden,
+    _Draw.unobserved,
 )
 
 

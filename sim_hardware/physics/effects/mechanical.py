@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from sim_hardware.physics.design import QuillDesign
-from sim_hardware.physics.effects.base import Action, Effect
+from sim_hardware.physics.effects.base import Action, UndeclaredEffect
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WrongStrength(Effect):
-    """The quill expands more or less than it did at the calibration.
+class WrongStrength(UndeclaredEffect):
+    """The quill expands more or less than during the calibration.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class WrongStrength(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SizeDependent(Effect):
+class SizeDependent(UndeclaredEffect):
     r"""A stop yields as the quill pushes: the strength depends on the size, :math:`g (1 + b g)`.
 
     Parameters
@@ -51,7 +51,7 @@ class SizeDependent(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StickSlip(Effect):
+class StickSlip(UndeclaredEffect):
     """A joint with play: the nose follows the growth only once the play is taken up.
 
     Parameters
@@ -82,7 +82,7 @@ class _Play(Action):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LateSensor(Effect):
+class LateSensor(UndeclaredEffect):
     """Heat reaches the thermocouple T_Q late, through a bracket or a pad.
 
     Parameters
@@ -90,7 +90,7 @@ class LateSensor(Effect):
     delay_s : float
         Dead time, s.
     lag_s : float
-        Time constant of the couple in its pad, s.
+        Time constant of the thermocouple in its pad, s.
     """
 
     kind: ClassVar[str] = "delay"
@@ -132,7 +132,7 @@ class _LatePad(Action):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProbeDrift(Effect):
+class ProbeDrift(UndeclaredEffect):
     """The probe's mount creeps: a ramp on the measured displacement, no error of the machine.
 
     Parameters
@@ -150,7 +150,7 @@ class ProbeDrift(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MountSlip(Effect):
+class MountSlip(UndeclaredEffect):
     """Something was knocked: the displacement jumps at a time and stays.
 
     Parameters
@@ -171,7 +171,7 @@ class MountSlip(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cycle(Effect):
+class Cycle(UndeclaredEffect):
     """A period that no channel shows: an air conditioner, central lubrication.
 
     Parameters

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from sim_hardware.physics.design import QuillDesign
-from sim_hardware.physics.effects.base import Array, Effect, Places
+from sim_hardware.physics.effects.base import Array, Places, UndeclaredEffect
 from sim_hardware.physics.plant import MAX_FAN_RPM, MAX_SPINDLE_RPM, Inputs
 
 
@@ -18,7 +18,7 @@ def _spread(heat_w: Array, nodes: tuple[int, ...] | list[int], watts: float) -> 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CoolantJacket(Effect):
+class CoolantJacket(UndeclaredEffect):
     """Coolant flows through a jacket and pulls a place towards its own temperature.
 
     Parameters
@@ -43,7 +43,7 @@ class CoolantJacket(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BearingFriction(Effect):
+class BearingFriction(UndeclaredEffect):
     """The spindle's bearing heats the nose, far from T_Q.
 
     Parameters
@@ -67,7 +67,7 @@ class BearingFriction(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FanOnFilm(Effect):
+class FanOnFilm(UndeclaredEffect):
     """A fan moves the air: the forced coefficient of every surface grows with its speed.
 
     Parameters
@@ -90,7 +90,7 @@ class FanOnFilm(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WetGuide(Effect):
+class WetGuide(UndeclaredEffect):
     """Flowing coolant wets the gap between quill and headstock and bridges it: the heat leaves by another path.
 
     Parameters
@@ -120,7 +120,7 @@ class WetGuide(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SecondMass(Effect):
+class SecondMass(UndeclaredEffect):
     """A further mass on the housing warms slowly and moves the tool: a mode that the model lacks.
 
     Parameters
@@ -148,7 +148,7 @@ class SecondMass(Effect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HiddenSource(Effect):
+class HiddenSource(UndeclaredEffect):
     """Something heats a place by a schedule of its own, and no channel shows it.
 
     Parameters

@@ -63,12 +63,12 @@ def test_sensor_noise_bias_steps():
 
 
 def test_sensor_wild_readings_and_dropouts_are_rare():
-    sensor = Sensor(SensorSpec(wild_share=0.01, wild_size=50.0, dropout_share=0.02), seed=2)
+    sensor = Sensor(SensorSpec(outlier_share=0.01, outlier_size=50.0, dropout_share=0.02), seed=2)
     readings = np.array([sensor.read(20.0) for _ in range(20_000)])
     assert np.isnan(readings).mean() == pytest.approx(0.02, abs=0.004)
     assert (np.abs(readings - 20.0) > 0.1).mean() == pytest.approx(0.01, abs=0.003)
     assert np.nanmax(np.abs(readings - 20.0)) > 40.0
-    many = Sensor(SensorSpec(wild_share=0.01, wild_size=50.0, dropout_share=0.02), seed=2)
+    many = Sensor(SensorSpec(outlier_share=0.01, outlier_size=50.0, dropout_share=0.02), seed=2)
     rows = many.read_many(np.full(20_000, 20.0), 1.0)
     assert np.isnan(rows).mean() == pytest.approx(0.02, abs=0.004)
 
