@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
 
 from compensator.diagnose.fit import Term
-from compensator.diagnose.outcome import Diagnosis, FoundEffect
+from compensator.diagnose.outcome import Ceiling, Diagnosis, FoundEffect, Remainder
 from compensator.identify.summary import with_std
 from compensator.model.simulation import Scores
 from compensator.remarks import ModelWarning
@@ -48,9 +49,18 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
         "after": _scores(diagnosis.after),
         "held_out": diagnosis.held_out,
         "noise_floor_um": diagnosis.noise_floor_um,
+        "remainder": _table(diagnosis.remainder),
+        "ceiling": _table(diagnosis.ceiling),
         "warnings": list(map(str, diagnosis.warnings)),
         "warning_codes": [warning.code for warning in diagnosis.warnings],
     }
+
+
+def _table(found: Remainder | Ceiling | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    table = dataclasses.asdict(found)
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
 
 
 def _place(term: Term) -> dict[str, Any]:
@@ -92,6 +102,23 @@ def name(effect: FoundEffect) -> str:
     return ": ".join(part for part in (kind.capitalize(), " ".join(word for word in where if word)) if part)
 
 
+def beyond_effects(diagnosis: Diagnosis) -> list[str]:
+    """Return what the channels explain beyond the named effects, one sentence or two for each figure."""
+    found = []
+    if (remainder := diagnosis.remainder) is not None:
+        deployed = "deployed in model.toml" if remainder.deployed else "not deployed"
+        found.append(
+            f"Remainder: a regularised linear response of {', '.join(remainder.channels)}, {deployed}. It corrects and "
+            f"explains nothing: {remainder.rms_before_um:.2f} to {remainder.rms_after_um:.2f} µm rms on held-out data."
+        )
+    if (ceiling := diagnosis.ceiling) is not None:
+        found.append(
+            f"The named effects explain {ceiling.explained_pct:.0f} % of what the channels can explain; the best "
+            f"linear use of all channels leaves {ceiling.rms_um:.2f} µm rms on held-out data."
+        )
+    return found
+
+
 def text(diagnosis: Diagnosis) -> str:
     """Return the summary for the terminal."""
     lines = [verdict(diagnosis)]
@@ -104,6 +131,8 @@ def text(diagnosis: Diagnosis) -> str:
             f"   nearly as good: {rival.label} ({rival.rms_after_um:.2f} µm rms). {rival.how_to_tell_apart}"
             for rival in effect.rivals
         ]
+    if beyond := beyond_effects(diagnosis):
+        lines += ["", *beyond]
     if diagnosis.warnings:
         lines += ["", "warnings:", *(f"- {word} [{word.code}]" for word in diagnosis.warnings)]
     return "\n".join(lines)
