@@ -22,6 +22,7 @@ from compensator.errors import ModelError, ServiceError
 from compensator.messages import Offset, number
 from compensator.model.effects import effect_from
 from compensator.model.effects.base import filters, forms
+from compensator.model.effects.blocks import ChangeSeen
 from compensator.model.effects.hypothesis import Context
 from compensator.model.effects.regression import MOST_CHANNELS, MOST_LAGS, MOST_ROWS, Regression
 from compensator.model.effects.signals import RecordSignals
@@ -203,6 +204,13 @@ def test_a_channel_that_drops_out_keeps_its_last_value_and_nothing_jumps() -> No
     assert abs(whole[149].y_effects_um[0]) > 1.0
     assert [e.y_um for e in holed_y] == [e.y_um for e in whole]
     assert [e.y_std_um for e in holed_y] == [e.y_std_um for e in whole]
+
+
+def test_a_change_over_gaps_streams_as_it_filters_and_is_never_0_for_missing() -> None:
+    u = np.array([math.nan, 5.0, 7.0, math.nan, math.nan, 6.0, math.nan])
+    block = ChangeSeen()
+    assert [block.step(value) for value in u.tolist()] == ChangeSeen().filter(u).tolist() == [0, 0, 2, 2, 2, 1, 1]
+    assert not ChangeSeen().filter(np.full(3, math.nan)).any()
 
 
 # ---------------------------------------------------------------------------- model file and errors
