@@ -124,6 +124,42 @@ class Rival:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Remainder:
+    """What the channels explain and no named effect does: a regularised linear response of several of them.
+
+    Parameters
+    ----------
+    deployed : bool
+        Whether the extended model has it, as an effect of kind `regression`.
+    channels : tuple of str
+        Channels that respond.
+    rms_before_um, rms_after_um : float
+        Residual without it and with it on data that took no part, µm.
+    """
+
+    deployed: bool
+    channels: tuple[str, ...]
+    rms_before_um: float
+    rms_after_um: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ceiling:
+    """What the best linear use of all logged channels leaves on data that took no part.
+
+    Parameters
+    ----------
+    rms_um : float
+        Its residual, µm.
+    explained_pct : float
+        How much of what it removes the named effects remove, %.
+    """
+
+    rms_um: float
+    explained_pct: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnosis:
     """What a model lacks.
 
@@ -147,6 +183,10 @@ class Diagnosis:
         Explanations of the largest effect and the rms that each leaves, µm, best first.
     warnings : tuple of Remark
         What to know before relying on it.
+    remainder : Remainder, optional
+        What the channels explain and no named effect does; None where there is none.
+    ceiling : Ceiling, optional
+        What all channels could explain; None where it was not computed.
     """
 
     verdict: Verdict
@@ -160,6 +200,8 @@ class Diagnosis:
     held_out_after: Vector
     tried: tuple[tuple[str, float], ...]
     warnings: tuple[Remark, ...]
+    remainder: Remainder | None = None
+    ceiling: Ceiling | None = None
 
     @property
     def before(self) -> Scores:

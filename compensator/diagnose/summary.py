@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from compensator.diagnose.fit import Term
-from compensator.diagnose.outcome import Diagnosis, FoundEffect
+from compensator.diagnose.outcome import Ceiling, Diagnosis, FoundEffect, Remainder
 from compensator.display import Table, Words, warnings_of, with_std
 from compensator.model.simulation import SCORE_HEAD, Scores
 from compensator.reasons import Remark
@@ -65,9 +66,18 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
         "after": _scores(diagnosis.after),
         "held_out": diagnosis.held_out,
         "noise_floor_um": diagnosis.noise_floor_um,
+        "remainder": _table(diagnosis.remainder),
+        "ceiling": _table(diagnosis.ceiling),
         "warnings": list(map(str, diagnosis.warnings)),
         "warning_codes": [warning.code for warning in diagnosis.warnings],
     }
+
+
+def _table(found: Remainder | Ceiling | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    table = dataclasses.asdict(found)
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
 
 
 def _place(term: Term) -> dict[str, Any]:
@@ -123,6 +133,8 @@ def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | 
         yield explanation(effect)
         if effect.rivals:
             yield rivals(effect)
+    if beyond := beyond_effects(diagnosis):
+        yield Words(title="Beyond the named effects", lines=beyond)
     yield from warnings_of(diagnosis.warnings)
     yield from warnings_of(remarks, "Remarks on the data")
 
@@ -177,3 +189,20 @@ def in_words(key: str) -> str:
         at -= 1
     unit = "".join("/" if word == "per" else _UNITS[word.rstrip("2")] + "²" * word.endswith("2") for word in words[at:])
     return f"{' '.join(words[:at]) or 'rate'}{', ' if unit else ''}{unit}"
+
+
+def beyond_effects(diagnosis: Diagnosis) -> list[str]:
+    """Return what the channels explain beyond the named effects, one sentence or two for each figure."""
+    found = []
+    if (remainder := diagnosis.remainder) is not None:
+        deployed = "deployed in model.toml" if remainder.deployed else "not deployed"
+        found.append(
+            f"Remainder: a regularised linear response of {', '.join(remainder.channels)}, {deployed}. It corrects and "
+            f"explains nothing: {remainder.rms_before_um:.2f} to {remainder.rms_after_um:.2f} µm rms on held-out data."
+        )
+    if (ceiling := diagnosis.ceiling) is not None:
+        found.append(
+            f"The named effects explain {ceiling.explained_pct:.0f} % of what the channels can explain; the best "
+            f"linear use of all channels leaves {ceiling.rms_um:.2f} µm rms on held-out data."
+        )
+    return found

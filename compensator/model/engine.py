@@ -56,7 +56,8 @@ class Estimate:
     y_um : float
         Predicted deformation, µm.
     y_std_um : float
-        Its standard deviation: sensor noise, missing samples and the model's own error, µm.
+        Its standard deviation: sensor noise, missing samples, the model's own error and the variance that effects
+        state of their own, µm.
     y_rate_um_per_min : float
         Growth over the next sample, with heat and ambient as they are, µm/min.
     """
@@ -175,7 +176,7 @@ class Engine:
         self.model = model
         self.bridge_samples = bridge_samples
         self._observer = Observer(model)
-        self._effects = self._at_rest()
+        self._start_effects()
         self.channels = tuple(dict.fromkeys(c for effect in self._effects for c in effect.channels))
         self._period_min = model.period_s / 60.0
         absolute = model.inputs == "absolute"
@@ -209,12 +210,13 @@ class Engine:
         if self.model.inputs == "changes":
             self._reference = Reference(t_q_degc, at_degc)
         self._observer.reset()
-        self._effects = self._at_rest()
+        self._start_effects()
         self._held = {}
         self._last_complete = self._gap = None
 
-    def _at_rest(self) -> list[EffectStream]:
-        return [EffectStream(effect, self.model.period_s / 60.0) for effect in self.model.effects]
+    def _start_effects(self) -> None:
+        self._effects = [EffectStream(effect, self.model.period_s / 60.0) for effect in self.model.effects]
+        self._uncertain = [stream for stream in self._effects if stream.effect.has_variance]
 
     def snapshot(self) -> EngineState:
         """Return the state after the last sample."""
@@ -388,6 +390,9 @@ class Engine:
         rate = (dtf_ahead + tdtf_ahead - dtf - tdtf) / self._period_min
         if self._effects:
             rate += self._effects_rate(dtf_ahead, tdtf_ahead, shares)
+        variance = observer.y_variance_um2 + self.model.y_std_um**2
+        for effect in self._uncertain:
+            variance += effect.variance_um2()
         heat = self.model.kind == "heat"
         return Estimate(
             heat_w=observer.drive if heat else NAN,
@@ -396,7 +401,7 @@ class Engine:
             y_tdtf_um=tdtf,
             y_effects_um=shares,
             y_um=y,
-            y_std_um=math.sqrt(observer.y_variance_um2 + self.model.y_std_um**2),
+            y_std_um=math.sqrt(variance),
             y_rate_um_per_min=rate,
         )
 

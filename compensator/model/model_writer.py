@@ -190,7 +190,7 @@ def _estimator(kind: str, estimator: Estimator) -> Iterator[str]:
 
 
 def _effect(where: str, effect: Effect) -> Iterator[str]:
-    yield from ("", "# Added to the base.", "[[effect]]", *_pairs(where, {"kind": effect.kind, **effect.to_table()}))
+    yield from ("", _comment(effect.comment), "[[effect]]", *_pairs(where, {"kind": effect.kind, **effect.to_table()}))
 
 
 def _comment(text: str) -> str:

@@ -56,6 +56,22 @@ class TomlTable:
             raise ModelError(f"{self.where}: {key} = {shown(values)}, expected {expected}")
         return tuple(float(v) for v in values)
 
+    def rows(self, key: str, *, needed: bool = True) -> tuple[tuple[float, ...], ...]:
+        """Return a list of lists of finite numbers; empty where it is left out and not needed."""
+        values: Any = self.table.get(key)
+        if values is None and not needed:
+            return ()
+        if not isinstance(values, list) or not values or not all(isinstance(row, list) for row in values):
+            raise ModelError(f"{self.where}: {key} = {shown(values)}, expected a list of lists of numbers")
+        return tuple(TomlTable(self.where, {key: row}).numbers(key) for row in values)
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """Return a list of strings."""
+        values: Any = self.table.get(key)
+        if not isinstance(values, list) or not values or not all(isinstance(value, str) for value in values):
+            raise ModelError(f"{self.where}: {key} = {shown(values)}, expected a list of strings")
+        return tuple(values)
+
     def text(self, key: str, choices: Sequence[str] = (), default: str | None = None) -> str:
         """Return a string, one of the choices where there are any."""
         value = self.table.get(key, default)

@@ -220,7 +220,8 @@ def check_runnable(model: ThermalModel) -> None:
     Raises
     ------
     ModelError
-        For an unstable path, or a TTF whose inverse is improper, unstable or rings.
+        For an unstable path, a TTF whose inverse is improper, unstable or rings, or an effect made for a model of
+        another kind.
     """
     if not (math.isfinite(model.period_s) and model.period_s > 0):
         raise ModelError(f"model {model.name}: sample_period_s = {model.period_s!r}, expected a number above 0")
@@ -235,6 +236,11 @@ def check_runnable(model: ThermalModel) -> None:
             _check_path(model, name, path)
     if model.ttf is not None:
         check_inverse(model.name, model.ttf.sampled)
+    for effect in model.effects:
+        try:
+            effect.check_base(model.kind)
+        except ModelError as error:
+            raise ModelError(f"model {model.name}: {error}") from error
 
 
 def _check_path(model: ThermalModel, name: str, path: Path) -> None:

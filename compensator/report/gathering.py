@@ -16,6 +16,7 @@ import numpy as np
 
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Event, Offset, Sample, number
+from compensator.model.effects.base import label_of
 from compensator.reasons import State
 from compensator.recording.container import Container, Contents, Damaged, Torn
 from compensator.recording.reading import decode, in_order, records_of
@@ -124,10 +125,7 @@ class _Reader:
         except (tomllib.TOMLDecodeError, UnicodeDecodeError):
             table = {}
         self._model = str(table.get("name", ""))
-        self._effects = [
-            " ".join(str(effect[key]) for key in ("kind", "path", "channel") if effect.get(key))
-            for effect in table.get("effect", [])
-        ]
+        self._effects = [label_of(effect) for effect in table.get("effect", [])]
 
     def _sample(self, sample: Sample) -> None:
         t = sample.time_utc_ns * _NS

@@ -8,7 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compensator.model.effects.base import EffectStream, effect_from, filters, forms
-from compensator.model.effects.blocks import Delay, FilterBank, FromStart, Function, Lag, Play, Stick
+from compensator.model.effects.blocks import (
+    ChangeSeen,
+    Delay,
+    FilterBank,
+    FromStart,
+    Function,
+    Lag,
+    Play,
+    Stick,
+    lag_or_none,
+)
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -16,6 +26,8 @@ FUNCTION = SampledTransferFunction(b=(0.2, 0.1), a=(1.0, -0.7), period_s=60.0)
 RECORDS = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=40).map(np.array)
 BLOCKS = {
     "start": lambda x: FromStart(),
+    "seen": lambda x: ChangeSeen(),
+    "undelayed": lambda x: FilterBank((0.0, x), ((1.0, -2.0),), 1.0, lag=lag_or_none),
     "zero": lambda x: FromStart(x),
     "lag": lambda x: Lag(x, 1.0),
     "bank": lambda x: FilterBank((x, 3.0), ((1.0, -2.0),), 1.0),
@@ -23,6 +35,14 @@ BLOCKS = {
     "function": lambda x: Function(FUNCTION),
     "play": Play,
     "stick": Stick,
+}
+#: Parameters of the remainder, whose lengths go together; one of its channels twice, one never seen.
+REGRESSION = {
+    "channels": lambda data, number: ["c", "heat_w", "at_degc", "c", "unseen"],
+    "exponents": lambda data, number: [1.0, 2.0, 1.0, 2.0, 1.0],
+    "taus_min": lambda data, number: [0.0, data.draw(number)],
+    "gains": lambda data, number: [[data.draw(number), data.draw(number)] for _ in range(5)],
+    "std_factor": lambda data, number: [[data.draw(number) for _ in range(10)]],
 }
 
 
@@ -44,6 +64,8 @@ def drawn(data, field):
     if field.metadata.get("choices"):
         return data.draw(st.sampled_from(field.metadata["choices"]))
     number = st.floats(0.5, 40.0)
+    if field.name in REGRESSION:
+        return REGRESSION[field.name](data, number)
     if field.name == "channel":
         return "c"
     if field.name == "b":

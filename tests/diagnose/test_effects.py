@@ -59,7 +59,8 @@ def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
         scale = max(1.0, float(np.max(np.abs(whole))))
         assert streamed == pytest.approx(whole, abs=2e-6 * scale), (hypothesis.place, hypothesis.form)
         seen.add(table.kind)
-    assert seen == set(kinds())
+    # The remainder has no form to search for.
+    assert seen == set(kinds()) - {"regression"}
 
 
 def test_a_restart_in_between_changes_no_bit(day, evidence):

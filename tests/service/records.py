@@ -58,6 +58,16 @@ EFFECTS: tuple[tuple[str, dict[str, Any]], ...] = (
             "tau_min": 12.0,
         },
     ),
+    (
+        "regression",
+        {
+            "channels": ["coolant_degc", "spindle_rpm", "heat_w", "spindle_rpm"],
+            "exponents": [1.0, 1.0, 1.0, 2.0],
+            "taus_min": [0.0, 6.0, 70.0],
+            "gains": [[0.3, 0.1, -0.2], [1e-4, 2e-4, 3e-4], [0.01, -0.01, 0.02], [1e-8, 2e-8, -1e-8]],
+            "std_factor": [[0.1, 0.2, -0.1, *[1e-5] * 3, *[1e-3] * 3, *[1e-9] * 3], [0.0, 0.3, *[0.0] * 10]],
+        },
+    ),
     ("hysteresis", {"form": "stick", "path": "all", "half_width_um": 1.5}),
 )
 

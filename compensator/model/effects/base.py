@@ -43,6 +43,21 @@ def text(*choices: str) -> Any:
     return dataclasses.field(metadata=_text(choices))
 
 
+def texts() -> Any:
+    """Return a parameter that the model file holds: a list of strings."""
+    return dataclasses.field(metadata={"read": lambda table, key: table.texts(key)})
+
+
+def rows() -> Any:
+    """Return a parameter that the model file holds: a list of lists of numbers."""
+    return dataclasses.field(metadata={"read": lambda table, key: table.rows(key)})
+
+
+def optional_rows(*, default: tuple[tuple[float, ...], ...] = ()) -> Any:
+    """Return a parameter that the model file holds or leaves out: a list of lists of numbers."""
+    return dataclasses.field(default=default, metadata={"read": lambda table, key: table.rows(key, needed=False)})
+
+
 def only(*, default: str) -> Any:
     """Return a parameter that the model file holds and that has one value in this form of the kind."""
     return dataclasses.field(default=default, metadata=_text((default,)))
@@ -69,6 +84,8 @@ class Effect:
 
     #: Kind in the model file and in `diagnosis.json`.
     kind: ClassVar[str] = ""
+    #: Comment above its table in the model file.
+    comment: ClassVar[str] = "Added to the base."
     #: Fields that y is linear in, solved for instead of searched.
     linear: ClassVar[tuple[str, ...]] = ()
     #: Whether it can be computed in real time from what is measured.
@@ -83,6 +100,8 @@ class Effect:
     worth: ClassVar[float] = 0.05
     #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
     worth_with_others: ClassVar[float] = 0.05
+    #: Whether it acts before all of its channels were seen, each from when it is.
+    acts_in_part: ClassVar[bool] = False
     #: Ridge weight on its linear parameters, against columns of norm 1; 0 leaves them free.
     ridge: ClassVar[float] = 0.0
 
@@ -94,8 +113,7 @@ class Effect:
     @property
     def label(self) -> str:
         """Name for people: its kind with the path and channel that it acts on."""
-        table = self.to_table()
-        return " ".join(part for part in (self.kind, table.get("path"), table.get("channel")) if part)
+        return label_of({"kind": self.kind, **self.to_table()})
 
     # ------------------------------------------------------------------ law
 
@@ -123,8 +141,31 @@ class Effect:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Channels that it needs."""
+        """Channels that it acts by."""
         return (self.channel,) if self.channel else ()
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Channels that must be measured for it."""
+        return self.channels
+
+    @property
+    def has_variance(self) -> bool:
+        """Whether it states a variance of its own."""
+        return False
+
+    def variance_um2(self, blocks: Sequence[Block]) -> float:
+        """Return the variance of its addition to y after a step of its blocks, µm²; asked only if `has_variance`."""
+        return 0.0
+
+    def check_base(self, kind: str) -> None:
+        """Refuse a base model of a kind that the effect was not made for.
+
+        Raises
+        ------
+        ModelError
+            Naming key and value.
+        """
 
     @property
     def time_constants_min(self) -> tuple[float, ...]:
@@ -149,8 +190,25 @@ class Effect:
     def to_table(self) -> dict[str, Any]:
         """Return its `[[effect]]` table, without the kind."""
         table = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if "read" in f.metadata}
-        found = {key: list(value) if isinstance(value, tuple) else value for key, value in table.items()}
+        found = {key: _as_list(value) for key, value in table.items()}
         return found | {key: value for key in _FOUND if (value := getattr(self, key))}
+
+
+def label_of(table: Mapping[str, Any]) -> str:
+    """Return the name for people of the effect in a table of a model file.
+
+    Examples
+    --------
+    >>> label_of({"kind": "regression", "channels": ["t1_degc", "t2_degc", "t2_degc"]})
+    'regression of 2 channels'
+    """
+    several = {str(name) for name in table.get("channels", ())}
+    parts = [str(table[key]) for key in ("kind", "path", "channel") if table.get(key)]
+    return " ".join([*parts, *([f"of {len(several)} channels"] if several else [])])
+
+
+def _as_list(value: Any) -> Any:
+    return [_as_list(item) for item in value] if isinstance(value, tuple) else value
 
 
 class BankEffect:
@@ -190,13 +248,14 @@ class EffectStream:
     """
 
     def __init__(self, effect: Effect, period_min: float) -> None:
-        self.effect, self.kind, self.channels = effect, effect.kind, effect.channels
+        self.effect, self.kind, self.channels = effect, effect.kind, effect.measured
+        self._awaited = () if effect.acts_in_part else self.channels
         self._blocks: tuple[Block, ...] = effect.blocks(period_min)
         self._steps = [block.step for block in self._blocks]
 
     def step(self, signals: Signals[float]) -> float:
         """Advance by one sample and return the addition to y, µm; 0 until each of its channels has had a value."""
-        for channel in self.channels:
+        for channel in self._awaited:
             if math.isnan(signals.channels.get(channel, NAN)):
                 return 0.0
         return float(self.effect.law(signals, self._steps))
@@ -208,6 +267,10 @@ class EffectStream:
         for block, state in zip(self._blocks, states, strict=True):
             block.state = state
         return y
+
+    def variance_um2(self) -> float:
+        """Return the variance that the effect states for its last addition, µm²."""
+        return self.effect.variance_um2(self._blocks)
 
     def snapshot(self) -> tuple[float, ...]:
         """Return everything that it must remember to continue with the same bits."""
@@ -229,7 +292,11 @@ _FORMS: list[type[Effect]] = []
 _loaded = False
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(number, numbers, text, only))
+@dataclass_transform(
+    frozen_default=True,
+    kw_only_default=True,
+    field_specifiers=(number, numbers, rows, optional_rows, text, texts, only),
+)
 def register(form: type[_E]) -> type[_E]:
     """Make a form of a kind of effect a frozen dataclass, and register it (class decorator)."""
     made = dataclass(frozen=True, slots=True, kw_only=True)(form)

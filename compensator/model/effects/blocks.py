@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -54,6 +54,33 @@ class FromStart(Block):
         return np.asarray(u - (u[0] if math.isnan(self._zero) else self._zero))
 
 
+class ChangeSeen(Block):
+    """The change from the first value that was seen: 0 before that, the last change while a value is missing.
+
+    Examples
+    --------
+    >>> ChangeSeen().filter(np.array([NAN, 5.0, 7.0, NAN, 6.0]))
+    array([0., 0., 2., 2., 1.])
+    """
+
+    state = (NAN, 0.0)
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        start, change = self.state
+        if not math.isnan(u):
+            start = u if math.isnan(start) else start
+            change = u - start
+        self.state = (start, change)
+        return change
+
+    def filter(self, u: Vector) -> Vector:
+        """Return the change over a record."""
+        seen = ~np.isnan(u)
+        values = u[seen]
+        return np.asarray(np.concatenate(([0.0], values - values[:1]))[np.cumsum(seen)])
+
+
 class Lag(Block):
     """A first-order lag of gain 1 by Tustin's rule, its pole not below 0, at rest at its first input.
 
@@ -82,6 +109,24 @@ class Lag(Block):
         return np.asarray(lfilter([self._half, self._half], [1.0, -self.pole], u - u[0]) + u[0])
 
 
+class Undelayed(Lag):
+    """The input itself, with the state of a lag."""
+
+    def step(self, u: float) -> float:
+        """Advance by one sample."""
+        self.state = (u, u)
+        return u
+
+    def filter(self, u: Vector) -> Vector:
+        """Return the record itself."""
+        return u
+
+
+def lag_or_none(tau_min: float, period_min: float) -> Lag:
+    """Return a lag; the input itself for a time constant of 0, where `Lag` takes the mean of two samples."""
+    return (Lag if tau_min > 0.0 else Undelayed)(tau_min, period_min)
+
+
 class FilterBank(Block):
     """First-order lags of one or more inputs, weighted and summed.
 
@@ -93,6 +138,8 @@ class FilterBank(Block):
         For each input, the weight of each lag.
     period_min : float
         Sample period, min.
+    lag : callable
+        Makes a lag of its time constant and the sample period, both in min.
 
     Raises
     ------
@@ -100,11 +147,17 @@ class FilterBank(Block):
         If there are not as many weights as lags.
     """
 
-    def __init__(self, taus_min: Sequence[float], gains: Sequence[Sequence[float]], period_min: float) -> None:
+    def __init__(
+        self,
+        taus_min: Sequence[float],
+        gains: Sequence[Sequence[float]],
+        period_min: float,
+        lag: Callable[[float, float], Lag] = Lag,
+    ) -> None:
         for row in gains:
             if len(taus_min) != len(row):
                 raise ModelError(f"a filter bank: {len(taus_min)} tau_min for {len(row)} gain, expected as many")
-        self._rows = [[(gain, Lag(tau, period_min)) for gain, tau in zip(row, taus_min, strict=True)] for row in gains]
+        self._rows = [[(gain, lag(tau, period_min)) for gain, tau in zip(row, taus_min, strict=True)] for row in gains]
         self._lags = [lag for row in self._rows for _, lag in row]
 
     @property
@@ -116,6 +169,11 @@ class FilterBank(Block):
     def state(self, values: tuple[float, ...]) -> None:
         for i, lag in enumerate(self._lags):
             lag.state = tuple(values[2 * i : 2 * i + 2])
+
+    @property
+    def outputs(self) -> list[float]:
+        """What each lag gave at the last sample, unweighted, input by input; 0 before the first."""
+        return [lag.state[1] for lag in self._lags]
 
     def step(self, *inputs: float) -> float:
         """Advance by one sample."""
