@@ -22,13 +22,11 @@ from compensator.errors import ServiceError
 from compensator.events import CommandName
 from compensator.reasons import Remark
 from compensator.remarks import ServiceWarning
-from compensator.service.presence import sole_voice
-from compensator.service.session import in_words, log_links, session_config
+from compensator.service.presence import sole_service
+from compensator.service.session import ALIVE, RETRY_S, in_words, log_links, session_config
 
 log = logging.getLogger("compensator")
 
-#: How long a client waits before it retries its router, s.
-RETRY_S = 1.0
 #: Commands of the service, each a query on `thermal/command/<name>/<sender>` or `thermal/command/<name>`.
 COMMANDS = tuple(CommandName)
 #: Characters of a sender's name, which is a chunk of a key.
@@ -121,10 +119,10 @@ class Publisher:
     def _begin(self) -> None:
         with ExitStack() as unfinished:  # if a step fails everything is undone, and retried as a whole
             # First: nothing may be published or answered in the name of a machine that has its service already.
-            with sole_voice(self._settings):
+            with sole_service(self._settings):
                 session = zenoh.open(session_config(self._settings))
                 unfinished.callback(session.close)
-                declared: list[Any] = [session.liveliness().declare_token(f"{self._settings.prefix}/thermal/alive")]
+                declared: list[Any] = [session.liveliness().declare_token(f"{self._settings.prefix}/{ALIVE}")]
             publishers = {name: self._publisher(session, name) for name in _KEYS}
             for name in ("offset", "status", "sample", "estimate"):
                 declared.append(session.declare_queryable(self.key(name), self._answer_latest(name)))

@@ -13,16 +13,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import msgspec
 import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError, UsageError
-from compensator.service.command_client import alive_at, operator_of_file
-from compensator.service.session import get, in_words, session_config, set_key
+from compensator.service.command_client import operator_of_file
+from compensator.service.session import (
+    RETRY_S,
+    alive_services,
+    client_config,
+    get,
+    in_words,
+    local_endpoints,
+)
 
-#: Time between two attempts to connect, s.
-RETRY_S = 1.0
 #: Largest number of messages that wait to be processed.
 WAITING = 65_536
 #: Longest wait for the answers to a query, s.
@@ -49,7 +53,7 @@ class Source(NamedTuple):
     where : str
         Endpoints, as text.
     config : callable
-        Returns the configuration of a Zenoh client.
+        Returns the configuration of a Zenoh client that tries its endpoints once.
     """
 
     prefix: str
@@ -59,12 +63,6 @@ class Source(NamedTuple):
 
 #: Keys that are queried: services answer them with the latest message.
 ASKED = ("y/offset", "status", "sample", "estimate")
-
-
-def endpoints_of(settings: Zenoh) -> list[str]:
-    """Return the endpoints of the service of a configuration: its routers first, then its own."""
-    listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
-    return [*settings.connect, *(endpoint for endpoint in listened if not endpoint.endswith(":0"))]
 
 
 def below(prefix: str, rest: str) -> str:
@@ -109,11 +107,8 @@ class Listener:
         ServiceError
             If there is no answer, or an endpoint cannot be used.
         """
-        config = self._source.config()
-        set_key(config, "connect/timeout_ms", 0)
-        set_key(config, "connect/exit_on_failure", True)
         try:
-            session = self._session = zenoh.open(config)
+            session = self._session = zenoh.open(self._source.config())
         except zenoh.ZError as error:
             raise ServiceError(f"zenoh: no answer at {self._source.where}: {in_words(error)}") from error
         prefix = self._source.prefix
@@ -154,7 +149,7 @@ class Listener:
 
     def elsewhere(self) -> list[str]:
         """Return the prefixes of all services that are alive, subscribed or not."""
-        return alive_at("**/thermal/alive", self._session, ANSWER_S) if self._session is not None else []
+        return alive_services(self._session, ANSWER_S) if self._session is not None else []
 
     def start(self) -> None:
         """Connect in the background, with retries, and query after each new connection."""
@@ -254,11 +249,10 @@ def of_settings(settings: Zenoh) -> Source:
             "--zenoh: missing; TLS needs a receiver's or operator's certificate, expected a Zenoh configuration such "
             "as receiver.json5"
         )
-    endpoints = endpoints_of(settings)
+    endpoints = [*settings.connect, *local_endpoints(settings)]
     if not endpoints:
         raise UsageError("zenoh: expected an endpoint in listen or connect")
-    client = msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints)
-    return Source(settings.prefix, ", ".join(endpoints), lambda: session_config(client))
+    return Source(settings.prefix, ", ".join(endpoints), lambda: client_config(settings, endpoints))
 
 
 def of_file(path: Path, prefix: str) -> Source:

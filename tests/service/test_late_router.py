@@ -90,6 +90,6 @@ def test_a_router_that_is_asked_by_a_whole_shop_at_once_is_asked_again(
     monkeypatch.setattr(presence, "REACHED_S", LONG_S / 20)
     port = free_port()
     settings = Zenoh(prefix="shop/vmc-07", mode="peer", connect=[f"tcp/127.0.0.1:{port}"])
-    with router(port), caplog.at_level(logging.WARNING), presence.sole_voice(settings):
+    with router(port), caplog.at_level(logging.WARNING), presence.sole_service(settings):
         assert refused
     assert "others_unknown" not in caplog.text
