@@ -17,6 +17,7 @@ from compensator import __version__
 from compensator.api.files import ModelLike, as_in_file, model_of, page_in
 from compensator.arrays import Vector
 from compensator.blas import in_one_thread, one_thread
+from compensator.codes import Remark
 from compensator.data.measurement import Measurement, measurements, runs_in
 from compensator.data.screening import screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
@@ -27,7 +28,6 @@ from compensator.identify.summary import with_std
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
-from compensator.reasons import Remark
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot

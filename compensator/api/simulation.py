@@ -15,6 +15,7 @@ from compensator.api.files import ModelLike, model_of
 from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
 from compensator.blas import one_thread
+from compensator.codes import Reason, Remark, SampleQuality
 from compensator.data.measurement import measurements
 from compensator.data.record import Record, require
 from compensator.data.screening import DEAD_SAMPLES, check_scale
@@ -22,7 +23,6 @@ from compensator.display import html_table
 from compensator.model.simulation import COLUMNS, Scores, csv_rows, scores
 from compensator.model.simulation import simulate as run_free
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Reason, Remark, SampleQuality
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot

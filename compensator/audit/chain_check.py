@@ -15,12 +15,12 @@ import msgspec
 
 from compensator.audit.findings import Fault
 from compensator.audit.result import RecordingAudit
+from compensator.codes import RecordingEnd
 from compensator.messages import SCHEMA, Chain, ChainLink, Seal, encode
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Contents, Flaw
 from compensator.recording.reading import Record
 from compensator.recording.signature import Verifier
-from compensator.remarks import RecordingEnd
 
 _sha256 = hashlib.sha256
 _DECODER = msgspec.json.Decoder(Chain)

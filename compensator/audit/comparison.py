@@ -10,14 +10,13 @@ from typing import Any
 
 from compensator.audit.findings import utc
 from compensator.clock import NS
+from compensator.codes import AuditRemark, Remark
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind
 from compensator.messages import EstimateMessage, Offset, number
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Remark
 from compensator.recording.container import Container, Contents
 from compensator.recording.reading import in_order
-from compensator.remarks import AuditRemark
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import FreeRun, Step, setup_of, steps_in

@@ -12,8 +12,8 @@ from compensator.audit.comparison import Comparison, worst_utc
 from compensator.audit.findings import Difference, utc
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit
+from compensator.codes import AuditFinding, RecordingEnd
 from compensator.recording.chain import NOTHING
-from compensator.remarks import AuditFinding, RecordingEnd
 from compensator.report.envelope import Envelope, line_of
 from compensator.report.history import Spread
 from compensator.report.page import (

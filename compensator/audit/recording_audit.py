@@ -12,11 +12,11 @@ from compensator.audit.chain_check import ChainCheck
 from compensator.audit.findings import Fault
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
+from compensator.codes import AuditFinding, RecordingEnd
 from compensator.errors import CompensatorError, DataError
 from compensator.recording.container import Container, Damaged, Torn
 from compensator.recording.reading import Record, groups_of
 from compensator.recording.signature import Verifier
-from compensator.remarks import AuditFinding, RecordingEnd
 
 #: Groups between two calls of `progress`.
 _STEP = 500

@@ -9,10 +9,10 @@ import msgspec
 
 from compensator.audit.findings import Difference, Field
 from compensator.audit.result import RecordingAudit
+from compensator.codes import Reason
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note, RecordingData, data_of, is_recorded
 from compensator.messages import Event, Offset, degraded, encode
-from compensator.reasons import Reason
 from compensator.recording.container import Contents
 from compensator.recording.reading import Record
 from compensator.service.compensation import Compensation, Outcome

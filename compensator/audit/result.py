@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from compensator.audit.findings import KEPT, Difference, Fault, Finding
+from compensator.codes import AuditFinding, RecordingEnd
 from compensator.recording.reading import Record
-from compensator.remarks import AuditFinding, RecordingEnd
 
 
 @dataclass(slots=True, kw_only=True)

@@ -12,10 +12,9 @@ from typing import Any
 from compensator.audit.findings import Difference, Fault, Finding, utc
 from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
-from compensator.reasons import Remark
+from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
 from compensator.recording.chain import NOTHING
 from compensator.recording.signature import Verifier
-from compensator.remarks import AuditFinding, AuditRemark, RecordingEnd
 
 _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
 

@@ -15,11 +15,10 @@ from cryptography import x509
 
 from compensator.bridge.register import Register
 from compensator.bridge.settings import OpcUa
+from compensator.codes import BridgeTrouble, Remark
 from compensator.errors import ConfigError
-from compensator.reasons import Remark
 from compensator.receiver import Applied, Receiver
 from compensator.receiver.subscriber import monotonic_s
-from compensator.remarks import BridgeTrouble
 
 log = logging.getLogger("compensator")
 

@@ -7,9 +7,8 @@ import asyncio
 import logging
 from typing import Any
 
+from compensator.codes import Remark, ServiceWarning
 from compensator.commands import Answer
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 from compensator.service.composition import read_once
 from compensator.service.loading import load
 from compensator.service.presence import is_used

@@ -13,10 +13,9 @@ from typing import Any
 import zenoh
 
 from compensator.certificates import check_files, remarks
+from compensator.codes import Remark, ServiceWarning
 from compensator.commands import Answer
 from compensator.errors import ConfigError, ServiceError
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 from compensator.service.session import ConfigFile, files_of, get, in_words, read_config_file, set_key
 
 log = logging.getLogger("compensator")

@@ -7,11 +7,10 @@ import math
 import numpy as np
 
 from compensator.arrays import LARGEST, Indices, Mask, Vector
+from compensator.codes import DataRemark, Remark
 from compensator.data.record import SHORT_GAP_SAMPLES, Data, Record
 from compensator.data.table import Table
 from compensator.errors import DataError
-from compensator.reasons import Remark
-from compensator.remarks import DataRemark
 
 #: Longest table, in samples of the model: eleven years of minutes.
 MOST_SAMPLES = 6_000_000

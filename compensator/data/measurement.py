@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from compensator.codes import Remark
 from compensator.data.files import read_csv, read_mat, read_recordings
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
@@ -19,7 +20,6 @@ from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.table import Table
 from compensator.display import html_table
 from compensator.errors import DataError, UsageError
-from compensator.reasons import Remark
 
 #: Sample period of the models made, s: the service's.
 PERIOD_S = 60.0

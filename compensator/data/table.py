@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.codes import DataRemark, Remark
 from compensator.config import ROLES
 from compensator.errors import DataError, UsageError
-from compensator.reasons import Remark
-from compensator.remarks import DataRemark
 
 #: Columns of an exported recording that the service computed.
 EXPORTED = (

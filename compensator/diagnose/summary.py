@@ -6,11 +6,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from compensator.codes import ModelWarning
 from compensator.diagnose.fit import Term
 from compensator.diagnose.outcome import Diagnosis, FoundEffect
 from compensator.identify.summary import with_std
 from compensator.model.simulation import Scores
-from compensator.remarks import ModelWarning
 
 _VERDICTS = {
     "adequate": "The model is adequate: the residual is noise.",

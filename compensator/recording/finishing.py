@@ -17,6 +17,7 @@ from typing import Any
 from mcap.writer import Writer
 
 from compensator.clock import NS
+from compensator.codes import RecordingEnd
 from compensator.errors import DataError
 from compensator.events import RecordingCode, RecordingData
 from compensator.messages import encode
@@ -26,7 +27,6 @@ from compensator.recording.container import Contents, Message
 from compensator.recording.naming import began_ns
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
-from compensator.remarks import RecordingEnd
 
 log = logging.getLogger("compensator")
 

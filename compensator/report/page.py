@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from compensator.atomic_write import atomic_write
-from compensator.reasons import Remark, explain
+from compensator.codes import Remark, explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 

@@ -12,13 +12,13 @@ import math
 import msgspec
 
 from compensator.arrays import NAN
+from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind, Note, ZeroData
 from compensator.messages import Offset, Sample, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Reason, SampleQuality, State
 from compensator.service.decision import Decision, OffsetDecision, mean
 from compensator.service.outcome import Outcome, Values, estimate_message
 from compensator.service.plausibility import HEATED_W, Evidence, PlausibilityCheck, PlausibilityState, SensorGuards

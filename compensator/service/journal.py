@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from compensator.clock import Clock
+from compensator.codes import Reason, Remark, ServiceWarning
 from compensator.events import EventKind, RecordingCode, RecordingData
 from compensator.messages import SCHEMA, Event, Offset, degraded, encode
-from compensator.reasons import Reason, Remark
 from compensator.recording.naming import day_of
-from compensator.remarks import ServiceWarning
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 
 log = logging.getLogger("compensator")

@@ -12,13 +12,12 @@ from typing import Any
 
 import drivers
 from compensator.certificates import Certificate, check_files, remarks
+from compensator.codes import Remark, ServiceWarning
 from compensator.config import Config, LoadedConfig, Zenoh, load_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.model.model_file import parse_model, read_model_bytes
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Remark
 from compensator.recording.signature import Signer
-from compensator.remarks import ServiceWarning
 from compensator.service.adoption import check_model
 from compensator.service.model_store import ModelStore
 from compensator.service.session import tls_files

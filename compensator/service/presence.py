@@ -20,10 +20,9 @@ from typing import Any
 
 import zenoh
 
+from compensator.codes import Remark, ServiceWarning
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 from compensator.service.session import ALIVE, client_config, tokens
 
 log = logging.getLogger("compensator")

@@ -17,11 +17,10 @@ from typing import Any, Literal, NamedTuple
 
 import zenoh
 
+from compensator.codes import Remark, ServiceWarning
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
 from compensator.events import CommandName
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 from compensator.service.presence import sole_service
 from compensator.service.session import ALIVE, RETRY_S, in_words, log_links, session_config
 

@@ -13,10 +13,9 @@ import msgspec
 import zenoh
 
 from compensator.certificates import TlsFiles
+from compensator.codes import Remark, ServiceWarning
 from compensator.config import Zenoh
 from compensator.errors import ConfigError
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 
 log = logging.getLogger("compensator")
 

@@ -8,10 +8,9 @@ from typing import Any
 import msgspec
 
 from compensator.clock import NS
+from compensator.codes import Reason, Remark, State, WatchWarning
 from compensator.events import EventKind
 from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
-from compensator.reasons import Reason, Remark, State
-from compensator.remarks import WatchWarning
 from compensator.watch.history import History, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import TONES, Tone, Words, age, in_words, to_do

@@ -21,8 +21,8 @@ from urllib.parse import parse_qs, urlsplit
 
 from compensator import __version__
 from compensator.clock import NS
+from compensator.codes import WORDS
 from compensator.errors import ServiceError
-from compensator.reasons import WORDS
 from compensator.watch.history import spells
 from compensator.watch.shop import Shop, headline
 

@@ -12,8 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from compensator.clock import NS
-from compensator.reasons import SampleQuality, State
-from compensator.remarks import WatchWarning
+from compensator.codes import SampleQuality, State, WatchWarning
 from compensator.report.notation import plain, signed
 from compensator.watch.day import STYLES, drawn, evenly, sparkline
 from compensator.watch.history import Spell, spells

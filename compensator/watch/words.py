@@ -7,10 +7,9 @@ from datetime import UTC, datetime
 from typing import Literal, NamedTuple
 
 from compensator.clock import NS
+from compensator.codes import State, WatchWarning, explain
 from compensator.events import EventKind, RecordingData, data_of
 from compensator.messages import Event
-from compensator.reasons import State, explain
-from compensator.remarks import WatchWarning
 
 Tone = Literal["good", "warn", "bad"]
 

@@ -25,10 +25,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from compensator.arrays import NAN
+from compensator.codes import Reason
 from compensator.config import Config, Plausibility
 from compensator.events import EventKind, Implausibility, Note
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Reason
 from compensator.service.plausibility.isolation import LOG_ODDS, Block, FaultIsolation, Fit
 
 #: Samples in a block of the residual: single minutes after a heat step say nothing about a sensor.
