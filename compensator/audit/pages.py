@@ -67,8 +67,9 @@ def audit_page(found: Audit) -> Page:
             lines.append(f"And {len(found.remarks) - _REMARKS} more; replay --json has all.")
         blocks.append(Words(title="Remarks", lines=lines))
     blocks.append(_hashes(found))
-    machines = ", ".join(dict.fromkeys(file.machine or "unnamed machine" for file in found.files))
-    return Page(title=f"Audit: {machines}{_span(found)}", verdict=verdict(found), blocks=blocks, tone=_tone(found))
+    return Page(
+        title=f"Audit: {found.machines}{_span(found)}", verdict=verdict(found), blocks=blocks, tone=_tone(found)
+    )
 
 
 def verdict(found: Audit) -> str:
@@ -99,9 +100,10 @@ def _tone(found: Audit) -> Tone:
 
 
 def _span(found: Audit) -> str:
-    times = [ns for file in found.files if file.samples for ns in (file.first_ns, file.last_ns)]
-    first, last = (utc(ns)[:16].replace("T", " ") for ns in (min(times), max(times))) if times else ("", "")
-    return f", {first} to {last} UTC" if times else ""
+    if found.span_ns is None:
+        return ""
+    first, last = (utc(ns)[:16].replace("T", " ") for ns in found.span_ns)
+    return f", {first} to {last} UTC"
 
 
 def _timeline(found: Audit) -> list[Block]:
@@ -137,7 +139,7 @@ def _timeline(found: Audit) -> list[Block]:
 
 def _proven(found: Audit) -> Table:
     yes, no, open_ = "✓ proven", "✗ not proven", "– not checked"
-    chained = [file for file in found.files if file.last]
+    chained = found.chained
     records = sum(file.records for file in chained)
     of_files = sum(finding.kind in _OF_FILES for finding in found.findings)
     ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]

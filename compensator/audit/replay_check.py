@@ -14,7 +14,7 @@ from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note, RecordingData, data_of, is_recorded
 from compensator.messages import Event, Offset, degraded, encode
 from compensator.recording.container import Contents
-from compensator.recording.reading import Record
+from compensator.recording.reading import RawRecord
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import Step, apply, setup_of, step_of
 
@@ -53,12 +53,12 @@ class ReplayCheck:
         #: A sample of which the estimate or the offset is missing: a torn end, or a difference.
         self._incomplete: Difference | None = None
 
-    def check(self, records: list[Record]) -> None:
+    def check(self, records: list[RawRecord]) -> None:
         """Replay one group.
 
         Parameters
         ----------
-        records : list of Record
+        records : list of RawRecord
             Events, sample, estimate and offset, as they were written together.
 
         Raises
@@ -126,7 +126,7 @@ class ReplayCheck:
                 return degraded(expected, reason)
         return expected
 
-    def _matches(self, topic: str, message: Any, record: Record) -> bool:
+    def _matches(self, topic: str, message: Any, record: RawRecord) -> bool:
         recorded, recomputed = record.data, encode(message)
         if recorded == recomputed:
             return True

@@ -16,7 +16,7 @@ from compensator.certificates import check_files, remarks
 from compensator.codes import Remark, ServiceWarning
 from compensator.commands import Answer
 from compensator.errors import ConfigError, ServiceError
-from compensator.service.session import ConfigFile, files_of, get, in_words, read_config_file, set_key
+from compensator.service.session import ConfigFile, error_text, files_of, get, read_config_file, set_key
 
 log = logging.getLogger("compensator")
 
@@ -112,7 +112,7 @@ async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        raise ServiceError(f"{path}: {in_words(error)}") from error
+        raise ServiceError(f"{path}: {error_text(error)}") from error
     with session:
         log.info("compensator: router listens on %s", ", ".join(endpoints))
         session.info.declare_link_events_listener(_log_link, history=True)

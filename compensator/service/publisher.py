@@ -22,7 +22,7 @@ from compensator.config import Zenoh
 from compensator.errors import ServiceError
 from compensator.events import CommandName
 from compensator.service.presence import sole_service
-from compensator.service.session import ALIVE, RETRY_S, in_words, log_links, session_config
+from compensator.service.session import ALIVE, RETRY_S, error_text, log_links, session_config
 
 log = logging.getLogger("compensator")
 
@@ -107,7 +107,7 @@ class Publisher:
             self._begin()
         except zenoh.ZError as error:
             endpoints = ", ".join(self._settings.listen + self._settings.connect) or "no endpoints"
-            words = f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})"
+            words = f"zenoh: {error_text(error)} ({self._settings.mode}, {endpoints})"
             if self._settings.mode != "client":
                 raise ServiceError(words) from error
             figures = f"{words.rstrip('.')}; it is tried again."

@@ -40,7 +40,7 @@ def get(config: zenoh.Config, key: str) -> Any:
         return None
 
 
-def in_words(error: zenoh.ZError) -> str:
+def error_text(error: zenoh.ZError) -> str:
     """Return the text of an error without the place in Zenoh's source."""
     return re.sub(r"\s+", " ", re.sub(r" at /\S+\.rs:\d+\.", "", str(error))).strip()
 
@@ -174,7 +174,7 @@ def read_config_file(path: Path) -> ConfigFile:
     try:
         config = zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:
-        raise ConfigError(f"{path}: {in_words(error)}") from error
+        raise ConfigError(f"{path}: {error_text(error)}") from error
     tls = {}
     for name in _FILES:
         value = get(config, f"{_TLS}/{name}")

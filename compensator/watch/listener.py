@@ -22,8 +22,8 @@ from compensator.service.session import (
     RETRY_S,
     alive_services,
     client_config,
+    error_text,
     get,
-    in_words,
     local_endpoints,
 )
 
@@ -34,7 +34,7 @@ ANSWER_S = 3.0
 
 
 class Sink(Protocol):
-    """Receives what the listener hears; called on Zenoh's threads."""
+    """Receives messages and liveliness; called on Zenoh's threads."""
 
     def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
         """Receive a message, or the answer to a query."""
@@ -95,7 +95,7 @@ class Listener:
         self._on_connection = on_connection
         self._session: Any = None
         self._thread: threading.Thread | None = None
-        self._hearing: threading.Thread | None = None
+        self._receiving: threading.Thread | None = None
         self._stop = threading.Event()
         self._wanted = threading.Event()
 
@@ -110,13 +110,13 @@ class Listener:
         try:
             session = self._session = zenoh.open(self._source.config())
         except zenoh.ZError as error:
-            raise ServiceError(f"zenoh: no answer at {self._source.where}: {in_words(error)}") from error
+            raise ServiceError(f"zenoh: no answer at {self._source.where}: {error_text(error)}") from error
         prefix = self._source.prefix
         # Zenoh's own threads fill the channel without waiting for Python: if they had to wait, the router would drop
         # messages when a whole shop publishes at one instant.
         subscriber = session.declare_subscriber(below(prefix, "**"), zenoh.handlers.FifoChannel(WAITING))
-        self._hearing = threading.Thread(target=self._hear, args=(subscriber,), name="watch receives")
-        self._hearing.start()
+        self._receiving = threading.Thread(target=self._forward_all, args=(subscriber,), name="watch receives")
+        self._receiving.start()
         session.liveliness().declare_subscriber(below(prefix, "alive"), self._token, history=True)
         session.info.declare_transport_events_listener(self._transport, history=False)
         self._on_connection(True)
@@ -142,7 +142,7 @@ class Listener:
         for answers in asked:
             for answer in answers:
                 if answer.ok is not None:
-                    self._heard(answer.ok, asked=True)
+                    self._forward(answer.ok, asked=True)
         for answer in alive:
             if answer.ok is not None:
                 self._token(answer.ok)
@@ -166,8 +166,8 @@ class Listener:
         session, self._session = self._session, None
         if session is not None:
             session.close()
-        if self._hearing is not None:
-            self._hearing.join()
+        if self._receiving is not None:
+            self._receiving.join()
 
     def __enter__(self) -> Listener:
         return self
@@ -177,11 +177,11 @@ class Listener:
 
     # ------------------------------------------------------------------ on other threads
 
-    def _hear(self, subscriber: Any) -> None:
+    def _forward_all(self, subscriber: Any) -> None:
         """Forward messages until the session is closed."""
         with suppress(zenoh.ZError):
             for sample in subscriber:
-                self._heard(sample)
+                self._forward(sample)
 
     def _keep_connected(self) -> None:
         while not self._stop.is_set():
@@ -205,7 +205,7 @@ class Listener:
         if came:
             self._wanted.set()
 
-    def _heard(self, sample: Any, asked: bool = False) -> None:
+    def _forward(self, sample: Any, asked: bool = False) -> None:
         key = str(sample.key_expr)
         if sample.kind != zenoh.SampleKind.PUT or key.endswith("/alive"):
             return
