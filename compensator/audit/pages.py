@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -67,9 +68,8 @@ def audit_page(found: Audit) -> Page:
             lines.append(f"And {len(found.remarks) - _REMARKS} more; replay --json has all.")
         blocks.append(Words(title="Remarks", lines=lines))
     blocks.append(_hashes(found))
-    return Page(
-        title=f"Audit: {found.machines}{_span(found)}", verdict=verdict(found), blocks=blocks, tone=_tone(found)
-    )
+    title = f"Audit: {found.machines}{_span(found)}"
+    return Page(title=title, verdict=verdict(found), blocks=blocks, tone=_tone(found))
 
 
 def verdict(found: Audit) -> str:
@@ -141,15 +141,13 @@ def _proven(found: Audit) -> Table:
     yes, no, open_ = "✓ proven", "✗ not proven", "– not checked"
     chained = found.chained
     records = sum(file.records for file in chained)
-    of_files = sum(finding.kind in _OF_FILES for finding in found.findings)
+    kinds = Counter(finding.kind for finding in found.findings)
+    of_files = sum(kinds[kind] for kind in _OF_FILES)
     ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]
     whole = bool(chained) and len(chained) == len(found.files)
     worked_out = bool(found.samples) and not any(file.not_replayed for file in found.files)
-    not_signed = sum(
-        finding.kind in (AuditFinding.UNSIGNED, AuditFinding.FALSE_SIGNATURE) for finding in found.findings
-    )
-    cut = sum(finding.kind == AuditFinding.TRUNCATED for finding in found.findings)
-    index = sum(finding.kind == AuditFinding.INDEX for finding in found.findings)
+    not_signed = kinds[AuditFinding.UNSIGNED] + kinds[AuditFinding.FALSE_SIGNATURE]
+    cut, index = kinds[AuditFinding.TRUNCATED], kinds[AuditFinding.INDEX]
     inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
         [
