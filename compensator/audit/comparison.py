@@ -37,7 +37,7 @@ COLUMNS = (
 
 @dataclass(slots=True)
 class Comparison:
-    """The recorded model beside another one.
+    """The recorded model compared with another one.
 
     Parameters
     ----------

@@ -285,7 +285,7 @@ class Curves:
 
 
 def comparison_page(found: Comparison, curves: Curves) -> Page:
-    """Make the page of another model beside the recorded one.
+    """Make the page that compares another model with the recorded one.
 
     Parameters
     ----------

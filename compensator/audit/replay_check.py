@@ -20,7 +20,7 @@ from compensator.service.replay import Step, apply, setup_of, step_of
 
 #: Reasons that the disk gives: only the offset itself shows that it was published before it was on disk.
 _DISK_REASONS = tuple((reason, f'"{reason}"'.encode()) for reason in (Reason.RECORDING_FAILED, Reason.RECORDING_LATE))
-#: Largest number of removed recordings that is believed of one event.
+#: Largest number of removed recordings that is read from one event.
 _REMOVED = 1000
 
 

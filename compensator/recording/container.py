@@ -56,7 +56,7 @@ __all__ = [
 ]
 
 MAGIC = b"\x89MCAP0\r\n"
-#: Longest record and chunk that is believed, bytes; ours are below 2 MiB.
+#: Longest record and chunk that is accepted, bytes; those of the recorder are below 2 MiB.
 LONGEST = 64 * 2**20
 _WINDOW = 2**20
 _LONGEST_HEADER = 4096
@@ -126,7 +126,7 @@ class Flaw(StrEnum):
 
 @dataclass(slots=True)
 class Contents:
-    """What was met so far beside messages.
+    """What the file has besides messages, as far as it was read.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class Container:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.contents = Contents()
-        #: What the index leads to, beside what is there.
+        #: Compares the index with the records that were read.
         self.index = Index()
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         try:

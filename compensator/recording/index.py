@@ -93,7 +93,7 @@ _READERS: dict[_Part, Callable[[Fields], Any]] = {
     _Part.SCHEMAS: lambda fields: fields.number("<H"),
 }
 
-#: How an entry describes what it leads to.
+#: How an entry describes what it points to.
 _Entry = dict[_Part, Any]
 
 
@@ -104,7 +104,7 @@ class Index:
         #: Part of the index that is wrong, and what is wrong with it: the first `KEPT`, and the number of all.
         self.faults: list[tuple[str, str]] = []
         self.count = 0
-        #: For each kind the entry that is due, by the offset of what it leads to, and the offsets that were found.
+        #: For each kind the expected entry, by the offset of what it points to, and the offsets that were found.
         self._due: dict[int, dict[int, _Entry]] = {kind: {} for kind in _THINGS}
         self._found: dict[int, set[int]] = {kind: set() for kind in _THINGS}
         #: Schemas and channels by number, and those that the summary repeats.
