@@ -12,9 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from compensator.codes import Remark, ServiceWarning
 from compensator.errors import ConfigError
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 
 #: Days before its end from which on a certificate is warned of.
 SOON_DAYS = 30.0

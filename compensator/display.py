@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from compensator.reasons import Remark
+from compensator.codes import Remark
 
 #: Cells of a column of numbers: digits, signs, errors, percent, and dashes for missing values.
 _NUMBER = re.compile(

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from compensator.reasons import SampleQuality, State
+from compensator.codes import SampleQuality, State
 
 #: Version of the messages.
 SCHEMA = 1
@@ -139,7 +139,7 @@ class Offset(msgspec.Struct, frozen=True, kw_only=True):
     state : str
         `starting`, `ok`, `degraded`, `hold` or `fault`.
     reasons : list of str
-        Codes of why the state is not `ok`, see `compensator.reasons`.
+        Codes of why the state is not `ok`, see `compensator.codes`.
     model_sha256 : str
         Hash of the model file.
     """

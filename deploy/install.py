@@ -152,13 +152,13 @@ class Installation:
             command.symlink_to(f"{self._prefix}/current/bin/compensator")
 
     def _write(self, path: Path, place: str, data: bytes, known: dict[str, list[str]]) -> None:
-        digest, beside = hashlib.sha256(data).hexdigest(), path.with_name(path.name + ".new")
+        digest, newer = hashlib.sha256(data).hexdigest(), path.with_name(path.name + ".new")
         found = hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else None
         if found == digest:
             return
         if found is not None and found not in known.get(place, []):
-            beside.write_bytes(data)
-            report(f"{path}: was changed here and stays; the new one is {beside.name}")
+            newer.write_bytes(data)
+            report(f"{path}: was changed here and stays; the new one is {newer.name}")
             return
         # Recorded before it is written: a power cut in between leaves no file without an owner.
         known[place] = [*known.get(place, []), digest]
@@ -167,7 +167,7 @@ class Installation:
         part = path.with_name("." + path.name + ".part")
         part.write_bytes(data)
         part.replace(path)
-        beside.unlink(missing_ok=True)
+        newer.unlink(missing_ok=True)
         report(f"{path}: written")
 
     def _known(self) -> dict[str, list[str]]:
@@ -381,10 +381,10 @@ def machine(given: argparse.Namespace, installation: Installation, system: Syste
 def _copy(source: Path, target: Path, system: System) -> None:
     data = source.read_bytes()
     if target.exists() and target.read_bytes() != data:
-        beside = target.with_name(target.name + ".new")
-        beside.write_bytes(data)
-        system.own(beside, 0o640)
-        report(f"{target}: differs and stays; the new one is {beside.name}")
+        newer = target.with_name(target.name + ".new")
+        newer.write_bytes(data)
+        system.own(newer, 0o640)
+        report(f"{target}: differs and stays; the new one is {newer.name}")
         return
     if not target.exists():
         target.write_bytes(data)

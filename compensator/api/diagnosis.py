@@ -18,6 +18,7 @@ from compensator.api.files import ModelLike, Paged, as_in_file, model_of
 from compensator.arrays import Vector
 from compensator.atomic_write import require_folder
 from compensator.blas import in_one_thread, one_thread
+from compensator.codes import Remark
 from compensator.data.measurement import DataLike, Measurement, measurements, runs_in
 from compensator.data.screening import screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
@@ -27,7 +28,6 @@ from compensator.display import Table, Words
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
-from compensator.reasons import Remark
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot

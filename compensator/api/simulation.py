@@ -11,13 +11,13 @@ from compensator.api.files import ModelLike, model_of
 from compensator.api.simulation_result import SimulationResult
 from compensator.arrays import Vector
 from compensator.blas import one_thread
+from compensator.codes import Reason, Remark, SampleQuality
 from compensator.data.measurement import DataLike, measurements
 from compensator.data.record import SampledRecord, require
 from compensator.data.screening import DEAD_SAMPLES, check_scale
 from compensator.model.simulation import COLUMNS, Scores, scores
 from compensator.model.simulation import simulate as run_free
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Reason, Remark, SampleQuality
 
 if TYPE_CHECKING:
     from compensator.api.simulation_frame import SimulationFrame

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import pandas
 
 from compensator.api.simulation_result import SimulationResult
+from compensator.codes import Remark
 from compensator.data.frames import time_index
 from compensator.model.simulation import Scores
-from compensator.reasons import Remark
 
 
 class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]

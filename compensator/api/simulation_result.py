@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
+from compensator.codes import Remark
 from compensator.display import Shown, Table, Words, text_of_all, warnings_of
 from compensator.model.simulation import SCORE_HEAD, Scores, csv_rows
-from compensator.reasons import Remark
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot

@@ -15,12 +15,12 @@ import msgspec
 
 from compensator.audit.findings import Fault
 from compensator.audit.result import RecordingAudit
+from compensator.codes import RecordingEnd
 from compensator.messages import SCHEMA, Chain, ChainLink, Seal, encode
 from compensator.recording import chain
 from compensator.recording.container import PAYLOAD, Contents, Flaw
-from compensator.recording.reading import Record
+from compensator.recording.reading import RawRecord
 from compensator.recording.signature import Verifier
-from compensator.remarks import RecordingEnd
 
 _sha256 = hashlib.sha256
 _DECODER = msgspec.json.Decoder(Chain)
@@ -59,19 +59,19 @@ class ChainCheck:
         #: Value that the chain of this file claims to continue from.
         self.previous = chain.NOTHING
         self._next = 0
-        self._run = contents.metadata.get("run", {})
+        self._run = contents.run
         self._machine = msgspec.json.encode(self._run.get("machine", "")).decode()
         self._gaps: dict[int, tuple[int, int]] = {}
         self._suspect: tuple[int, bytes] | None = None
 
-    def check(self, records: list[Record], message: Record) -> None:
+    def check(self, records: list[RawRecord], message: RawRecord) -> None:
         """Check the records since the last `/chain` message, and that message.
 
         Parameters
         ----------
-        records : list of Record
+        records : list of RawRecord
             The records, in the order of the file.
-        message : Record
+        message : RawRecord
             The message after them.
         """
         _, sequence, time_ns, body = message
@@ -90,7 +90,7 @@ class ChainCheck:
             number += 1
             if topic == "seal":
                 self._before_last = before
-                self._seal(before, Record(topic, its_number, its_time, its_body))
+                self._seal(before, RawRecord(topic, its_number, its_time, its_body))
             else:
                 result.seal, result.sealed_signed = "", False
                 result.unsigned_behind += 1
@@ -105,7 +105,7 @@ class ChainCheck:
             return
         self._explain(records, value, message)
 
-    def add_rest(self, records: list[Record]) -> None:
+    def add_rest(self, records: list[RawRecord]) -> None:
         """Count the records after the last `/chain` message: the file ends within a group."""
         result = self._result
         for record in records:
@@ -128,7 +128,7 @@ class ChainCheck:
 
     # ------------------------------------------------------------------ opening
 
-    def _open(self, message: Record) -> None:
+    def _open(self, message: RawRecord) -> None:
         """Check what the file opens with; name the part that is not what it was."""
         result, sequence = self._result, message.sequence
         parts = chain.parts_of(self._contents)
@@ -175,7 +175,7 @@ class ChainCheck:
 
     # ------------------------------------------------------------------ what happened
 
-    def _explain(self, records: list[Record], computed: bytes, message: Record) -> None:
+    def _explain(self, records: list[RawRecord], computed: bytes, message: RawRecord) -> None:
         """Name what makes a group differ from its `/chain` message, and continue after it."""
         result, sequence = self._result, message.sequence
         try:
@@ -208,7 +208,7 @@ class ChainCheck:
         findings[index] = replace(old, topic="chain", text=text)
         return True
 
-    def _place(self, records: list[Record], first: int, message: Record) -> bool:
+    def _place(self, records: list[RawRecord], first: int, message: RawRecord) -> bool:
         """Return whether whole groups are missing before this one, or whether it is in the wrong place."""
         sequence, time_ns = message.sequence, message.log_time_ns
         present = {record.sequence for record in records}
@@ -230,7 +230,7 @@ class ChainCheck:
         self._result.find(fault, sequence=first, time_utc_ns=time_ns, numbers=_numbers(first, sequence))
         return True
 
-    def _find_unlisted(self, records: list[Record], listed: list[ChainLink], before: bytes) -> None:
+    def _find_unlisted(self, records: list[RawRecord], listed: list[ChainLink], before: bytes) -> None:
         """Name records that the chain does not list."""
         numbers = {entry.sequence for entry in listed}
         unlisted = [record for record in records if record.sequence not in numbers]
@@ -253,7 +253,7 @@ class ChainCheck:
                 self._result.find(Fault.NOT_LISTED, record)
             seen.add(record.sequence)
 
-    def _find_missing(self, records: list[Record], listed: list[ChainLink], message: Record) -> None:
+    def _find_missing(self, records: list[RawRecord], listed: list[ChainLink], message: RawRecord) -> None:
         """Name records that are listed and missing, or are in another order."""
         present = [record.sequence for record in records]
         for entry in listed:
@@ -273,7 +273,7 @@ class ChainCheck:
                 return
 
     def _find_changed(
-        self, records: list[Record], listed: list[ChainLink], values: list[bytes], message: Record
+        self, records: list[RawRecord], listed: list[ChainLink], values: list[bytes], message: RawRecord
     ) -> None:
         """Name records whose value is not the one stated; `values` begins with the one before the first of them."""
         there = {record.sequence: record for record in reversed(records)}
@@ -295,7 +295,7 @@ class ChainCheck:
 
     # ------------------------------------------------------------------ seals
 
-    def _seal(self, before: bytes, record: Record) -> None:
+    def _seal(self, before: bytes, record: RawRecord) -> None:
         result = self._result
         try:
             seal = msgspec.json.decode(record.data, type=Seal)

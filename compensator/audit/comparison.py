@@ -10,14 +10,13 @@ from typing import Any
 
 from compensator.audit.findings import utc
 from compensator.clock import NS
+from compensator.codes import AuditRemark, Remark
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind
 from compensator.messages import EstimateMessage, Offset, number
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Remark
 from compensator.recording.container import Container, Contents
 from compensator.recording.reading import in_order
-from compensator.remarks import AuditRemark
 from compensator.report.history import Spread
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.replay import FreeRun, RecordedStep, setup_of, steps_in
@@ -39,7 +38,7 @@ COLUMNS = (
 
 @dataclass(slots=True)
 class Comparison:
-    """The recorded model beside another one.
+    """The recorded model compared with another one.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from enum import Enum
 from typing import Any
 
-from compensator.remarks import AuditFinding
+from compensator.codes import AuditFinding
 
 #: Number of findings of one file that are kept; the others are counted.
 KEPT = 50

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,8 +13,8 @@ from compensator.audit.comparison import Comparison, worst_utc
 from compensator.audit.findings import Difference, utc
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit
+from compensator.codes import AuditFinding, RecordingEnd
 from compensator.recording.chain import NOTHING
-from compensator.remarks import AuditFinding, RecordingEnd
 from compensator.report.envelope import Envelope, line_of
 from compensator.report.history import Spread
 from compensator.report.page import (
@@ -67,8 +68,8 @@ def audit_page(found: Audit) -> Page:
             lines.append(f"And {len(found.remarks) - _REMARKS} more; replay --json has all.")
         blocks.append(Words(title="Remarks", lines=lines))
     blocks.append(_hashes(found))
-    machines = ", ".join(dict.fromkeys(file.machine or "unnamed machine" for file in found.files))
-    return Page(title=f"Audit: {machines}{_span(found)}", verdict=verdict(found), blocks=blocks, tone=_tone(found))
+    title = f"Audit: {found.machines}{_span(found)}"
+    return Page(title=title, verdict=verdict(found), blocks=blocks, tone=_tone(found))
 
 
 def verdict(found: Audit) -> str:
@@ -99,9 +100,10 @@ def _tone(found: Audit) -> Tone:
 
 
 def _span(found: Audit) -> str:
-    times = [ns for file in found.files if file.samples for ns in (file.first_ns, file.last_ns)]
-    first, last = (utc(ns)[:16].replace("T", " ") for ns in (min(times), max(times))) if times else ("", "")
-    return f", {first} to {last} UTC" if times else ""
+    if found.span_ns is None:
+        return ""
+    first, last = (utc(ns)[:16].replace("T", " ") for ns in found.span_ns)
+    return f", {first} to {last} UTC"
 
 
 def _timeline(found: Audit) -> list[Block]:
@@ -137,17 +139,15 @@ def _timeline(found: Audit) -> list[Block]:
 
 def _proven(found: Audit) -> Table:
     yes, no, open_ = "✓ proven", "✗ not proven", "– not checked"
-    chained = [file for file in found.files if file.last]
+    chained = found.chained
     records = sum(file.records for file in chained)
-    of_files = sum(finding.kind in _OF_FILES for finding in found.findings)
+    kinds = Counter(finding.kind for finding in found.findings)
+    of_files = sum(kinds[kind] for kind in _OF_FILES)
     ends = [file.file for file in found.files if file.end not in _ENDS_WHOLE]
     whole = bool(chained) and len(chained) == len(found.files)
     worked_out = bool(found.samples) and not any(file.not_replayed for file in found.files)
-    not_signed = sum(
-        finding.kind in (AuditFinding.UNSIGNED, AuditFinding.FALSE_SIGNATURE) for finding in found.findings
-    )
-    cut = sum(finding.kind == AuditFinding.TRUNCATED for finding in found.findings)
-    index = sum(finding.kind == AuditFinding.INDEX for finding in found.findings)
+    not_signed = kinds[AuditFinding.UNSIGNED] + kinds[AuditFinding.FALSE_SIGNATURE]
+    cut, index = kinds[AuditFinding.TRUNCATED], kinds[AuditFinding.INDEX]
     inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
         [
@@ -285,7 +285,7 @@ class Curves:
 
 
 def comparison_page(found: Comparison, curves: Curves) -> Page:
-    """Make the page of another model beside the recorded one.
+    """Make the page that compares another model with the recorded one.
 
     Parameters
     ----------

@@ -12,11 +12,11 @@ from compensator.audit.chain_check import ChainCheck
 from compensator.audit.findings import Fault
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
+from compensator.codes import AuditFinding, RecordingEnd
 from compensator.errors import CompensatorError, DataError
 from compensator.recording.container import Container, Damaged, Torn
-from compensator.recording.reading import Record, groups_of
+from compensator.recording.reading import RawRecord, groups_of
 from compensator.recording.signature import Verifier
-from compensator.remarks import AuditFinding, RecordingEnd
 
 #: Groups between two calls of `progress`.
 _STEP = 500
@@ -58,7 +58,7 @@ class _Audit:
         self._chain: ChainCheck | None = None
         self._replay: ReplayCheck | None = None
         #: Records after the last complete group.
-        self._rest: list[Record] = []
+        self._rest: list[RawRecord] = []
         self._position = 0
 
     def run(self) -> RecordingAudit:
@@ -107,7 +107,7 @@ class _Audit:
         """Start the checks once it is known what the file opens with."""
         if self._chain is None:
             contents, result = self._contents, self._result
-            run = contents.metadata.get("run", {})
+            run = contents.run
             result.original, result.machine = run.get("file", result.file), run.get("machine", "")
             result.began, result.previous_file = run.get("began", ""), run.get("previous_file", "")
             identity = hashlib.sha256()
@@ -124,7 +124,7 @@ class _Audit:
                 result.not_replayed = str(error)
         return self._chain
 
-    def _replay_group(self, records: list[Record]) -> None:
+    def _replay_group(self, records: list[RawRecord]) -> None:
         if self._replay is None or self._result.not_replayed or not records:
             return
         try:

@@ -9,18 +9,18 @@ import msgspec
 
 from compensator.audit.findings import Difference, Field
 from compensator.audit.result import RecordingAudit
+from compensator.codes import Reason
 from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note, RecordingData, data_of, is_recorded
 from compensator.messages import Event, Offset, degraded, encode
-from compensator.reasons import Reason
 from compensator.recording.container import Contents
-from compensator.recording.reading import Record
+from compensator.recording.reading import RawRecord
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.replay import RecordedStep, apply, setup_of, step_of
 
 #: Reasons that the disk gives: only the offset itself shows that it was published before it was on disk.
 _DISK_REASONS = tuple((reason, f'"{reason}"'.encode()) for reason in (Reason.RECORDING_FAILED, Reason.RECORDING_LATE))
-#: Largest number of removed recordings that is believed of one event.
+#: Largest number of removed recordings that is read from one event.
 _REMOVED = 1000
 
 
@@ -53,12 +53,12 @@ class ReplayCheck:
         #: A sample of which the estimate or the offset is missing: a torn end, or a difference.
         self._incomplete: Difference | None = None
 
-    def check(self, records: list[Record]) -> None:
+    def check(self, records: list[RawRecord]) -> None:
         """Replay one group.
 
         Parameters
         ----------
-        records : list of Record
+        records : list of RawRecord
             Events, sample, estimate and offset, as they were written together.
 
         Raises
@@ -126,7 +126,7 @@ class ReplayCheck:
                 return degraded(expected, reason)
         return expected
 
-    def _matches(self, topic: str, message: Any, record: Record) -> bool:
+    def _matches(self, topic: str, message: Any, record: RawRecord) -> bool:
         recorded, recomputed = record.data, encode(message)
         if recorded == recomputed:
             return True

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from compensator.audit.findings import KEPT, Difference, Fault, Finding
-from compensator.recording.reading import Record
-from compensator.remarks import AuditFinding, RecordingEnd
+from compensator.codes import AuditFinding, RecordingEnd
+from compensator.recording.reading import RawRecord
 
 
 @dataclass(slots=True, kw_only=True)
@@ -98,7 +98,7 @@ class RecordingAudit:
     def find(
         self,
         fault: Fault,
-        at: Record | None = None,
+        at: RawRecord | None = None,
         *,
         topic: str = "",
         sequence: int | None = None,
@@ -111,7 +111,7 @@ class RecordingAudit:
         ----------
         fault : Fault
             What is wrong.
-        at : Record, optional
+        at : RawRecord, optional
             Where.
         topic, sequence, time_utc_ns
             Where it is in no single record.

@@ -12,10 +12,9 @@ from typing import Any
 from compensator.audit.findings import Difference, Fault, Finding, utc
 from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
-from compensator.reasons import Remark
+from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
 from compensator.recording.chain import NOTHING
 from compensator.recording.signature import Verifier
-from compensator.remarks import AuditFinding, AuditRemark, RecordingEnd
 
 _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
 
@@ -56,6 +55,22 @@ class Audit:
     def differing(self) -> int:
         """Number of samples that the replay does not reproduce."""
         return sum(file.differing for file in self.files)
+
+    @property
+    def machines(self) -> str:
+        """Names of the machines, for people."""
+        return ", ".join(dict.fromkeys(file.machine or "unnamed machine" for file in self.files))
+
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """Times of the first and last sample that were replayed, ns since 1970 UTC; None where there was none."""
+        times = [ns for file in self.files if file.samples for ns in (file.first_ns, file.last_ns)]
+        return (min(times), max(times)) if times else None
+
+    @property
+    def chained(self) -> list[RecordingAudit]:
+        """Files with a hash chain."""
+        return [file for file in self.files if file.last]
 
     @property
     def clean(self) -> bool:
@@ -304,10 +319,8 @@ class _Series:
 def summary(found: Audit) -> str:
     """Return the verdict in a few lines for people."""
     files, samples = len(found.files), found.samples
-    machines = ", ".join(dict.fromkeys(file.machine or "unnamed machine" for file in found.files))
-    times = [ns for file in found.files if file.samples for ns in (file.first_ns, file.last_ns)]
-    span = f", {utc(min(times))} to {utc(max(times))}" if times else ""
-    lines = [f"{samples} samples of {machines} in {files} file(s){span}"]
+    span = ", " + " to ".join(map(utc, found.span_ns)) if found.span_ns else ""
+    lines = [f"{samples} samples of {found.machines} in {files} file(s){span}"]
     if not samples:
         lines.append("No sample was replayed.")
     elif not found.differing:
@@ -315,9 +328,8 @@ def summary(found: Audit) -> str:
     else:
         lines.append(f"{found.differing} sample(s) differ in the replay. The first of them:")
         lines += found.difference.lines() if found.difference else []
-    chained = [file for file in found.files if file.last]
-    if chained and not found.findings_count:
-        records = sum(file.records for file in chained)
+    if found.chained and not found.findings_count:
+        records = sum(file.records for file in found.chained)
         lines.append(f"The hash chain holds over {records} records; nothing was changed, removed, inserted or moved.")
         if not found.signed:
             lines.append(

@@ -15,11 +15,10 @@ from cryptography import x509
 
 from compensator.bridge.register import Register
 from compensator.bridge.settings import OpcUa
+from compensator.codes import BridgeTrouble, Remark
 from compensator.errors import ConfigError
-from compensator.reasons import Remark
 from compensator.receiver import Applied, Receiver
 from compensator.receiver.subscriber import monotonic_s
-from compensator.remarks import BridgeTrouble
 
 log = logging.getLogger("compensator")
 
@@ -150,22 +149,22 @@ class Bridge:
         for key, number in (("state_node", state), ("heartbeat_node", self._beat)):
             if key in nodes:
                 await _write(nodes[key][0], number, nodes[key][1])
-        self._report_news(applied)
+        self._report_change(applied)
 
     async def _wait_disconnected(self, stop: asyncio.Event) -> None:
         """Follow what is published without the PLC, until the next attempt."""
         self._receiver.follower.hold()
         end_s = monotonic_s() + self._settings.retry_s
         while not stop.is_set() and monotonic_s() < end_s:
-            self._report_news(self._receiver.poll())
+            self._report_change(self._receiver.poll())
             await _pause(stop, min(self._settings.cycle_s, self._settings.retry_s))
 
-    def _report_news(self, applied: Applied) -> None:
+    def _report_change(self, applied: Applied) -> None:
         trouble = self.register.trouble
-        news = f"trouble: {trouble}" if trouble else f"{applied.state}: {applied.steady_reasons}".rstrip(": ")
-        if news != self._reported:
-            self._reported = news
-            self._report(news)
+        line = f"trouble: {trouble}" if trouble else f"{applied.state}: {applied.steady_reasons}".rstrip(": ")
+        if line != self._reported:
+            self._reported = line
+            self._report(line)
 
 
 def _application_uri(path: Path) -> str:

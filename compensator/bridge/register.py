@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 import struct
 
-from compensator.reasons import Remark
+from compensator.codes import BridgeTrouble, Remark
 from compensator.receiver import Follower
-from compensator.remarks import BridgeTrouble
 
 
 class Register:

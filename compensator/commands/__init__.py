@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from compensator.reasons import Remark
+from compensator.codes import Remark
 
 log = logging.getLogger("compensator")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import difflib
 
+from compensator.codes import WORDS
 from compensator.commands import Answer
 from compensator.errors import UsageError
-from compensator.reasons import WORDS
 from compensator.receiver.reasons import WORDS as RECEIVER_WORDS
 
 

@@ -6,9 +6,8 @@ import argparse
 import asyncio
 from typing import Any
 
+from compensator.codes import Remark, ServiceWarning
 from compensator.commands import Answer, log_warnings, warnings_as_json
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 from compensator.service.composition import read_once
 from compensator.service.loading import load
 from compensator.service.presence import is_used

@@ -13,11 +13,10 @@ from typing import Any
 import zenoh
 
 from compensator.certificates import check_files, remarks
+from compensator.codes import Remark, ServiceWarning
 from compensator.commands import Answer, log_warnings
 from compensator.errors import ConfigError, ServiceError
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
-from compensator.service.session import ConfigFile, files_of, get, in_words, read_config_file, set_key
+from compensator.service.session import ConfigFile, error_text, files_of, get, read_config_file, set_key
 
 log = logging.getLogger("compensator")
 
@@ -104,7 +103,7 @@ async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        raise ServiceError(f"{path}: {in_words(error)}") from error
+        raise ServiceError(f"{path}: {error_text(error)}") from error
     with session:
         log.info("compensator: router listens on %s", ", ".join(endpoints))
         session.info.declare_link_events_listener(_log_link, history=True)

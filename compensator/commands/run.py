@@ -13,9 +13,9 @@ from typing import Any
 
 import msgspec
 
+from compensator.codes import State
 from compensator.events import EventKind
 from compensator.messages import Event, Offset
-from compensator.reasons import State
 from compensator.service import systemd
 from compensator.service.composition import run_service
 from compensator.service.daemon import Daemon

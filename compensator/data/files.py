@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from compensator.codes import DataRemark, Remark
 from compensator.config import ROLES
 from compensator.data.table import TIMES, Table, table_of, time_names
 from compensator.errors import DataError
 from compensator.messages import number
-from compensator.reasons import Remark
 from compensator.recording.reading import messages
-from compensator.remarks import DataRemark
 
 #: First bytes of files that are mistaken for tables, and what to do with such a file.
 _OTHER_FILES = (

@@ -8,11 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from compensator.arrays import LARGEST, Indices, Mask, Vector
+from compensator.codes import DataRemark, Remark
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledData, SampledRecord
 from compensator.data.table import Table
 from compensator.errors import DataError
-from compensator.reasons import Remark
-from compensator.remarks import DataRemark
 
 #: Longest table, in samples of the model: eleven years of minutes.
 MOST_SAMPLES = 6_000_000

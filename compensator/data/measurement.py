@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from compensator import display
+from compensator.codes import Remark
 from compensator.data.files import read_csv, read_mat, read_recordings
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
@@ -20,7 +21,6 @@ from compensator.data.record import SampledData, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.table import Table
 from compensator.errors import DataError, UsageError
-from compensator.reasons import Remark
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from compensator.arrays import Vector
+from compensator.codes import Remark
 from compensator.errors import DataError
-from compensator.reasons import Remark
 
 #: A gap of up to this many model samples stays inside a record; the engine bridges it.
 SHORT_GAP_SAMPLES = 60

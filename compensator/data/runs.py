@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import Mask, Vector
+from compensator.codes import DataRemark, Remark
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledRecord
-from compensator.reasons import Remark
-from compensator.remarks import DataRemark
 
 #: A single reading this many noise deviations away from both neighbours is an outlier.
 OUTLIER_DEVIATIONS = 12.0

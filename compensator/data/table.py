@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.codes import DataRemark, Remark
 from compensator.config import ROLES
 from compensator.errors import DataError, UsageError
-from compensator.reasons import Remark
-from compensator.remarks import DataRemark
 
 #: Columns that hold the time: s from the start, or date and time. With both, the first is used.
 TIMES = ("t_s", "time_utc")

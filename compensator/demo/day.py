@@ -23,12 +23,12 @@ from rich.progress import Progress
 
 from compensator.arrays import Vector
 from compensator.clock import NS, VirtualClock
+from compensator.codes import Reason
 from compensator.config import Zenoh, load_config
 from compensator.demo.machine import MACHINES, configuration, hardware
 from compensator.errors import ServiceError
 from compensator.events import CommandName
 from compensator.messages import Offset
-from compensator.reasons import Reason
 from compensator.service.command_client import ask
 from compensator.service.compensation import Outcome
 from compensator.service.composition import run_service

@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 
 from compensator.arrays import Vector
+from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.estimate import Estimate, Prediction
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term, response
@@ -17,8 +18,6 @@ from compensator.diagnose.outcome import HELD_OUT, FoundEffect
 from compensator.diagnose.refit import refit
 from compensator.model.thermal_model import Path, ThermalModel
 from compensator.progress import ExecutorMap
-from compensator.reasons import Remark
-from compensator.remarks import ModelWarning
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1

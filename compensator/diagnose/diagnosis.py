@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.base_refit import FAR_OFF, BaseRefit, is_far_off
 from compensator.diagnose.estimate import Estimate
@@ -20,8 +21,6 @@ from compensator.diagnose.outcome import FOLDS, Diagnosis, FoundEffect, Verdict,
 from compensator.diagnose.residual_search import ResidualSearch
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
-from compensator.reasons import Remark
-from compensator.remarks import ModelWarning
 
 #: A base refit replaces a search's answer where it leaves no more than this share.
 REFIT_LEAVES = 0.5

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 
 from compensator.arrays import Vector
+from compensator.codes import Remark
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
 from compensator.diagnose.outcome import HELD_OUT, FoundEffect, described, rivals_of
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap
-from compensator.reasons import Remark
 
 #: What is predicted on every sample by the base alone and with the effects, µm.
 Prediction = tuple[Vector, Vector]

@@ -10,13 +10,12 @@ from typing import Any, Literal
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
 from compensator.model.effects import Effect
 from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Remark
-from compensator.remarks import ModelWarning
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 

@@ -10,6 +10,7 @@ from itertools import repeat
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.codes import Remark
 from compensator.diagnose.estimate import Estimate, Prediction
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import response, standard_errors, summed
@@ -17,7 +18,6 @@ from compensator.diagnose.outcome import FoundEffect
 from compensator.diagnose.search import Candidate, Search, Selection
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap
-from compensator.reasons import Remark
 
 
 class ResidualSearch(Estimate):

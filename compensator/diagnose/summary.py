@@ -7,12 +7,11 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.fit import Term
 from compensator.diagnose.outcome import Ceiling, Diagnosis, FoundEffect, Remainder
 from compensator.display import Table, Words, warnings_of, with_std
 from compensator.model.simulation import SCORE_HEAD, Scores
-from compensator.reasons import Remark
-from compensator.remarks import ModelWarning
 
 _VERDICTS = {
     "adequate": "The model is adequate: the residual is noise.",

@@ -10,12 +10,11 @@ from scipy.signal import freqz
 from scipy.special import gammaincc
 
 from compensator.arrays import ComplexVector, Mask, Vector
+from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.display import with_std
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
-from compensator.reasons import Remark
-from compensator.remarks import ModelWarning
 
 #: Lags of the correlations, samples.
 LAGS = 60

@@ -35,9 +35,9 @@ def main() -> int:
         while not ended.wait(0.1):
             applied = receiver.poll()
             # A changed figure in a detail (an age, a distance) is not worth a line.
-            news = (applied.seq, applied.state, tuple(reason.code for reason in applied.reasons))
-            if news != reported:
-                reported = news
+            shown = (applied.seq, applied.state, tuple(reason.code for reason in applied.reasons))
+            if shown != reported:
+                reported = shown
                 sys.stdout.write(applied.text + "\n")
                 sys.stdout.flush()
     return 0

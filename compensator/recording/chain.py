@@ -22,7 +22,7 @@ import struct
 import msgspec
 
 from compensator.messages import SCHEMA, Chain, ChainLink, ChainPart, Seal, encode
-from compensator.recording.container import Attachment, Channel, Contents
+from compensator.recording.container import Attachment, Contents, McapChannel
 
 #: Value before the first file of a machine.
 NOTHING = bytes(32)
@@ -87,7 +87,7 @@ def _attachment(part: Attachment) -> bytes:
     return _prefixed(part.name.encode(), part.media_type.encode(), times, part.data)
 
 
-def _channel(number: int, channel: Channel) -> bytes:
+def _channel(number: int, channel: McapChannel) -> bytes:
     texts = (str(number), channel.topic, channel.encoding, channel.schema_name, channel.schema_encoding)
     return _prefixed(*(text.encode() for text in texts), channel.schema, _texts(channel.metadata))
 

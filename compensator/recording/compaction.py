@@ -24,15 +24,15 @@ from compensator.recording import chain
 from compensator.recording.container import (
     PAYLOAD,
     Attachment,
-    Channel,
     Container,
     Contents,
+    McapChannel,
     Message,
     Torn,
 )
 from compensator.recording.live_file import Opening
 
-#: Number of messages after which a patient copy yields to other threads, and for how long, s.
+#: Number of messages after which a yielding copy lets other threads run, and for how long, s.
 TURN, MOMENT_S = 64, 0.0005
 _PART = ".mcap.part"
 
@@ -79,7 +79,11 @@ class Copy:
 
 
 def rewrite(
-    path: Path, copy_of: Callable[[Contents, Writer], Copy] = Copy, *, patient: bool = False, chained: bool = False
+    path: Path,
+    copy_of: Callable[[Contents, Writer], Copy] = Copy,
+    *,
+    yielding: bool = False,
+    chained: bool = False,
 ) -> Copy | None:
     """Replace a finished or abandoned live recording by a compact copy.
 
@@ -91,7 +95,7 @@ def rewrite(
         A recording.
     copy_of : callable
         Makes the copy.
-    patient : bool
+    yielding : bool
         Whether to let other threads go first.
     chained : bool
         Whether to leave files without a hash chain alone.
@@ -120,11 +124,11 @@ def rewrite(
         try:
             with part.open("xb") as file:
                 copy = _copied(
-                    path, Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True), copy_of, patient
+                    path, Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True), copy_of, yielding
                 )
                 file.flush()
                 os.fsync(file.fileno())
-            if _digest(part, patient) != copy.digest():
+            if _digest(part, yielding) != copy.digest():
                 raise DataError(f"{part}: does not read back as what was written")
             part.replace(path)
         except McapError as error:
@@ -147,13 +151,13 @@ def _is_live(path: Path, chained: bool) -> bool:
         return not chained and not container.contents.chunked
 
 
-def _copied(path: Path, writer: Writer, copy_of: Callable[[Contents, Writer], Copy], patient: bool) -> Copy:
+def _copied(path: Path, writer: Writer, copy_of: Callable[[Contents, Writer], Copy], yielding: bool) -> Copy:
     with Container(path) as container:
         copy = copy_of(container.contents, writer)
         try:
             for number, message in enumerate(container.messages()):
                 copy.add(message)
-                if patient and number % TURN == 0:
+                if yielding and number % TURN == 0:
                     time.sleep(MOMENT_S)
         except Torn as torn:
             # Nothing can be read after a torn end; a damaged file is refused, so that an audit finds it as it was.
@@ -162,7 +166,7 @@ def _copied(path: Path, writer: Writer, copy_of: Callable[[Contents, Writer], Co
     return copy
 
 
-def _digest(path: Path, patient: bool) -> str:
+def _digest(path: Path, yielding: bool) -> str:
     """Read a compact file with the library's seeking reader; return the hash of everything in it."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
@@ -171,7 +175,7 @@ def _digest(path: Path, patient: bool) -> str:
             head = chain.body_of(message.sequence, message.log_time, b"")[:12]
             body = head + message.publish_time.to_bytes(8, "little") + message.data
             digest.update(message.channel_id.to_bytes(2, "little") + body)
-            if patient and number % TURN == 0:
+            if yielding and number % TURN == 0:
                 time.sleep(MOMENT_S)
         return _with_parts(digest, _contents_of(path, reader))
 
@@ -192,7 +196,7 @@ def _contents_of(path: Path, reader: McapReader) -> Contents:
     for number, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)
         described = (schema.name, schema.encoding, schema.data) if schema is not None else ("", "", b"")
-        contents.channels[number] = Channel(channel.topic, channel.message_encoding, channel.metadata, *described)
+        contents.channels[number] = McapChannel(channel.topic, channel.message_encoding, channel.metadata, *described)
     return contents
 
 

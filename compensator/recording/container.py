@@ -16,7 +16,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar
 
-import lz4.frame
 import zstandard
 
 from compensator.errors import DataError
@@ -47,17 +46,17 @@ __all__ = [
     "MAGIC",
     "PAYLOAD",
     "Attachment",
-    "Channel",
     "Container",
     "Contents",
     "Damaged",
     "Flaw",
+    "McapChannel",
     "Message",
     "Torn",
 ]
 
 MAGIC = b"\x89MCAP0\r\n"
-#: Longest record and chunk that is believed, bytes; ours are below 2 MiB.
+#: Longest record and chunk that is accepted, bytes; those of the recorder are below 2 MiB.
 LONGEST = 64 * 2**20
 _WINDOW = 2**20
 _LONGEST_HEADER = 4096
@@ -106,7 +105,7 @@ class Attachment:
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
+class McapChannel:
     """A channel with its schema."""
 
     topic: str
@@ -127,7 +126,7 @@ class Flaw(StrEnum):
 
 @dataclass(slots=True)
 class Contents:
-    """What was met so far beside messages.
+    """What the file has besides messages, as far as it was read.
 
     Parameters
     ----------
@@ -137,7 +136,7 @@ class Contents:
         By name.
     attachments : dict of str to Attachment
         By name.
-    channels : dict of int to Channel
+    channels : dict of int to McapChannel
         By number.
     flaws : list of (str, Flaw)
         Attachments and metadata with a flaw.
@@ -150,11 +149,16 @@ class Contents:
     library: str = ""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, Attachment] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
+    channels: dict[int, McapChannel] = field(default_factory=dict)
     flaws: list[tuple[str, Flaw]] = field(default_factory=list)
     chunked: bool = False
     ended: bool = False
     messages: int = 0
+
+    @property
+    def run(self) -> dict[str, str]:
+        """Metadata that the recorder of a machine writes; empty in other files."""
+        return self.metadata.get("run", {})
 
 
 class Container:
@@ -174,7 +178,7 @@ class Container:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.contents = Contents()
-        #: What the index leads to, beside what is there.
+        #: Compares the index with the records that were read.
         self.index = Index()
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         try:
@@ -322,11 +326,9 @@ class Container:
                 if stated not in (-1, size):
                     raise Damaged(self.path, offset, f"a chunk of {size} bytes whose data says {stated}")
                 data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size or 1)
-            elif compression == "lz4":
-                data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
             elif compression:
-                raise Damaged(self.path, offset, f"a chunk compressed by {compression!r}, expected zstd, lz4 or none")
-        except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
+                raise Damaged(self.path, offset, f"a chunk compressed by {compression!r}, expected zstd or none")
+        except (zstandard.ZstdError, ValueError) as error:
             raise Damaged(self.path, offset, f"a chunk that cannot be uncompressed: {error}") from error
         if len(data) != size or (crc and zlib.crc32(data) != crc):
             raise Damaged(self.path, offset, "a chunk whose CRC is wrong")
@@ -351,7 +353,7 @@ class Container:
             topic, encoding, metadata = fields.text(), fields.text(), fields.table()
             fields.done()
             name, schema_encoding, data = self._schemas.get(schema, ("", "", b""))
-            channel = Channel(topic, encoding, metadata, name, schema_encoding, data)
+            channel = McapChannel(topic, encoding, metadata, name, schema_encoding, data)
             if contents.channels.setdefault(number, channel) != channel:
                 raise Damaged(self.path, offset, f"a second channel {number}, {topic}")
             self.index.add_description(CHANNEL, number, body)

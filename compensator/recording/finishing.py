@@ -17,6 +17,7 @@ from typing import Any
 from mcap.writer import Writer
 
 from compensator.clock import NS
+from compensator.codes import RecordingEnd
 from compensator.errors import DataError
 from compensator.events import RecordingCode, RecordingData
 from compensator.messages import encode
@@ -26,7 +27,6 @@ from compensator.recording.container import Contents, Message
 from compensator.recording.naming import began_ns
 from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
-from compensator.remarks import RecordingEnd
 
 log = logging.getLogger("compensator")
 
@@ -74,7 +74,7 @@ class Finisher:
         compacted: Callable[[Path], str] | None = None,
     ) -> None:
         self._folder, self._machine, self._retention = folder, machine, retention
-        self._compact = compacted or (lambda path: compact(path, signer, patient=True))
+        self._compact = compacted or (lambda path: compact(path, signer, yielding=True))
         self._lock = threading.Lock()
         self._jobs: deque[tuple[Path | None, int]] = deque()
         #: What the disk did not let be made compact; tried again with the next file.
@@ -195,7 +195,7 @@ class Finisher:
         return bool(removed)
 
 
-def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) -> str:
+def compact(path: Path, signer: Signer | None = None, *, yielding: bool = False) -> str:
     """Replace a machine's live recording by a compact copy.
 
     A torn end is finished: its complete records get their place in a `/chain` message, and a seal says `recovered`.
@@ -206,7 +206,7 @@ def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) 
         A recording; one that is compact, has no hash chain or is being written is left alone.
     signer : Signer, optional
         Signs the seal of a recovered end.
-    patient : bool
+    yielding : bool
         Whether to let other threads go first.
 
     Returns
@@ -219,7 +219,7 @@ def compact(path: Path, signer: Signer | None = None, *, patient: bool = False) 
     OSError, DataError
         As from `rewrite`; the file stays as it is.
     """
-    copy = rewrite(path, partial(_ChainedCopy, signer=signer), patient=patient, chained=True)
+    copy = rewrite(path, partial(_ChainedCopy, signer=signer), yielding=yielding, chained=True)
     if not isinstance(copy, _ChainedCopy) or copy.recovered is None:
         return "its torn end was cut off" if copy is not None and copy.torn else ""
     end = "its torn end was cut off" if copy.torn else "it had no end"
@@ -242,7 +242,7 @@ class _ChainedCopy(Copy):
         """Copy one message and follow the chain."""
         super().add(message)
         if self._chain is None:
-            run = self.contents.metadata.get("run", {})
+            run = self.contents.run
             before = bytes.fromhex(run.get("previous_chain", "")) or chain.NOTHING
             self._chain = chain.ChainWriter(run.get("machine", ""), before)
             self._chain.begin(chain.parts_of(self.contents), message.log_time_ns)

@@ -9,6 +9,8 @@ chunks, attachments and metadata, the statistics, the repeated schemas and chann
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
+from enum import StrEnum
 from typing import Any
 
 from compensator.recording.framing import (
@@ -34,8 +36,65 @@ _NAMES = {
 }
 _THINGS = {CHUNK_INDEX: "chunk", ATTACHMENT_INDEX: "attachment", METADATA_INDEX: "metadata table"}
 
-#: How an entry describes what it leads to, by name.
-_Entry = dict[str, Any]
+
+class _Part(StrEnum):
+    """Parts of an entry of the index, as findings name them."""
+
+    FIRST_NS = "first message (ns)"
+    LAST_NS = "last message (ns)"
+    OFFSET = "offset"
+    LENGTH = "length"
+    INDEXES = "message indexes"
+    INDEXES_LENGTH = "length of the message indexes"
+    COMPRESSION = "compression"
+    COMPRESSED_SIZE = "compressed size"
+    SIZE = "size"
+    LOG_NS = "log time (ns)"
+    CREATION_NS = "creation time (ns)"
+    NAME = "name"
+    MEDIA_TYPE = "media type"
+    MESSAGES = "messages"
+    SCHEMAS = "schemas"
+    CHANNELS = "channels"
+    ATTACHMENTS = "attachments"
+    METADATA = "metadata tables"
+    CHUNKS = "chunks"
+    BY_CHANNEL = "messages by channel"
+
+
+def _u64(fields: Fields) -> int:
+    return fields.number("<Q")
+
+
+def _u32(fields: Fields) -> int:
+    return fields.number("<I")
+
+
+#: The parts of each kind of record of the index, in their order on disk.
+_LAYOUT = {
+    CHUNK_INDEX: (
+        *(_Part.FIRST_NS, _Part.LAST_NS, _Part.OFFSET, _Part.LENGTH, _Part.INDEXES, _Part.INDEXES_LENGTH),
+        *(_Part.COMPRESSION, _Part.COMPRESSED_SIZE, _Part.SIZE),
+    ),
+    ATTACHMENT_INDEX: (
+        *(_Part.OFFSET, _Part.LENGTH, _Part.LOG_NS, _Part.CREATION_NS, _Part.SIZE, _Part.NAME, _Part.MEDIA_TYPE),
+    ),
+    METADATA_INDEX: (_Part.OFFSET, _Part.LENGTH, _Part.NAME),
+    STATISTICS: (
+        *(_Part.MESSAGES, _Part.SCHEMAS, _Part.CHANNELS, _Part.ATTACHMENTS, _Part.METADATA, _Part.CHUNKS),
+        *(_Part.FIRST_NS, _Part.LAST_NS, _Part.BY_CHANNEL),
+    ),
+}
+#: How a part is read where it is not an unsigned number of 8 bytes.
+_READERS: dict[_Part, Callable[[Fields], Any]] = {
+    **dict.fromkeys((_Part.COMPRESSION, _Part.NAME, _Part.MEDIA_TYPE), Fields.text),
+    **dict.fromkeys((_Part.INDEXES, _Part.BY_CHANNEL), Fields.counts),
+    **dict.fromkeys((_Part.CHANNELS, _Part.ATTACHMENTS, _Part.METADATA, _Part.CHUNKS), _u32),
+    _Part.SCHEMAS: lambda fields: fields.number("<H"),
+}
+
+#: How an entry describes what it points to.
+_Entry = dict[_Part, Any]
 
 
 class Index:
@@ -45,7 +104,7 @@ class Index:
         #: Part of the index that is wrong, and what is wrong with it: the first `KEPT`, and the number of all.
         self.faults: list[tuple[str, str]] = []
         self.count = 0
-        #: For each kind the entry that is due, by the offset of what it leads to, and the offsets that were found.
+        #: For each kind the expected entry, by the offset of what it points to, and the offsets that were found.
         self._due: dict[int, dict[int, _Entry]] = {kind: {} for kind in _THINGS}
         self._found: dict[int, set[int]] = {kind: set() for kind in _THINGS}
         #: Schemas and channels by number, and those that the summary repeats.
@@ -97,14 +156,14 @@ class Index:
             )
         self._places, self._chunk_at, self._next = places, offset, offset + length
         self._chunk = {
-            "first message (ns)": first_ns,
-            "last message (ns)": last_ns,
-            "length": length,
-            "message indexes": {},
-            "length of the message indexes": 0,
-            "compression": compression,
-            "compressed size": len(stored),
-            "size": size,
+            _Part.FIRST_NS: first_ns,
+            _Part.LAST_NS: last_ns,
+            _Part.LENGTH: length,
+            _Part.INDEXES: {},
+            _Part.INDEXES_LENGTH: 0,
+            _Part.COMPRESSION: compression,
+            _Part.COMPRESSED_SIZE: len(stored),
+            _Part.SIZE: size,
         }
         self._due[CHUNK_INDEX][offset] = self._chunk
         for channel, place in places.items():
@@ -129,13 +188,13 @@ class Index:
             self._fault(where, "does not follow a chunk")
             return
         self._next += length
-        self._chunk["length of the message indexes"] += length
+        self._chunk[_Part.INDEXES_LENGTH] += length
         place = self._places.pop(channel, None)
         if place is None:
-            if entries or channel in self._chunk["message indexes"]:
+            if entries or channel in self._chunk[_Part.INDEXES]:
                 self._fault(where, f"leads into the chunk at byte {self._chunk_at}, which has no (more) messages of it")
             return
-        self._chunk["message indexes"][channel] = offset
+        self._chunk[_Part.INDEXES][channel] = offset
         if entries == struct.pack(f"<{len(place)}Q", *place):
             return
         due = set(zip(place[::2], place[1::2], strict=True))
@@ -181,17 +240,17 @@ class Index:
     ) -> None:
         """Note an attachment."""
         self._due[ATTACHMENT_INDEX][offset] = {
-            "length": length,
-            "log time (ns)": log_ns,
-            "creation time (ns)": create_ns,
-            "size": size,
-            "name": name,
-            "media type": media_type,
+            _Part.LENGTH: length,
+            _Part.LOG_NS: log_ns,
+            _Part.CREATION_NS: create_ns,
+            _Part.SIZE: size,
+            _Part.NAME: name,
+            _Part.MEDIA_TYPE: media_type,
         }
 
     def add_metadata(self, offset: int, length: int, name: str) -> None:
         """Note a metadata table."""
-        self._due[METADATA_INDEX][offset] = {"length": length, "name": name}
+        self._due[METADATA_INDEX][offset] = {_Part.LENGTH: length, _Part.NAME: name}
 
     # ------------------------------------------------------------------ the summary
 
@@ -219,15 +278,16 @@ class Index:
         else:
             self._groups.append([kind, offset, length])
         if kind in _THINGS:
-            self._entry(kind, *_entry_of(kind, fields))
+            self._entry(kind, _read(kind, fields))
         elif kind == STATISTICS:
             if self._statistics is not None:
                 self._fault("statistics", "occur twice")
-            self._statistics = _statistics_of(fields)
+            self._statistics = _read(kind, fields)
         else:
             self._repeat(kind, fields)
 
-    def _entry(self, kind: int, offset: int, entry: _Entry) -> None:
+    def _entry(self, kind: int, entry: _Entry) -> None:
+        offset = entry[_Part.OFFSET]
         where = f"{_NAMES[kind]} of the {_THINGS[kind]} at byte {offset}"
         due = self._due[kind].get(offset)
         if due is None:
@@ -272,7 +332,7 @@ class Index:
                 self._fault(
                     _NAMES[kind],
                     f"no entry leads to the {_THINGS[kind]} at byte {offset}"
-                    + (f", {entries[offset]['name']}" if "name" in entries[offset] else ""),
+                    + (f", {entries[offset][_Part.NAME]}" if _Part.NAME in entries[offset] else ""),
                 )
         for kind, described in self._described.items():
             for number in described.keys() - self._repeated[kind]:
@@ -286,15 +346,15 @@ class Index:
     def _totals(self) -> _Entry:
         any_there = bool(self._messages)
         return {
-            "messages": sum(self._messages.values()),
-            "schemas": len(self._described[SCHEMA]),
-            "channels": len(self._described[CHANNEL]),
-            "attachments": len(self._due[ATTACHMENT_INDEX]),
-            "metadata tables": len(self._due[METADATA_INDEX]),
-            "chunks": len(self._due[CHUNK_INDEX]),
-            "first message (ns)": self._first_ns if any_there else 0,
-            "last message (ns)": self._last_ns if any_there else 0,
-            "messages by channel": self._messages,
+            _Part.MESSAGES: sum(self._messages.values()),
+            _Part.SCHEMAS: len(self._described[SCHEMA]),
+            _Part.CHANNELS: len(self._described[CHANNEL]),
+            _Part.ATTACHMENTS: len(self._due[ATTACHMENT_INDEX]),
+            _Part.METADATA: len(self._due[METADATA_INDEX]),
+            _Part.CHUNKS: len(self._due[CHUNK_INDEX]),
+            _Part.FIRST_NS: self._first_ns if any_there else 0,
+            _Part.LAST_NS: self._last_ns if any_there else 0,
+            _Part.BY_CHANNEL: self._messages,
         }
 
     def _places_of_groups(self, start: int, footer_at: int, stated_start: int, stated_offsets: int) -> None:
@@ -318,34 +378,8 @@ class Index:
                 self._fault(f"summary offset of kind {name}", f"none of them is at byte {group[1]}")
 
 
-def _entry_of(kind: int, fields: Fields) -> tuple[int, _Entry]:
-    """Return where an entry leads, and how it describes what is there."""
-    entry: _Entry = {}
-    if kind == CHUNK_INDEX:
-        entry["first message (ns)"], entry["last message (ns)"] = fields.number("<Q"), fields.number("<Q")
-        offset = fields.number("<Q")
-        entry["length"], entry["message indexes"] = fields.number("<Q"), fields.counts()
-        entry["length of the message indexes"], entry["compression"] = fields.number("<Q"), fields.text()
-        entry["compressed size"], entry["size"] = fields.number("<Q"), fields.number("<Q")
-    else:
-        offset = fields.number("<Q")
-        entry["length"] = fields.number("<Q")
-        if kind == ATTACHMENT_INDEX:
-            for name in ("log time (ns)", "creation time (ns)", "size"):
-                entry[name] = fields.number("<Q")
-        entry["name"] = fields.text()
-        if kind == ATTACHMENT_INDEX:
-            entry["media type"] = fields.text()
+def _read(kind: int, fields: Fields) -> _Entry:
+    """Read an entry of the index, or the statistics."""
+    entry = {part: _READERS.get(part, _u64)(fields) for part in _LAYOUT[kind]}
     fields.done()
-    return offset, entry
-
-
-def _statistics_of(fields: Fields) -> _Entry:
-    entry = {"messages": fields.number("<Q"), "schemas": fields.number("<H")}
-    for name in ("channels", "attachments", "metadata tables", "chunks"):
-        entry[name] = fields.number("<I")
-    for name in ("first message (ns)", "last message (ns)"):
-        entry[name] = fields.number("<Q")
-    counts = {**entry, "messages by channel": fields.counts()}
-    fields.done()
-    return counts
+    return entry

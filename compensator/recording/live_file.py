@@ -15,7 +15,7 @@ from compensator import __version__
 from compensator.errors import DataError
 from compensator.messages import MESSAGES, encode, shipped_schema
 from compensator.recording import chain
-from compensator.recording.container import Attachment, Channel, Contents
+from compensator.recording.container import Attachment, Contents, McapChannel
 from compensator.recording.signature import Signer
 
 #: Topics of a recording; `chain` and `seal` come from the recorder itself.
@@ -174,7 +174,7 @@ class RecordingFile(LiveFile):
         contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
         for number, topic in enumerate(TOPICS, 1):
             about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
-            contents.channels[number] = Channel(f"/{topic}", "json", about, kind, "jsonschema", schema)
+            contents.channels[number] = McapChannel(f"/{topic}", "json", about, kind, "jsonschema", schema)
         opening = Opening(self.writer)
         opening.write(contents)
         self._channels = {topic: number for number, topic in opening.topics.items()}

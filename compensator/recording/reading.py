@@ -19,7 +19,7 @@ _EPOCH_2020_NS = 1_577_836_800 * 1_000_000_000
 _DECODERS = {topic: msgspec.json.Decoder(kind) for topic, kind in MESSAGES.items()}
 
 
-class Record(NamedTuple):
+class RawRecord(NamedTuple):
     """One message of a recording.
 
     Parameters
@@ -50,20 +50,20 @@ class Group(NamedTuple):
 
     Parameters
     ----------
-    records : list of Record
+    records : list of RawRecord
         Events, sample, estimate and offset of one sample, or a seal.
-    chain : Record or None
+    chain : RawRecord or None
         The `/chain` message that lists them; None in a file without a hash chain.
     whole : bool
         Whether the group has its end; only the last one of a file may lack it.
     """
 
-    records: list[Record]
-    chain: Record | None
+    records: list[RawRecord]
+    chain: RawRecord | None
     whole: bool
 
 
-def records_of(container: Container) -> Iterator[Record]:
+def records_of(container: Container) -> Iterator[RawRecord]:
     """Yield the messages of a file with their topics.
 
     Raises
@@ -79,7 +79,7 @@ def records_of(container: Container) -> Iterator[Record]:
         topic = topics.get(channel)
         if topic is None:
             topic = topics[channel] = channels[channel].topic.lstrip("/")
-        yield Record(topic, sequence, time_ns, body)
+        yield RawRecord(topic, sequence, time_ns, body)
 
 
 def groups_of(container: Container) -> Iterator[Group]:
@@ -95,7 +95,7 @@ def groups_of(container: Container) -> Iterator[Group]:
     Damaged
         Where it cannot be read any further; everything before that was yielded.
     """
-    records: list[Record] = []
+    records: list[RawRecord] = []
     end = ""
     try:
         for record in records_of(container):
@@ -117,7 +117,7 @@ def groups_of(container: Container) -> Iterator[Group]:
     yield Group(records, None, False)
 
 
-def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: str = "") -> Iterator[Record]:
+def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: str = "") -> Iterator[RawRecord]:
     """Yield the messages of a file in the order in which they were written.
 
     Parameters
@@ -185,7 +185,7 @@ def machines_in(path: Path) -> list[str]:
     return sorted(known - {""})
 
 
-def decode(record: Record, file: Path | str) -> Any:
+def decode(record: RawRecord, file: Path | str) -> Any:
     """Decode a recorded message of any topic; `file` is for the error.
 
     Raises
@@ -199,14 +199,14 @@ def decode(record: Record, file: Path | str) -> Any:
     return decode_with(decoder, record, str(file))
 
 
-def decode_with(decoder: msgspec.json.Decoder[_T], record: Record, file: str) -> _T:
+def decode_with(decoder: msgspec.json.Decoder[_T], record: RawRecord, file: str) -> _T:
     """Decode a recorded message, or a part of one.
 
     Parameters
     ----------
     decoder : msgspec.json.Decoder
         What is expected.
-    record : Record
+    record : RawRecord
         The message.
     file : str
         Where it is, for the error.
@@ -261,7 +261,7 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
     machines: set[str] = set()
     for path in dict.fromkeys(paths):
         with Container(path) as container:
-            run = container.survey(whole=False).metadata.get("run", {})
+            run = container.survey(whole=False).run
         machines |= {run["machine"]} if "machine" in run else set()
         began[path] = run.get("file", path.name).removesuffix(".mcap")
     if len(machines) > 1:

@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from compensator.codes import RecordingEnd, State
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Event, Offset, Sample, number
 from compensator.model.effects.base import label_of
-from compensator.reasons import State
 from compensator.recording.container import Container, Contents, Damaged, Torn
 from compensator.recording.reading import decode, in_order, records_of
-from compensator.remarks import RecordingEnd
 from compensator.report.envelope import Envelope, Stretches
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, File, History, Missed, Period
 

@@ -6,7 +6,7 @@ import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 
-from compensator.remarks import RecordingEnd
+from compensator.codes import RecordingEnd
 from compensator.report.envelope import Envelope, Stretches
 
 #: Numbers of events and episodes that are kept; the others are only counted.

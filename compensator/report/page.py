@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Literal
 
 from compensator.atomic_write import atomic_write
+from compensator.codes import explain
 from compensator.display import Cell, CodeLink, Link, Table, Words, sentence_of, text_of, warnings_of
-from compensator.reasons import explain
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 

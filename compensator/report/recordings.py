@@ -7,8 +7,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
-from compensator.reasons import Remark, State, explain
-from compensator.remarks import AuditRemark, RecordingEnd
+from compensator.codes import AuditRemark, RecordingEnd, Remark, State, explain
 from compensator.report.envelope import line_of
 from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
 from compensator.report.notation import plain, signed

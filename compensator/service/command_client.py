@@ -5,18 +5,26 @@ from __future__ import annotations
 import datetime
 import getpass
 import json
-import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import zenoh
 
 from compensator.certificates import check_files, common_name_of
 from compensator.config import Zenoh
 from compensator.errors import ConfigError, ServiceError, UsageError
 from compensator.service.publisher import SENDER
-from compensator.service.session import files_of, get, read_config_file, session_config, set_key
+from compensator.service.session import (
+    ALIVE,
+    alive_services,
+    client_config,
+    files_of,
+    get,
+    local_endpoints,
+    read_config_file,
+    set_key,
+    try_once,
+)
 
 
 class NotReached(ServiceError):
@@ -49,7 +57,7 @@ def operator_of_file(path: Path) -> Operator:
         raise ConfigError(f"{path}: connect/endpoints: missing, expected the router, such as tls/HOST:7447")
     set_key(config, "mode", "client")
     set_key(config, "scouting/multicast/enabled", False)
-    _one_attempt(config)
+    try_once(config)
     if not tls:
         return Operator(config, _user())
     files = files_of(path, tls, "connect")
@@ -78,18 +86,8 @@ def operator_here(settings: Zenoh) -> Operator | None:
             "--zenoh: missing; over TLS commands need an operator's certificate, expected a Zenoh "
             "configuration such as operator.json5"
         )
-    listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
-    endpoints = [endpoint for endpoint in listened if not endpoint.endswith(":0")] + settings.connect
-    if not endpoints:
-        return None
-    config = session_config(msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints))
-    _one_attempt(config)
-    return Operator(config, _user())
-
-
-def _one_attempt(config: zenoh.Config) -> None:
-    set_key(config, "connect/timeout_ms", 0)  # a running service answers at once
-    set_key(config, "connect/exit_on_failure", True)
+    endpoints = [*local_endpoints(settings), *settings.connect]
+    return Operator(client_config(settings, endpoints), _user()) if endpoints else None
 
 
 def _user() -> str:
@@ -142,9 +140,9 @@ def ask(
                 if answer.ok is not None:
                     reply: dict[str, Any] = json.loads(answer.ok.payload.to_bytes())
                     return reply
-            own = f"{settings.prefix}/thermal/alive"
             # An operator who may see this machine only must ask for it alone.
-            alive = [*alive_at(own, session, timeout_s), *alive_at("**/thermal/alive", session, timeout_s)]
+            own = alive_services(session, timeout_s, f"{settings.prefix}/{ALIVE}")
+            alive = {*own, *alive_services(session, timeout_s)}
     except (zenoh.ZError, ValueError) as error:
         raise NotReached(f"{unreached}: nothing answers at {where}; does the service, or its router, run?") from error
     if settings.prefix in alive:
@@ -154,12 +152,3 @@ def ask(
         )
     there = f"alive there: {', '.join(sorted(alive))}" if alive else "none is alive there"
     raise NotReached(f"{unreached}: none of that prefix at {where}; {there}")
-
-
-def alive_at(key: str, session: zenoh.Session, timeout_s: float) -> list[str]:
-    """Return the prefixes of the services that are alive, as far as the session may see them.
-
-    `key` is that of their tokens, such as `**/thermal/alive` for all.
-    """
-    replies = session.liveliness().get(key, timeout=timeout_s)
-    return sorted({str(reply.ok.key_expr).removesuffix("/thermal/alive") for reply in replies if reply.ok is not None})

@@ -12,6 +12,7 @@ import math
 import msgspec
 
 from compensator.arrays import NAN
+from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind, Note, ZeroData
@@ -19,7 +20,6 @@ from compensator.messages import Offset, Sample, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Reason, SampleQuality, State
 from compensator.service.decision import Decision, OffsetDecision, mean
 from compensator.service.outcome import Outcome, Values, estimate_message
 from compensator.service.plausibility import (

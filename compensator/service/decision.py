@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from compensator.arrays import NAN
+from compensator.codes import Reason, State
 from compensator.config import Config, Limits
 from compensator.messages import SCHEMA, Offset
 from compensator.model.engine import Estimate
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Reason, State
 from compensator.service.outcome import Values
 from compensator.service.plausibility import PlausibilityCheck
 from compensator.service.state import Memory

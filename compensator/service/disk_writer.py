@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from compensator.codes import Reason
 from compensator.messages import Event, Offset, degraded, encode
-from compensator.reasons import Reason
 from compensator.recording.naming import day_of
 from compensator.service.event_log import WAITING_EVENTS
 

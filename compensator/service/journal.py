@@ -10,10 +10,9 @@ import asyncio
 import logging
 
 from compensator.clock import Clock
+from compensator.codes import Reason, Remark, ServiceWarning
 from compensator.events import EventKind, RecordingCode, RecordingData
 from compensator.messages import Offset, degraded
-from compensator.reasons import Reason, Remark
-from compensator.remarks import ServiceWarning
 from compensator.service.disk_writer import DiskWriter, Entry
 from compensator.service.event_log import EventLog
 from compensator.service.offset_checkpoint import OffsetCheckpoint

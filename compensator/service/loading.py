@@ -12,13 +12,12 @@ from typing import Any
 
 import drivers
 from compensator.certificates import Certificate, check_files, remarks
+from compensator.codes import Remark, ServiceWarning
 from compensator.config import Config, LoadedConfig, Zenoh, load_config
 from compensator.errors import CompensatorError, ConfigError, ModelError
 from compensator.model.model_file import read_model_bytes
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Remark
 from compensator.recording.signature import Signer
-from compensator.remarks import ServiceWarning
 from compensator.service.compensation import model_of
 from compensator.service.session import tls_files
 from compensator.service.transfer.model_store import ModelStore, check_model

@@ -17,9 +17,8 @@ from pathlib import Path
 import msgspec
 
 from compensator.atomic_write import replace_file
+from compensator.codes import Remark, ServiceWarning
 from compensator.messages import Offset, number
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 
 log = logging.getLogger("compensator")
 

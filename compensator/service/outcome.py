@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from compensator.arrays import NAN
+from compensator.codes import SampleQuality
 from compensator.events import Note
 from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, number
 from compensator.model.engine import Estimate, Reference
-from compensator.reasons import SampleQuality
 from compensator.service.state import ZeroState
 
 

@@ -17,14 +17,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-import msgspec
 import zenoh
 
+from compensator.codes import Remark, ServiceWarning
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
-from compensator.service.session import session_config, set_key
+from compensator.service.session import ALIVE, client_config, tokens
 
 log = logging.getLogger("compensator")
 
@@ -136,25 +134,18 @@ def _reached(settings: Zenoh) -> zenoh.Session:
     end = time.monotonic() + REACHED_S
     while True:
         try:
-            return zenoh.open(_client_config(settings))
+            return zenoh.open(client_config(settings, settings.connect))
         except zenoh.ZError:
             if settings.mode == "client" or time.monotonic() > end:
                 raise
             time.sleep(REACHED_S / 5.0)
 
 
-def _client_config(settings: Zenoh) -> zenoh.Config:
-    config = session_config(msgspec.structs.replace(settings, mode="client", listen=[]))
-    set_key(config, "connect/timeout_ms", 0)  # one attempt
-    set_key(config, "connect/exit_on_failure", True)
-    return config
-
-
 def _claim(session: zenoh.Session, prefix: str) -> zenoh.LivelinessToken:
     """Return the token of a starting service, if none is alive and no other was first."""
-    key = f"{prefix}/thermal/alive"
+    key = f"{prefix}/{ALIVE}"
     end = time.monotonic() + STALE_S
-    while _tokens(session, key):
+    while tokens(session, key, ANSWER_S):
         if time.monotonic() > end:
             raise ServiceError(f"{key}: another service is alive there and continues; this one ends")
         time.sleep(0.5)
@@ -162,13 +153,8 @@ def _claim(session: zenoh.Session, prefix: str) -> zenoh.LivelinessToken:
     own = f"{others}/{time.time_ns():020d}-{secrets.token_hex(8)}"
     candidate = session.liveliness().declare_token(own)
     time.sleep(SHOWN_S)
-    first = min([own, *_tokens(session, f"{others}/*")])
-    if first != own or _tokens(session, key):
+    first = min([own, *tokens(session, f"{others}/*", ANSWER_S)])
+    if first != own or tokens(session, key, ANSWER_S):
         candidate.undeclare()  # type: ignore[no-untyped-call]
         raise ServiceError(f"{key}: another service started at the same moment and continues; this one ends")
     return candidate
-
-
-def _tokens(session: zenoh.Session, key: str) -> list[str]:
-    replies = session.liveliness().get(key, timeout=ANSWER_S)
-    return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]

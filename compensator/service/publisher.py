@@ -17,18 +17,15 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import zenoh
 
+from compensator.codes import Remark, ServiceWarning
 from compensator.config import Zenoh
 from compensator.errors import ServiceError
 from compensator.events import CommandName
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 from compensator.service.presence import sole_publisher
-from compensator.service.session import in_words, log_links, session_config
+from compensator.service.session import ALIVE, RETRY_S, error_text, log_links, session_config
 
 log = logging.getLogger("compensator")
 
-#: How long a client waits before it retries its router, s.
-RETRY_S = 1.0
 #: Commands of the service, each a query on `thermal/command/<name>/<sender>` or `thermal/command/<name>`.
 COMMANDS = tuple(CommandName)
 #: Characters of a sender's name, which is a chunk of a key.
@@ -125,7 +122,7 @@ class Publisher:
             self._begin()
         except zenoh.ZError as error:
             endpoints = ", ".join(self._settings.listen + self._settings.connect) or "no endpoints"
-            words = f"zenoh: {in_words(error)} ({self._settings.mode}, {endpoints})"
+            words = f"zenoh: {error_text(error)} ({self._settings.mode}, {endpoints})"
             if self._settings.mode != "client":
                 raise ServiceError(words) from error
             figures = f"{words.rstrip('.')}; it is tried again."
@@ -139,9 +136,7 @@ class Publisher:
             with sole_publisher(self._settings):
                 session = zenoh.open(session_config(self._settings))
                 unfinished.callback(session.close)
-                declared: list[_Declared] = [
-                    session.liveliness().declare_token(f"{self._settings.prefix}/thermal/alive")
-                ]
+                declared: list[_Declared] = [session.liveliness().declare_token(f"{self._settings.prefix}/{ALIVE}")]
             publishers = {name: self._publisher(session, name) for name in _KEYS}
             for name in ("offset", "status", "sample", "estimate"):
                 declared.append(session.declare_queryable(self.key(name), self._answer_latest(name)))

@@ -30,7 +30,7 @@ from compensator.events import CommandName, EventKind, PauseData, command_of, da
 from compensator.messages import EstimateMessage, Event, Offset, Sample
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.container import Container, Contents, Damaged
-from compensator.recording.reading import Record, decode_with, groups_of
+from compensator.recording.reading import RawRecord, decode_with, groups_of
 from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.state import ZeroMode
 
@@ -48,7 +48,7 @@ class RecordedStep:
         Name of the file.
     run : dict of str to str
         Metadata of the file.
-    records : dict of str to Record
+    records : dict of str to RawRecord
         `sample`, `estimate` and `offset`, as far as they are there; a torn end lacks some.
     events : list of Event
         Events. Those of smaller numbers were held back by a full disk and are in the state of the file already.
@@ -58,7 +58,7 @@ class RecordedStep:
 
     file: str
     run: dict[str, str]
-    records: dict[str, Record]
+    records: dict[str, RawRecord]
     events: list[Event]
     sample: Sample | None
 
@@ -84,7 +84,7 @@ class RecordedStep:
         return None if estimate is None else "rest" if estimate.y_base_um == 0.0 else "warm"
 
 
-def step_of(records: Sequence[Record], contents: Contents, file: str) -> RecordedStep:
+def step_of(records: Sequence[RawRecord], contents: Contents, file: str) -> RecordedStep:
     """Read one group of records.
 
     Raises

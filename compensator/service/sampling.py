@@ -16,10 +16,10 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.clock import NS, Clock
+from compensator.codes import SampleQuality
 from compensator.config import Config
 from compensator.events import EventKind
 from compensator.messages import ChannelSample
-from compensator.reasons import SampleQuality
 from drivers.errors import DriverError
 from drivers.reading import Device, Quality, Reading
 

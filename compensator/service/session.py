@@ -9,18 +9,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import zenoh
 
 from compensator.certificates import TlsFiles
+from compensator.codes import Remark, ServiceWarning
 from compensator.config import Zenoh
 from compensator.errors import ConfigError
-from compensator.reasons import Remark
-from compensator.remarks import ServiceWarning
 
 log = logging.getLogger("compensator")
 
 #: Participants that a router admits at one time.
 PENDING = 1000
+#: Time between two attempts to open a session, s.
+RETRY_S = 1.0
+#: Liveliness token of a service, below its prefix.
+ALIVE = "thermal/alive"
 
 
 def set_key(config: zenoh.Config, key: str, value: object) -> None:
@@ -36,7 +40,7 @@ def get(config: zenoh.Config, key: str) -> Any:
         return None
 
 
-def in_words(error: zenoh.ZError) -> str:
+def error_text(error: zenoh.ZError) -> str:
     """Return the text of an error without the place in Zenoh's source."""
     return re.sub(r"\s+", " ", re.sub(r" at /\S+\.rs:\d+\.", "", str(error))).strip()
 
@@ -67,6 +71,42 @@ def session_config(settings: Zenoh) -> zenoh.Config:
         set_key(config, "transport/link/tls/connect_private_key", settings.tls_key)
         set_key(config, "transport/link/protocols", ["tls", "quic"])
     return config
+
+
+def client_config(settings: Zenoh, endpoints: Sequence[str]) -> zenoh.Config:
+    """Make the configuration of a client of a service, which tries the endpoints once."""
+    config = session_config(msgspec.structs.replace(settings, mode="client", listen=[], connect=list(endpoints)))
+    try_once(config)
+    return config
+
+
+def try_once(config: zenoh.Config) -> None:
+    """Let opening a session fail at once where nothing answers: a running service or router answers at once."""
+    set_key(config, "connect/timeout_ms", 0)
+    set_key(config, "connect/exit_on_failure", True)
+
+
+def local_endpoints(settings: Zenoh) -> list[str]:
+    """Return where a service listens, as reached from its own computer; ports that the system chose are left out.
+
+    Examples
+    --------
+    >>> local_endpoints(Zenoh(prefix="shop/vmc-07", listen=["tcp/0.0.0.0:7448", "tcp/127.0.0.1:0"]))
+    ['tcp/127.0.0.1:7448']
+    """
+    listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
+    return [endpoint for endpoint in listened if not endpoint.endswith(":0")]
+
+
+def tokens(session: zenoh.Session, key: str, timeout_s: float) -> list[str]:
+    """Return the keys of the liveliness tokens that a key expression matches, as far as the session may see them."""
+    replies = session.liveliness().get(key, timeout=timeout_s)
+    return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+
+
+def alive_services(session: zenoh.Session, timeout_s: float, key: str = f"**/{ALIVE}") -> list[str]:
+    """Return the prefixes of the services that are alive, of all of them or of those whose token is `key`."""
+    return [token.removesuffix(f"/{ALIVE}") for token in tokens(session, key, timeout_s)]
 
 
 def enlarge_queues(config: zenoh.Config) -> None:
@@ -120,7 +160,7 @@ def read_config_file(path: Path) -> ConfigFile:
     try:
         config = zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:
-        raise ConfigError(f"{path}: {in_words(error)}") from error
+        raise ConfigError(f"{path}: {error_text(error)}") from error
     tls = {}
     for name in _FILES:
         value = get(config, f"{_TLS}/{name}")

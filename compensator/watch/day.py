@@ -39,7 +39,7 @@ def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = Fal
     Parameters
     ----------
     history : mapping of str to sequence
-        Columns as of `History`.
+        Columns as of `MachineHistory`.
     width : int
         Available width, characters.
     short : bool

@@ -22,7 +22,7 @@ _OFFSET = ("y_offset_um", "y_offset_std_um", "state")
 COLUMNS = (*_OFFSET, "reasons", *_ESTIMATE, "t_q_degc", "at_degc")
 
 
-class Spell(NamedTuple):
+class StateInterval(NamedTuple):
     """An interval in one state with the same reasons.
 
     Parameters
@@ -41,7 +41,7 @@ class Spell(NamedTuple):
     reasons: str
 
 
-class History:
+class MachineHistory:
     """Points of the last day; messages may arrive in any order.
 
     The newest sample of a minute is its point. The values of one sample come in several messages with the same number.
@@ -123,23 +123,23 @@ class History:
         return found
 
 
-def spells(history: Mapping[str, Sequence[Any]], valid_for_s: float | None) -> list[Spell]:
+def state_intervals(history: Mapping[str, Sequence[Any]], valid_for_s: float | None) -> list[StateInterval]:
     """Return the intervals of a history, the newest first.
 
     Parameters
     ----------
     history : mapping of str to sequence
-        Columns as of `History`.
+        Columns as of `MachineHistory`.
     valid_for_s : float, optional
         Validity of an offset, s: a longer pause separates two intervals.
 
     Examples
     --------
     >>> day = {"t_s": [0.0, 60.0, 120.0], "state": ["ok", "ok", "hold"], "reasons": ["", "", "operator_hold"]}
-    >>> [(spell.state, spell.end_s - spell.begin_s) for spell in spells(day, 150.0)]
+    >>> [(interval.state, interval.end_s - interval.begin_s) for interval in state_intervals(day, 150.0)]
     [('hold', 60.0), ('ok', 120.0)]
     """
-    found: list[Spell] = []
+    found: list[StateInterval] = []
     step_s = STEP_NS / NS
     pause_s = max(LEAST_PAUSE_S, valid_for_s or 0.0)
     columns = (history.get(name, ()) for name in ("t_s", "state", "reasons"))
@@ -150,7 +150,7 @@ def spells(history: Mapping[str, Sequence[Any]], valid_for_s: float | None) -> l
         if last is not None and last[2:] == (state, reasons or "") and t - last.end_s + step_s < pause_s:
             found[-1] = last._replace(end_s=t + step_s)
         else:
-            found.append(Spell(t, t + step_s, state, reasons or ""))
+            found.append(StateInterval(t, t + step_s, state, reasons or ""))
     return found[::-1]
 
 

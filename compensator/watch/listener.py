@@ -13,16 +13,20 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import msgspec
 import zenoh
 
 from compensator.config import Zenoh
 from compensator.errors import ServiceError, UsageError
-from compensator.service.command_client import alive_at, operator_of_file
-from compensator.service.session import get, in_words, session_config, set_key
+from compensator.service.command_client import operator_of_file
+from compensator.service.session import (
+    RETRY_S,
+    alive_services,
+    client_config,
+    error_text,
+    get,
+    local_endpoints,
+)
 
-#: Time between two attempts to connect, s.
-RETRY_S = 1.0
 #: Largest number of messages that wait to be processed.
 WAITING = 65_536
 #: Longest wait for the answers to a query, s.
@@ -30,7 +34,7 @@ ANSWER_S = 3.0
 
 
 class Sink(Protocol):
-    """Receives what the listener hears; called on Zenoh's threads."""
+    """Receives messages and liveliness; called on Zenoh's threads."""
 
     def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
         """Receive a message, or the answer to a query."""
@@ -49,7 +53,7 @@ class Source(NamedTuple):
     where : str
         Endpoints, as text.
     config : callable
-        Returns the configuration of a Zenoh client.
+        Returns the configuration of a Zenoh client that tries its endpoints once.
     """
 
     prefix: str
@@ -59,12 +63,6 @@ class Source(NamedTuple):
 
 #: Keys that are queried: services answer them with the latest message.
 ASKED = ("y/offset", "status", "sample", "estimate")
-
-
-def endpoints_of(settings: Zenoh) -> list[str]:
-    """Return the endpoints of the service of a configuration: its routers first, then its own."""
-    listened = [re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", endpoint) for endpoint in settings.listen]
-    return [*settings.connect, *(endpoint for endpoint in listened if not endpoint.endswith(":0"))]
 
 
 def below(prefix: str, rest: str) -> str:
@@ -97,7 +95,7 @@ class Listener:
         self._on_connection = on_connection
         self._session: Any = None
         self._thread: threading.Thread | None = None
-        self._hearing: threading.Thread | None = None
+        self._receiving: threading.Thread | None = None
         self._stop = threading.Event()
         self._wanted = threading.Event()
 
@@ -109,19 +107,16 @@ class Listener:
         ServiceError
             If there is no answer, or an endpoint cannot be used.
         """
-        config = self._source.config()
-        set_key(config, "connect/timeout_ms", 0)
-        set_key(config, "connect/exit_on_failure", True)
         try:
-            session = self._session = zenoh.open(config)
+            session = self._session = zenoh.open(self._source.config())
         except zenoh.ZError as error:
-            raise ServiceError(f"zenoh: no answer at {self._source.where}: {in_words(error)}") from error
+            raise ServiceError(f"zenoh: no answer at {self._source.where}: {error_text(error)}") from error
         prefix = self._source.prefix
         # Zenoh's own threads fill the channel without waiting for Python: if they had to wait, the router would drop
         # messages when a whole shop publishes at one instant.
         subscriber = session.declare_subscriber(below(prefix, "**"), zenoh.handlers.FifoChannel(WAITING))
-        self._hearing = threading.Thread(target=self._hear, args=(subscriber,), name="watch receives")
-        self._hearing.start()
+        self._receiving = threading.Thread(target=self._forward_all, args=(subscriber,), name="watch receives")
+        self._receiving.start()
         session.liveliness().declare_subscriber(below(prefix, "alive"), self._token, history=True)
         session.info.declare_transport_events_listener(self._transport, history=False)
         self._on_connection(True)
@@ -147,14 +142,14 @@ class Listener:
         for answers in asked:
             for answer in answers:
                 if answer.ok is not None:
-                    self._heard(answer.ok, asked=True)
+                    self._forward(answer.ok, asked=True)
         for answer in alive:
             if answer.ok is not None:
                 self._token(answer.ok)
 
     def elsewhere(self) -> list[str]:
         """Return the prefixes of all services that are alive, subscribed or not."""
-        return alive_at("**/thermal/alive", self._session, ANSWER_S) if self._session is not None else []
+        return alive_services(self._session, ANSWER_S) if self._session is not None else []
 
     def start(self) -> None:
         """Connect in the background, with retries, and query after each new connection."""
@@ -171,8 +166,8 @@ class Listener:
         session, self._session = self._session, None
         if session is not None:
             session.close()
-        if self._hearing is not None:
-            self._hearing.join()
+        if self._receiving is not None:
+            self._receiving.join()
 
     def __enter__(self) -> Listener:
         return self
@@ -182,11 +177,11 @@ class Listener:
 
     # ------------------------------------------------------------------ on other threads
 
-    def _hear(self, subscriber: Any) -> None:
+    def _forward_all(self, subscriber: Any) -> None:
         """Forward messages until the session is closed."""
         with suppress(zenoh.ZError):
             for sample in subscriber:
-                self._heard(sample)
+                self._forward(sample)
 
     def _keep_connected(self) -> None:
         while not self._stop.is_set():
@@ -210,7 +205,7 @@ class Listener:
         if came:
             self._wanted.set()
 
-    def _heard(self, sample: Any, asked: bool = False) -> None:
+    def _forward(self, sample: Any, asked: bool = False) -> None:
         key = str(sample.key_expr)
         if sample.kind != zenoh.SampleKind.PUT or key.endswith("/alive"):
             return
@@ -254,11 +249,10 @@ def of_settings(settings: Zenoh) -> Source:
             "--zenoh: missing; TLS needs a receiver's or operator's certificate, expected a Zenoh configuration such "
             "as receiver.json5"
         )
-    endpoints = endpoints_of(settings)
+    endpoints = [*settings.connect, *local_endpoints(settings)]
     if not endpoints:
         raise UsageError("zenoh: expected an endpoint in listen or connect")
-    client = msgspec.structs.replace(settings, mode="client", listen=[], connect=endpoints)
-    return Source(settings.prefix, ", ".join(endpoints), lambda: session_config(client))
+    return Source(settings.prefix, ", ".join(endpoints), lambda: client_config(settings, endpoints))
 
 
 def of_file(path: Path, prefix: str) -> Source:

@@ -130,7 +130,7 @@ async function showOne(prefix, count) {
   pictures(machine, past.history, found.now_s);
   list("reasons", machine.reasons.map((reason) => [wordLink(reason.code), `: ${reason.means} `, make("b", {}, "Action: "), reason.do]), "warning");
   list("warnings", machine.warnings.map((text, i) => [text, " ", wordLink(machine.warning_codes[i])]), "warning");
-  faulty(machine); now(machine); events(machine.events); spells(found.spells); channels(machine); points(past.history);
+  faulty(machine); now(machine); events(machine.events); intervals(found.intervals); channels(machine); points(past.history);
 }
 
 function joined(before, news, now_s) {
@@ -202,9 +202,9 @@ function events(found) {
   $("events").replaceChildren(lines.length ? make("ul", {}, ...lines) : make("p", {}, "None."));
 }
 
-function spells(found) {
+function intervals(found) {
   const when = (t) => `${day(t) === day(Date.now() / 1000) ? "" : `${day(t).slice(5)} `}${clock(t)}`;
-  fill($("spells"), found.map((one) =>
+  fill($("intervals"), found.map((one) =>
     [when(one.begin_s), `${SIGNS[TONES[one.state] ?? "bad"]} ${one.state}`, age(one.end_s - one.begin_s), one.reasons]));
 }
 

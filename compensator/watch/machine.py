@@ -8,13 +8,12 @@ from typing import Any
 import msgspec
 
 from compensator.clock import NS
+from compensator.codes import Reason, Remark, State, WatchWarning
 from compensator.events import EventKind
 from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
-from compensator.reasons import Reason, Remark, State
-from compensator.remarks import WatchWarning
-from compensator.watch.history import History, usable
+from compensator.watch.history import MachineHistory, usable
 from compensator.watch.sequence import Sequence
-from compensator.watch.words import TONES, Tone, Words, age, in_words, to_do
+from compensator.watch.words import TONES, ExplainedCode, Tone, age, explained, to_do
 
 #: Kinds of messages by the part of their key after `thermal/`.
 KINDS = {"y/offset": "offset", "sample": "sample", "estimate": "estimate", "status": "status", "event": "event"}
@@ -61,7 +60,7 @@ def decoded(kind: str, payload: bytes) -> Any:
     return message
 
 
-class Machine:
+class WatchedMachine:
     """One machine.
 
     Parameters
@@ -76,7 +75,7 @@ class Machine:
         #: Whether its liveliness token exists; None if unknown.
         self.alive: bool | None = None
         self.numbers = Sequence()
-        self.history = History()
+        self.history = MachineHistory()
         self.events: deque[Event] = deque(maxlen=EVENTS)
         self.malformed = 0
         self.last_malformed = ""
@@ -252,15 +251,15 @@ class Machine:
         offset, status = self._offset, self._status
         shown = self.shown(now_ns, monotonic_s)
         old_s = self.age_s(now_ns, monotonic_s)
-        reasons = [in_words(code) for code in offset.reasons] if offset else []
+        reasons = [explained(code) for code in offset.reasons] if offset else []
         warnings = self.warnings(now_ns, monotonic_s)
         found: dict[str, Any] = {
             "prefix": self.prefix,
             "machine": self.name,
             "shown": shown,
             "tone": _tone(shown, warnings),
-            "means": in_words(shown).means,
-            "do": in_words(shown).do,
+            "means": explained(shown).means,
+            "do": explained(shown).do,
             "alive": self.alive,
             "reasons": [words._asdict() for words in reasons],
             "to_do": _to_do(shown, reasons, warnings),
@@ -310,7 +309,7 @@ class Machine:
             return {"t_q_degc": None, "at_degc": None, "period_s": None, "channels": {}}
         channels: dict[str, Any] = {}
         for name, channel in sample.channels.items():
-            _, means, do = in_words(channel.quality)
+            _, means, do = explained(channel.quality)
             values = {"mean": usable(sample, name), "quality": channel.quality, "errors": channel.errors}
             channels[name] = values | {"means": means, "do": do}
         temperatures = {name: usable(sample, name) for name in ("t_q_degc", "at_degc")}
@@ -330,9 +329,9 @@ def _tone(shown: str, warnings: list[Remark]) -> Tone:
     return "warn" if tone == "good" and codes & ATTENTION else tone
 
 
-def _to_do(shown: str, reasons: list[Words], warnings: list[Remark]) -> str:
+def _to_do(shown: str, reasons: list[ExplainedCode], warnings: list[Remark]) -> str:
     """Return the actions in one line; the last reasons of a silent machine are out of date and ignored."""
     asked = [words.do for words in reasons if shown not in (WatchWarning.SILENT, WatchWarning.UNKNOWN)]
     if not asked and not (warnings and shown == State.OK):
-        asked = [in_words(shown).do]
+        asked = [explained(shown).do]
     return " ".join(dict.fromkeys([*asked, *map(str, warnings)]))

@@ -21,15 +21,15 @@ from urllib.parse import parse_qs, urlsplit
 
 from compensator import __version__
 from compensator.clock import NS
+from compensator.codes import WORDS
 from compensator.errors import ServiceError
-from compensator.reasons import WORDS
-from compensator.watch.history import spells
+from compensator.watch.history import state_intervals
 from compensator.watch.shop import Shop, headline
 
 #: The only address to which the server is bound.
 HOST = "127.0.0.1"
 #: Largest number of intervals in one state on the page.
-SPELLS = 30
+INTERVALS = 30
 #: Values of a machine that the table of a shop does not need.
 _DETAILS = ("channels", "devices", "events", "shares")
 
@@ -89,8 +89,8 @@ class PageServer:
                 return None
             history = self._shop.history(prefix, int(float(since)) * NS)
             found = {"now_s": self._shop.now_ns() / NS, "status": self._status(), "machine": machine}
-            intervals = spells(self._shop.history(prefix), machine["valid_for_s"])[:SPELLS]
-            found["spells"] = [spell._asdict() for spell in intervals]
+            intervals = state_intervals(self._shop.history(prefix), machine["valid_for_s"])[:INTERVALS]
+            found["intervals"] = [interval._asdict() for interval in intervals]
             return _json(found | {"history": history, "effects": self._shop.effects(prefix)})
         return None
 

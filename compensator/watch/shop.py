@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from compensator.clock import NS, Clock
-from compensator.watch.machine import KINDS, Machine
+from compensator.watch.machine import KINDS, WatchedMachine
 from compensator.watch.words import TONES
 
 #: Largest number of machines; messages of others are only counted.
@@ -35,7 +35,7 @@ class Shop:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._machines: dict[str, Machine] = {}
+        self._machines: dict[str, WatchedMachine] = {}
         #: Number of messages with unknown keys, or of machines beyond `MACHINES`.
         self.ignored = 0
 
@@ -80,10 +80,10 @@ class Shop:
                 for message in messages:
                     machine.add_recorded(message)
 
-    def _machine(self, prefix: str) -> Machine | None:
+    def _machine(self, prefix: str) -> WatchedMachine | None:
         machine = self._machines.get(prefix)
         if machine is None and prefix and len(self._machines) < MACHINES:
-            machine = self._machines[prefix] = Machine(prefix)
+            machine = self._machines[prefix] = WatchedMachine(prefix)
         return machine
 
     # ------------------------------------------------------------------ views
@@ -107,7 +107,7 @@ class Shop:
             return machine.snapshot(now_ns, monotonic_s) if machine is not None else None
 
     def history(self, prefix: str, since_ns: int = 0) -> dict[str, list[Any]]:
-        """Return the last day of a machine; see `History.columns`."""
+        """Return the last day of a machine; see `MachineHistory.columns`."""
         with self._lock:
             machine = self._machines.get(prefix)
             return machine.history.columns(since_ns) if machine is not None else {}

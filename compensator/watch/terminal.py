@@ -12,11 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from compensator.clock import NS
-from compensator.reasons import SampleQuality, State
-from compensator.remarks import WatchWarning
+from compensator.codes import SampleQuality, State, WatchWarning
 from compensator.report.notation import plain, signed
 from compensator.watch.day import STYLES, drawn, evenly, sparkline
-from compensator.watch.history import Spell, spells
+from compensator.watch.history import StateInterval, state_intervals
 from compensator.watch.shop import Shop, headline
 from compensator.watch.words import SIGNS, age, here, zone
 
@@ -36,7 +35,7 @@ _COLUMNS = (
     ("reasons", 60),
 )
 #: Numbers of events and of intervals in one state shown for one machine.
-EVENTS, SPELLS = 6, 4
+EVENTS, INTERVALS = 6, 4
 #: Action for a machine in state ok that has warnings.
 BELOW = "See the warnings below."
 #: Height of a terminal from which on everything is drawn.
@@ -200,9 +199,8 @@ def detail(
     numbers = Table.grid(padding=(0, 2))
     for i in range(0, len(pairs), per_row):
         numbers.add_row(*(cell for name, value in pairs[i : i + per_row] for cell in (Text(name, style="dim"), value)))
-    past = [
-        _spell(spell, now_ns) for spell in spells(history, machine["valid_for_s"])[: SPELLS // 2 if short else SPELLS]
-    ]
+    intervals = state_intervals(history, machine["valid_for_s"])[: INTERVALS // 2 if short else INTERVALS]
+    past = [_interval_text(interval, now_ns) for interval in intervals]
     lists = [(title, lines) for title, lines in _lists(machine, past, here(now_ns)) if lines]
     urgent = [(title, lines) for title, lines in lists if title in URGENT]
     parts += [_titled(title, lines) for title, lines in urgent]
@@ -283,11 +281,11 @@ def _channel(name: str, channel: dict[str, Any]) -> str:
     return f"{name}: {channel['quality']}" + (f" ({errors})" if errors else "") + f": {channel['do']}"
 
 
-def _spell(spell: Spell, now_ns: int) -> str:
-    begin = here(round(spell.begin_s * NS))
+def _interval_text(interval: StateInterval, now_ns: int) -> str:
+    begin = here(round(interval.begin_s * NS))
     when = f"{begin:%H:%M}" if begin.date() == here(now_ns).date() else f"{begin:%m-%d %H:%M}"
-    text = f"{when} {spell.state} for {age(spell.end_s - spell.begin_s)}"
-    return f"{text}: {spell.reasons}" if spell.reasons else text
+    text = f"{when} {interval.state} for {age(interval.end_s - interval.begin_s)}"
+    return f"{text}: {interval.reasons}" if interval.reasons else text
 
 
 def _titled(title: str, lines: list[str]) -> RenderableType:

@@ -7,10 +7,9 @@ from datetime import UTC, datetime
 from typing import Literal, NamedTuple
 
 from compensator.clock import NS
+from compensator.codes import State, WatchWarning, explain
 from compensator.events import EventKind, RecordingData, data_of
 from compensator.messages import Event
-from compensator.reasons import State, explain
-from compensator.remarks import WatchWarning
 
 Tone = Literal["good", "warn", "bad"]
 
@@ -38,7 +37,7 @@ _DO: Mapping[str, str] = {
 }
 
 
-class Words(NamedTuple):
+class ExplainedCode(NamedTuple):
     """A code with its meaning and action."""
 
     code: str
@@ -46,22 +45,22 @@ class Words(NamedTuple):
     do: str
 
 
-def in_words(code: str) -> Words:
+def explained(code: str) -> ExplainedCode:
     """Return a state or reason with its meaning and action, also if it is unknown.
 
     Examples
     --------
-    >>> in_words("ok").do
+    >>> explained("ok").do
     'Nothing.'
     """
     found = explain(code)
     if found is None:
-        return Words(
+        return ExplainedCode(
             code,
             "Unknown code: the service may be newer than this program.",
             "Install the same version on both computers.",
         )
-    return Words(code, *found)
+    return ExplainedCode(code, *found)
 
 
 def to_do(event: Event) -> str:
@@ -72,7 +71,7 @@ def to_do(event: Event) -> str:
         state = str(event.data.get("state", ""))
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
-        return " ".join(dict.fromkeys(in_words(code).do for code in codes)) if state not in ("", State.OK) else ""
+        return " ".join(dict.fromkeys(explained(code).do for code in codes)) if state not in ("", State.OK) else ""
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
     if recording is not None and recording.is_resolved:
         return ""

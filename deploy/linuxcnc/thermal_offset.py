@@ -102,10 +102,10 @@ def run(component: Any, receiver: Receiver, reconciler: Reconciler, axis: Axis, 
         component["counts"] = reconciler.step(monotonic_s(), applied.offset_um, view)
         _show(component, receiver, applied, view, reconciler)
         words = " ".join(filter(None, (reconciler.trouble.replace("axis.L", axis.name), applied.steady_reasons)))
-        news = f"{applied.state}{': ' if words else ''}{words}"
-        if news != reported:
-            reported = news
-            report(news)
+        line = f"{applied.state}{': ' if words else ''}{words}"
+        if line != reported:
+            reported = line
+            report(line)
         time.sleep(PERIOD_S)
 
 

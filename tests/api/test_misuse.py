@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import compensator as tc
-from compensator.reasons import Remark, SampleQuality
+from compensator.codes import Remark, SampleQuality
 from tests.api.tables import frame, write_run
 from tests.identify.quill_runs import VALIDATION_W
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import shlex
 
-from compensator.reasons import WORDS
+from compensator.codes import WORDS
 from tests.deploy.conftest import ROOT
 
 GUIDE = ROOT / "deploy/README.md"
 OPERATING = ROOT / "deploy/OPERATING.md"
-_BEGIN = "<!-- states: made from compensator/reasons.py by `python -m tests.deploy.guide` -->\n"
+_BEGIN = "<!-- states: made from compensator/codes.py by `python -m tests.deploy.guide` -->\n"
 _END = "<!-- end of states -->"
 
 

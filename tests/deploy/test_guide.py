@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 
 from compensator.cli import COMMANDS, _parser
-from compensator.reasons import WORDS
+from compensator.codes import WORDS
 from tests.deploy.guide import GUIDE, LAST, OPERATING, commands, with_table
 from tests.deploy.test_install import load
 
@@ -58,7 +58,7 @@ def test_commands_in_the_text_exist() -> None:
 
 
 def test_states_and_reasons_are_those_of_the_service() -> None:
-    assert with_table(CODES) == CODES, "out of step with compensator/reasons.py: python -m tests.deploy.guide"
+    assert with_table(CODES) == CODES, "out of step with compensator/codes.py: python -m tests.deploy.guide"
     assert CODES.count("\n| `") > list(WORDS).index(LAST) > 30
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from compensator.reasons import WORDS as SERVICE_WORDS
+from compensator.codes import WORDS as SERVICE_WORDS
 from compensator.receiver import WORDS, ReceiverError, load_settings
 
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from compensator.cli import main
-from compensator.reasons import WORDS
+from compensator.codes import WORDS
 
 STYLE = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
 SCHEMES = [

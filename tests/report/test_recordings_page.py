@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from compensator.cli import main
-from compensator.reasons import explain
+from compensator.codes import explain
 from compensator.recording.reading import recordings
 from compensator.report.envelope import COLUMNS, Envelope, Stretches
 from compensator.report.gathering import read_history

@@ -16,7 +16,7 @@ from compensator.config import Zenoh
 from compensator.errors import ServiceError, UsageError
 from compensator.service.publisher import COMMANDS, Publisher, Sender
 from compensator.service.session import session_config
-from compensator.watch.listener import Listener, endpoints_of, of_endpoints, of_settings
+from compensator.watch.listener import Listener, of_endpoints, of_settings
 from compensator.watch.shop import Shop
 from tests.cli.test_adopt import free_port
 from tests.watch.heard import event, offset, sample, status
@@ -166,7 +166,7 @@ def test_nobody_there_is_one_line() -> None:
 
 def test_a_service_is_reached_where_its_configuration_says() -> None:
     settings = Zenoh(prefix="a", listen=["tcp/0.0.0.0:7447", "tcp/127.0.0.1:0"], connect=["tcp/10.0.0.1:7447"])
-    assert endpoints_of(settings) == ["tcp/10.0.0.1:7447", "tcp/127.0.0.1:7447"]
+    assert of_settings(settings).where == "tcp/10.0.0.1:7447, tcp/127.0.0.1:7447"
 
 
 def test_the_machines_own_certificate_is_not_what_a_reader_uses() -> None:

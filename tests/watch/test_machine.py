@@ -9,8 +9,8 @@ import pytest
 
 from compensator.clock import NS
 from compensator.messages import EstimateMessage, Event, Offset, Sample
-from compensator.watch.history import spells
-from compensator.watch.machine import Machine, decoded
+from compensator.watch.history import state_intervals
+from compensator.watch.machine import WatchedMachine, decoded
 from compensator.watch.shop import Shop
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
 
@@ -238,14 +238,14 @@ def test_machines_that_need_somebody_stand_first_and_strangers_are_counted(heard
 
 
 def test_effects_have_numbers_where_their_names_do_not_fit() -> None:
-    machine = Machine("shop/vmc-07")
+    machine = WatchedMachine("shop/vmc-07")
     machine.update("estimate", estimate(5, effects=(1.0, 2.0)), 0.0)
     machine.update("status", status(5), 0.0)
     assert machine.effects() == ["effect 1", "effect 2"]
 
 
 def test_the_day_is_one_point_a_minute_with_values_of_one_sample() -> None:
-    machine = Machine("shop/vmc-07")
+    machine = WatchedMachine("shop/vmc-07")
     for i in range(0, 3600, 10):  # an hour at ten seconds
         t = START_NS + i * NS
         machine.update("offset", offset(i, t, y_offset_um=float(i)), i)
@@ -263,7 +263,7 @@ def test_the_day_is_one_point_a_minute_with_values_of_one_sample() -> None:
 
 
 def test_the_past_of_a_recording_says_nothing_of_now() -> None:
-    machine = Machine("shop/vmc-07")
+    machine = WatchedMachine("shop/vmc-07")
     for kind, payload in (
         ("offset", offset(3)),
         ("sample", sample(3)),
@@ -284,5 +284,6 @@ def test_the_past_of_a_recording_says_nothing_of_now() -> None:
 
 def test_samples_of_a_slow_model_are_one_interval() -> None:
     day = {"t_s": [0.0, 300.0, 600.0, 2000.0], "state": ["ok"] * 4, "reasons": [""] * 4}
-    assert [(spell.begin_s, spell.end_s) for spell in spells(day, 750.0)] == [(2000.0, 2060.0), (0.0, 660.0)]
-    assert len(spells(day, 150.0)) == 4
+    intervals = [(interval.begin_s, interval.end_s) for interval in state_intervals(day, 750.0)]
+    assert intervals == [(2000.0, 2060.0), (0.0, 660.0)]
+    assert len(state_intervals(day, 150.0)) == 4

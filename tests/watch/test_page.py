@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from compensator.clock import NS
+from compensator.codes import WORDS
 from compensator.errors import ServiceError
-from compensator.reasons import WORDS
 from compensator.watch.server import PageServer
 from compensator.watch.shop import Shop
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status

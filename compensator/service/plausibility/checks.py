@@ -27,10 +27,10 @@ from typing import Any
 import msgspec
 
 from compensator.arrays import NAN
+from compensator.codes import Reason
 from compensator.config import Config, Plausibility
 from compensator.events import EventKind, Implausibility, Note
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Reason
 from compensator.service.plausibility.isolation import LOG_ODDS, FaultFit, FaultIsolation, ResidualBlock
 
 #: Samples in a block of the residual: single minutes after a heat step are no evidence against a sensor.

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 
 import msgspec
 
+from compensator.codes import SampleQuality
 from compensator.config import Channel, Guards
 from compensator.messages import ChannelSample, number
-from compensator.reasons import SampleQuality
 
 #: Estimated heat, W, above which the machine counts as heated where heat is not measured.
 HEATED_W = 10.0

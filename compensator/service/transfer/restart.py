@@ -12,12 +12,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from compensator.codes import Reason
 from compensator.config import LoadedConfig
 from compensator.errors import CompensatorError, DataError
 from compensator.events import CommandName, EventKind, Note, command_of
 from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
-from compensator.reasons import Reason
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.offset_checkpoint import CheckpointedOffset
