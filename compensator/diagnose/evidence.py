@@ -17,8 +17,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from compensator.arrays import Mask, Matrix, Vector
-from compensator.data.runs import Run, noise_std
+from compensator.data.runs import Run, noise_of, noise_std
 from compensator.diagnose.noise import NoiseTest, drive_of, noise_floor, own_error
+from compensator.diagnose.smoothing import course
 from compensator.errors import DataError
 from compensator.identify.output_error import low_frequency_ratio
 from compensator.model.effects.hypothesis import Context
@@ -29,6 +30,8 @@ from compensator.model.transfer_function import SampledTransferFunction
 
 #: An initial state moves y by no more than about this many times its spread, with the weight of one sample.
 STATE_PRIOR = 1e-3
+#: Least noise of Y: a reading has digits.
+LEAST_NOISE_UM = 1e-3
 #: A displacement is an effect, never a cause: another probe follows Y whatever moves it.
 _DISPLACEMENT = "_um"
 #: A channel whose span is less than this many of its noise deviations does not move.
@@ -57,6 +60,8 @@ class Evidence:
         What proposals may build on.
     noise : NoiseTest
         What noise and the base model's own error may leave of the samples used.
+    probe_um : float
+        White noise of the measured deformation, µm.
     """
 
     runs: tuple[Run, ...]
@@ -67,6 +72,7 @@ class Evidence:
     basis: Matrix
     context: Context
     noise: NoiseTest
+    probe_um: float
 
     @property
     def count(self) -> int:
@@ -164,6 +170,13 @@ def effects_of(model: ThermalModel, run: Run) -> Vector:
     return np.array([sum(e.y_effects_um) for e in engine.run(run.t_q_degc, run.at_degc, run.channels)])
 
 
+def _without_noise(run: Run) -> Run:
+    """Return a run with the courses of T_Q and AT in place of their readings."""
+    t_q, at = run.difference_k + run.ambient_k, run.ambient_k
+    t_q, at = course(t_q, noise_std(t_q)), course(at, noise_std(at))
+    return dataclasses.replace(run, difference_k=t_q - at, ambient_k=at)
+
+
 def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     """Form the residual of a model over runs.
 
@@ -179,6 +192,8 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     DataError
         If there is no y in it.
     """
+    noise_um, probe_um = noise_floor(model, runs), noise_of(runs)["y_um"]
+    runs = [_without_noise(run) for run in runs]
     signals = [signals_of(model, run, number) for number, run in enumerate(runs)]
     parts = [
         run.y_um - own.y_dtf_um - own.y_tdtf_um - effects_of(model, run) for run, own in zip(runs, signals, strict=True)
@@ -188,7 +203,6 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     if used.sum() < 60:
         names = ", ".join(dict.fromkeys(run.name for run in runs))
         raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
-    noise_um = noise_floor(model, runs)
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)
     nuisances = np.asarray(block_diag(*(_nuisances(record, context) for record in signals)))
@@ -201,6 +215,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         basis=_basis(nuisances, used),
         context=context,
         noise=NoiseTest(count=int(used.sum()), noise_um=noise_um, own_error_um=own_error(model, noise_um, spread_um)),
+        probe_um=max(probe_um, LEAST_NOISE_UM),
     )
 
 

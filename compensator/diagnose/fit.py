@@ -1,17 +1,20 @@
-"""Several effects fitted together: free parameters searched, amplitudes projected."""
+"""Several effects fitted together: free parameters searched, amplitudes integrated out."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import least_squares
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
+from compensator.diagnose.likelihood import Likelihood, Rest
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis
 
@@ -63,20 +66,39 @@ class Fit:
     ----------
     terms : tuple of Term
         Effects with their values.
-    residual : numpy.ndarray, shape (n,)
-        What is left, nuisances projected out; 0 where samples are not used.
-    cost : float
-        Its sum of squares, µm².
+    likelihood : Likelihood
+        The data and the rest that they were fitted with.
+    log_evidence : float
+        Logarithm of the probability of the data, parameters and amplitudes integrated out.
+    columns : numpy.ndarray, shape (points, ·)
+        Averaged columns of all amplitudes, of size 1.
+    fixed : numpy.ndarray, shape (points,)
+        What effects without an amplitude add, µm.
+    added : numpy.ndarray, shape (points,)
+        What all effects add, µm.
     """
 
     terms: tuple[Term, ...]
-    residual: Vector
-    cost: float
+    likelihood: Likelihood
+    log_evidence: float
+    columns: Matrix
+    fixed: Vector
+    added: Vector
 
     @property
-    def parameters(self) -> int:
-        """Number of parameters of all effects."""
-        return sum(term.hypothesis.parameters for term in self.terms)
+    def rest(self) -> Rest:
+        """What no effect explains."""
+        return self.likelihood.rest
+
+    @property
+    def places(self) -> frozenset[tuple[str, str, str]]:
+        """Kind, path and channel of each effect."""
+        return frozenset(term.hypothesis.place for term in self.terms)
+
+    @property
+    def size_um(self) -> float:
+        """Standard deviation of what all effects add, µm."""
+        return float(np.std(self.added[self.likelihood.points.used]))
 
     def starts(self, without: int | None = None) -> list[Start]:
         """Return where another fit begins, with all terms or all but one."""
@@ -85,7 +107,7 @@ class Fit:
 
 def response(evidence: Evidence, term: Term) -> Vector:
     """Return what an effect adds to y on every sample, µm, also on those that are not used."""
-    columns = np.concatenate([term.hypothesis.columns(record, term.values) for record in evidence.signals])
+    columns = raw_columns(evidence, term.hypothesis, term.values)
     return np.asarray(columns @ np.array(term.amplitudes) if term.amplitudes else columns[:, 0])
 
 
@@ -94,55 +116,132 @@ def summed(evidence: Evidence, terms: Sequence[Term]) -> Vector:
     return np.asarray(sum((response(evidence, term) for term in terms), np.zeros(evidence.used.size)))
 
 
-def columns_of(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> tuple[Matrix, Vector | None]:
-    """Return columns and fixed part on the samples used, nuisances projected out."""
-    columns = np.concatenate([hypothesis.columns(record, values) for record in evidence.signals])
-    columns[~evidence.used] = 0.0
-    if hypothesis.amplitudes:
-        return evidence.without_nuisances(columns), None
-    return columns[:, :0], evidence.without_nuisances(columns[:, 0])
+def raw_columns(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> Matrix:
+    """Return the columns of a hypothesis on every sample."""
+    return np.concatenate([hypothesis.columns(record, values) for record in evidence.signals])
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A hypothesis at some values: averaged columns, their scale (none without amplitudes), and projected ones."""
+
+    values: tuple[float, ...]
+    columns: Matrix
+    scale: Vector | None
+    projected: Matrix
 
 
 class _Problem:
-    """The projected problem of some hypotheses; keeps the columns of the last values of each."""
+    """The least squares problem of some hypotheses; keeps the columns of the last values of each."""
 
-    def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis]) -> None:
-        self.evidence, self.hypotheses = evidence, hypotheses
-        self.y = evidence.without_nuisances(evidence.residual)
+    def __init__(self, likelihood: Likelihood, hypotheses: Sequence[Hypothesis]) -> None:
+        self.likelihood, self.hypotheses = likelihood, hypotheses
         self.free = [free for hypothesis in hypotheses for free in hypothesis.free]
-        self.ridge = np.array([h.effect.ridge for h in hypotheses for _ in h.amplitudes])
-        self._known: list[tuple[tuple[float, ...], tuple[Matrix, Vector | None]] | None] = [None] * len(hypotheses)
+        self._known: list[_Part | None] = [None] * len(hypotheses)
 
-    def values(self, x: Vector) -> list[tuple[float, ...]]:
+    def parts(self, x: Vector) -> list[_Part]:
         natural = iter([from_search(free, float(v)) for free, v in zip(self.free, x, strict=True)])
-        return [tuple(itertools.islice(natural, len(hypothesis.free))) for hypothesis in self.hypotheses]
+        found = []
+        for i, hypothesis in enumerate(self.hypotheses):
+            values = tuple(itertools.islice(natural, len(hypothesis.free)))
+            part = self._known[i]
+            if part is None or part.values != values:
+                part = self._known[i] = _part(self.likelihood, hypothesis, values)
+            found.append(part)
+        return found
 
-    def solve(self, x: Vector) -> tuple[Vector, Vector]:
-        """Return residual and amplitudes."""
-        target, columns = self.y, []
-        for i, values in enumerate(self.values(x)):
-            kept = self._known[i]
-            if kept is None or kept[0] != values:
-                kept = (values, columns_of(self.evidence, self.hypotheses[i], values))
-                self._known[i] = kept
-            table, fixed = kept[1]
-            columns.append(table)
-            if fixed is not None:
-                target = target - fixed
-        whole = np.concatenate(columns, axis=1) if columns else np.zeros((self.y.size, 0))
-        if whole.shape[1] == 0:
-            return target, np.zeros(0)
-        scale = np.linalg.norm(whole, axis=0)
-        scale[scale == 0.0] = 1.0
-        table, aim = whole / scale, target
-        if self.ridge.any():
-            table = np.concatenate([table, np.diag(np.sqrt(self.ridge))])
-            aim = np.concatenate([target, np.zeros(self.ridge.size)])
-        amplitudes = np.linalg.lstsq(table, aim, rcond=1e-9)[0] / scale
-        return target - whole @ amplitudes, amplitudes
+    def solve(self, x: Vector) -> tuple[Vector, Vector, Matrix]:
+        """Return the residual with the amplitudes' prior, the amplitudes and their precision."""
+        target, columns = self.likelihood.target, [np.zeros((self.likelihood.target.size, 0))]
+        for part in self.parts(x):
+            if part.scale is None:
+                target = target - part.projected[:, 0]
+            else:
+                columns.append(part.projected)
+        table = np.concatenate(columns, axis=1)
+        precision = np.eye(table.shape[1]) + table.T @ table
+        amplitudes = cho_solve(cho_factor(precision, lower=True), table.T @ target) if table.shape[1] else np.zeros(0)
+        return np.concatenate([target - table @ amplitudes, -amplitudes]), amplitudes, precision
 
     def fun(self, x: Vector) -> Vector:
-        return self.solve(x)[0][self.evidence.used]
+        return self.solve(x)[0]
+
+
+def _part(likelihood: Likelihood, hypothesis: Hypothesis, values: tuple[float, ...]) -> _Part:
+    points = likelihood.points
+    table, scale = raw_columns(points.evidence, hypothesis, values), None
+    if hypothesis.amplitudes:
+        averaged, scale = points.scaled(table)
+    else:
+        averaged = points.averaged(table)
+    return _Part(values, averaged, scale, likelihood.projected(averaged))
+
+
+def fit_terms(likelihood: Likelihood, starts: Sequence[Start], *, evaluations: int = 15) -> Fit:
+    """Fit effects together.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        The data.
+    starts : sequence of (Hypothesis, values)
+        Effects, and where the search of their free parameters begins.
+    evaluations : int
+        Most steps of the search.
+    """
+    problem = _Problem(likelihood, [hypothesis for hypothesis, _ in starts])
+    begin = [v for _, values in starts for v in values]
+    x = np.array([to_search(free, v) for free, v in zip(problem.free, begin, strict=True)])
+    jacobian, ranges = np.zeros((likelihood.target.size, 0)), np.zeros(0)
+    if x.size:
+        low = np.array([to_search(free, free.low) for free in problem.free])
+        high = np.array([to_search(free, free.high) for free in problem.free])
+        ranges = high - low
+        inside = np.clip(x, low + 1e-9 * ranges, high - 1e-9 * ranges)
+        found = least_squares(
+            problem.fun, inside, bounds=(low, high), diff_step=1e-3, xtol=1e-5, ftol=1e-4, max_nfev=evaluations
+        )
+        x, jacobian = np.asarray(found.x), np.asarray(found.jac)[: likelihood.target.size]
+    residual, amplitudes, precision = problem.solve(x)
+    return _fitted(problem, x, (residual, amplitudes, precision), jacobian * ranges)
+
+
+def _fitted(problem: _Problem, x: Vector, solved: tuple[Vector, Vector, Matrix], jacobian: Matrix) -> Fit:
+    likelihood, (residual, amplitudes, precision) = problem.likelihood, solved
+    parts, rest = problem.parts(x), iter(amplitudes.tolist())
+    terms, columns, fixed = [], [np.zeros((likelihood.points.used.size, 0))], np.zeros(likelihood.points.used.size)
+    for hypothesis, part in zip(problem.hypotheses, parts, strict=True):
+        own: tuple[float, ...] = ()
+        if part.scale is None:
+            fixed = fixed + part.columns[:, 0]
+        else:
+            columns.append(part.columns)
+            own = tuple(
+                a * s for a, s in zip(itertools.islice(rest, part.scale.size), part.scale.tolist(), strict=True)
+            )
+        terms.append(Term(hypothesis=hypothesis, values=part.values, amplitudes=own))
+    table = np.concatenate(columns, axis=1)
+    # Laplace's approximation: how much of the range of each searched parameter the data leave.
+    searched = np.eye(jacobian.shape[1]) + jacobian.T @ jacobian / (2.0 * math.pi)
+    times = sum(len(getattr(h.effect, "times", ())) for h in problem.hypotheses)
+    surprise = float(residual @ residual) + likelihood.log_det + _log_det(precision) + _log_det(searched)
+    return Fit(
+        terms=tuple(terms),
+        likelihood=likelihood,
+        log_evidence=likelihood.log_prior - 0.5 * surprise - times * math.log(likelihood.points.count / 2.0),
+        columns=table,
+        fixed=fixed,
+        added=fixed + table @ amplitudes,
+    )
+
+
+def settled(fit: Fit) -> Fit:
+    """Return a fit with the rest that fits its effects best, and the own error that effects of their size have."""
+    points = fit.likelihood.points
+    own = points.own_error_with(fit.size_um)
+    start = dataclasses.replace(fit.rest, own_um=own)
+    rest = points.settled(fit.columns, fit.fixed, start)
+    return fit_terms(Likelihood(points, rest), fit.starts())
 
 
 def to_search(free: Free, value: float) -> float:
@@ -156,45 +255,12 @@ def from_search(free: Free, x: float) -> float:
     return float(np.exp(x)) if free.log else x * (free.high - free.low)
 
 
-def fit_terms(evidence: Evidence, starts: Sequence[Start], *, evaluations: int = 25) -> Fit:
-    """Fit effects together.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        Residual and signals.
-    starts : sequence of (Hypothesis, values)
-        Effects, and where the search of their free parameters begins.
-    evaluations : int
-        Most steps of the search.
-    """
-    problem = _Problem(evidence, [hypothesis for hypothesis, _ in starts])
-    begin = [v for _, values in starts for v in values]
-    x = np.array([to_search(free, v) for free, v in zip(problem.free, begin, strict=True)])
-    if x.size:
-        low = np.array([to_search(free, free.low) for free in problem.free])
-        high = np.array([to_search(free, free.high) for free in problem.free])
-        inside = np.clip(x, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
-        found = least_squares(
-            problem.fun, inside, bounds=(low, high), diff_step=1e-4, xtol=1e-6, ftol=1e-7, max_nfev=evaluations
-        )
-        x = np.asarray(found.x)
-    residual, amplitudes = problem.solve(x)
-    residual = np.where(evidence.used, residual, 0.0)
-    rest = iter(amplitudes.tolist())
-    terms = [
-        Term(hypothesis=hypothesis, values=values, amplitudes=tuple(itertools.islice(rest, len(hypothesis.amplitudes))))
-        for hypothesis, values in zip(problem.hypotheses, problem.values(x), strict=True)
-    ]
-    return Fit(terms=tuple(terms), residual=residual, cost=float(residual @ residual))
-
-
-def standard_errors(evidence: Evidence, fit: Fit, variance_inflation: float) -> list[dict[str, float]]:
-    """Return the standard error of everything that each effect is named by, for the effective number of samples."""
+def standard_errors(fit: Fit) -> list[dict[str, float]]:
+    """Return the standard error of everything that each effect is named by."""
     natural = np.array([v for term in fit.terms for v in (*term.values, *term.amplitudes)])
     if natural.size == 0:
         return []
-    ridge = np.array([r for term in fit.terms for r in _ridges(term)])
+    likelihood = fit.likelihood
 
     def moved(values: Vector) -> list[Term]:
         rest = iter(values.tolist())
@@ -208,9 +274,8 @@ def standard_errors(evidence: Evidence, fit: Fit, variance_inflation: float) -> 
         ]
 
     def predicted(values: Vector) -> Vector:
-        total = summed(evidence, moved(values))
-        total[~evidence.used] = 0.0
-        return evidence.without_nuisances(total)
+        total = summed(likelihood.points.evidence, moved(values))
+        return likelihood.projected(likelihood.points.averaged(total[:, None]))[:, 0]
 
     def named(values: Vector) -> Vector:
         return np.array([v for term in moved(values) for v in term.named.values()])
@@ -219,16 +284,11 @@ def standard_errors(evidence: Evidence, fit: Fit, variance_inflation: float) -> 
     jacobian = _slopes(predicted, natural, steps)
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
-    _, s, vt = np.linalg.svd(np.concatenate([jacobian / scale, np.diag(np.sqrt(ridge))]), full_matrices=False)
+    _, s, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
     inverse = vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None]
-    sigma2 = fit.cost / max(evidence.count - natural.size, 1) * variance_inflation
     spread = _slopes(named, natural, steps) @ inverse
-    errors = iter(np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread) * sigma2, 0.0)).tolist())
+    errors = iter(np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread), 0.0)).tolist())
     return [dict(zip(term.named, errors, strict=False)) for term in fit.terms]
-
-
-def _ridges(term: Term) -> list[float]:
-    return [*(0.0 for _ in term.values), *(term.hypothesis.effect.ridge for _ in term.amplitudes)]
 
 
 def _slopes(function: Callable[[Vector], Vector], at: Vector, steps: Vector) -> Matrix:
@@ -240,3 +300,7 @@ def _slopes(function: Callable[[Vector], Vector], at: Vector, steps: Vector) -> 
         below[i] -= step
         columns.append((function(above) - function(below)) / (2.0 * step))
     return np.stack(columns, axis=1)
+
+
+def _log_det(matrix: Matrix) -> float:
+    return float(np.linalg.slogdet(matrix)[1])

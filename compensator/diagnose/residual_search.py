@@ -31,10 +31,11 @@ class ResidualSearch(Estimate):
 
     def __init__(self, evidence: Evidence) -> None:
         super().__init__(evidence)
-        self._selection = found = Search(evidence).run()
+        self._search = search = Search(evidence)
+        self._selection = found = search.run()
         self.effects = self._effects(found)
         self.tried = self._ranked(found.rivals[0]) if found.rivals else ()
-        self.residual_before, self.residual_after = found.before.residual, found.fit.residual
+        self.residual_before, self.residual_after = search.left(found.before), search.left(found.fit)
 
     def predictions(self, views: Sequence[Evidence], executor_map: ExecutorMap) -> Iterable[Prediction]:
         """Repeat the search in each part of the evidence."""
@@ -52,7 +53,7 @@ class ResidualSearch(Estimate):
     def is_explained(self, before_um: float, after_um: float) -> bool:
         """Return whether the fit leaves noise; effects that do not hold on held-out data explain part at most."""
         holds = not self._selection.fit.terms or after_um <= before_um
-        return holds and self.evidence.noise.is_explained(self._selection.fit.cost)
+        return holds and self.evidence.noise.is_explained(float(self.residual_after @ self.residual_after))
 
     def extended(
         self, model: ThermalModel, deployed: Sequence[FoundEffect], after_um: float
@@ -71,25 +72,24 @@ class ResidualSearch(Estimate):
 
     def _effects(self, selection: Selection) -> tuple[FoundEffect, ...]:
         evidence, fit = self.evidence, selection.fit
-        errors = standard_errors(evidence, fit, selection.variance_inflation)
-        after = self._rms(fit.cost)
+        left = self._search.left(fit)
         effects = []
-        for term, std, rivals in zip(fit.terms, errors, selection.rivals, strict=True):
+        for term, std, rivals in zip(fit.terms, standard_errors(fit), selection.rivals, strict=True):
             signal = response(evidence, term)
-            without = fit.residual + evidence.without_nuisances(np.where(evidence.used, signal, 0.0))
-            others = ((c.term, self._rms(c.fit.cost)) for c in rivals)
-            effects.append(self.found(term, std, signal, (self._rms(float(without @ without)), after), others))
+            without = left + evidence.without_nuisances(np.where(evidence.used, signal, 0.0))
+            rms = self._rms(without), self._rms(left)
+            effects.append(self.found(term, std, signal, rms, ((c.term, c.rms_um) for c in rivals)))
         return tuple(sorted(effects, key=lambda e: -e.rms_before_um))
 
     def _ranked(self, candidates: Sequence[Candidate]) -> tuple[tuple[str, float], ...]:
         best: dict[str, float] = {}
         for candidate in candidates:
-            label, rms = candidate.term.hypothesis.label, self._rms(candidate.fit.cost)
-            best[label] = min(rms, best.get(label, np.inf))
+            label = candidate.term.hypothesis.label
+            best[label] = min(candidate.rms_um, best.get(label, np.inf))
         return tuple(sorted(best.items(), key=lambda item: item[1]))
 
-    def _rms(self, cost: float) -> float:
-        return float(np.sqrt(cost / self.evidence.count))
+    def _rms(self, residual: Vector) -> float:
+        return float(np.sqrt(residual @ residual / self.evidence.count))
 
 
 def _predicted(seen: Evidence, *, unobserved: bool) -> Prediction:

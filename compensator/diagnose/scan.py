@@ -1,82 +1,89 @@
-"""The scan: every hypothesis on a grid of its searched parameters against what is left, as a first ranking."""
+"""The scan: every hypothesis on a grid of its searched parameters against what a fit leaves, as a first ranking."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 
-from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, columns_of
-from compensator.model.effects.hypothesis import Hypothesis, proposals
+from compensator.arrays import Matrix
+from compensator.diagnose.fit import Fit, Start, raw_columns
+from compensator.diagnose.likelihood import Likelihood, Points, Rest, dense
+from compensator.model.effects.hypothesis import Hypothesis
 
-#: Single precision: half the memory, and more digits than a first ranking needs.
-Coarse = npt.NDArray[np.float32]
+Place = tuple[str, str, str]
 
 
 class Scan:
-    """Every hypothesis for some evidence, with its columns on the grid kept."""
+    """Hypotheses with their columns at every point of their grids.
 
-    def __init__(self, evidence: Evidence) -> None:
-        self.evidence = evidence
-        self.hypotheses = proposals(evidence.context)
-        self._grids: dict[int, list[tuple[tuple[float, ...], Coarse]]] = {}
+    Parameters
+    ----------
+    points : Points
+        The data.
+    hypotheses : list of Hypothesis
+        What could act.
+    """
 
-    def ranked(self, base: Fit, kept: Sequence[Term]) -> list[tuple[Hypothesis, tuple[float, ...]]]:
-        """Rank the hypotheses of free places by what their best grid point would explain of a residual.
+    def __init__(self, points: Points, hypotheses: list[Hypothesis]) -> None:
+        self._points = points
+        self._where = [(hypothesis, values) for hypothesis in hypotheses for values in hypothesis.grid()]
+        tables = []
+        for hypothesis, values in self._where:
+            table = raw_columns(points.evidence, hypothesis, values)
+            tables.append(points.scaled(table)[0] if hypothesis.amplitudes else points.averaged(table))
+        self._columns = np.asfortranarray(np.concatenate(tables, axis=1))
+        self._first = np.array([0, *itertools.accumulate(table.shape[1] for table in tables)])
+
+    def ranked(self, rest: Rest, fit: Fit, cost: Callable[[Hypothesis], float]) -> list[Start]:
+        """Rank the hypotheses whose places are free by what their best grid point adds to the evidence.
 
         Parameters
         ----------
-        base : Fit
-            What leaves the residual; its columns are projected out.
-        kept : sequence of Term
-            Effects whose places are not free.
-
-        Returns
-        -------
-        list of (Hypothesis, values)
-            Best first, with the values of the best grid point.
+        rest : Rest
+            What no effect explains.
+        fit : Fit
+            What leaves the residual.
+        cost : callable
+            What a hypothesis costs before the data are seen.
         """
-        known = [columns_of(self.evidence, *term.start)[0] for term in base.terms]
-        whole = np.concatenate(known, axis=1) if known and sum(k.shape[1] for k in known) else None
-        q = None if whole is None else np.linalg.qr(whole)[0].astype(np.float32)
-        residual = base.residual.astype(np.float32)
-        count, log_count = self.evidence.count, math.log(self.evidence.count)
-        occupied = {term.hypothesis.place for term in kept}
-        ranking = []
-        for hypothesis in self.hypotheses:
-            if hypothesis.place in occupied:
+        likelihood = Likelihood(self._points, rest)
+        gains = self._gains(likelihood, fit)
+        best: dict[int, tuple[float, Start]] = {}
+        for (hypothesis, values), gain in zip(self._where, gains.tolist(), strict=True):
+            known = best.get(id(hypothesis))
+            if hypothesis.place not in fit.places and (known is None or gain > known[0]):
+                best[id(hypothesis)] = (gain, (hypothesis, values))
+        ranking = sorted(best.values(), key=lambda item: cost(item[1][0]) - item[0])
+        return [start for _, start in ranking]
+
+    def _gains(self, likelihood: Likelihood, fit: Fit) -> Matrix:
+        """Return what each grid point adds to the logarithm of the evidence, amplitudes integrated out."""
+        white = dense(likelihood) @ self._columns
+        kept = likelihood.projected(fit.columns)
+        target = likelihood.target - likelihood.projected(fit.fixed[:, None])[:, 0]
+        # The amplitudes of the fit stay free: their columns are projected out, as far as their prior lets them.
+        inner = np.linalg.solve(np.eye(kept.shape[1]) + kept.T @ kept, kept.T)
+        target = target - kept @ (inner @ target)
+        cross, back = kept.T @ white, inner @ white
+        products = white.T @ target
+        squares = np.einsum("ij,ij->j", white, white) - np.einsum("ij,ij->j", cross, back)
+        widths = np.diff(self._first)
+        gains = np.empty(widths.size)
+        for width in set(widths.tolist()):
+            which = np.flatnonzero(widths == width)
+            at = self._first[which][:, None] + np.arange(width)
+            if width == 1:
+                one = at[:, 0]
+                gains[which] = 0.5 * (products[one] ** 2 / (1.0 + squares[one]) - np.log1p(squares[one]))
                 continue
-            best: tuple[float, tuple[float, ...]] | None = None
-            for values, table in self._grid(hypothesis):
-                gain = _explained(table if q is None else table - q @ (q.T @ table), residual)
-                if best is None or gain > best[0]:
-                    best = (gain, values)
-            if best is not None:
-                left = max(base.cost - best[0], 1e-3 * base.cost)
-                ranking.append((count * math.log(left) + hypothesis.parameters * log_count, hypothesis, best[1]))
-        return [(hypothesis, values) for _, hypothesis, values in sorted(ranking, key=lambda item: item[0])]
-
-    def _grid(self, hypothesis: Hypothesis) -> list[tuple[tuple[float, ...], Coarse]]:
-        key = id(hypothesis)
-        if key not in self._grids:
-            tables = []
-            for values in hypothesis.grid():
-                table = np.concatenate([hypothesis.columns(record, values) for record in self.evidence.signals])
-                table[~self.evidence.used] = 0.0
-                tables.append((values, self.evidence.without_nuisances(table).astype(np.float32)))
-            self._grids[key] = tables
-        return self._grids[key]
-
-
-def _explained(x: Coarse, residual: Coarse) -> float:
-    """Return how much of the residual's sum of squares some columns explain."""
-    if x.shape[1] == 1:
-        size = float(x[:, 0] @ x[:, 0])
-        return float((x[:, 0] @ residual) ** 2 / size) if size > 1e-12 else 0.0
-    q, r = np.linalg.qr(x)
-    good = np.abs(np.diag(r)) > 1e-5 * np.linalg.norm(r, axis=0) + 1e-9
-    part = q.T @ residual
-    return float(np.sum(part[good] ** 2))
+            some = white.T[at]
+            gram = np.eye(width) + some @ some.transpose(0, 2, 1) - cross.T[at] @ back.T[at].transpose(0, 2, 1)
+            moment = products[at]
+            solved = np.linalg.solve(gram, moment[..., None])[..., 0]
+            gains[which] = 0.5 * np.einsum("ij,ij->i", moment, solved) - 0.5 * np.linalg.slogdet(gram)[1]
+        for i, (hypothesis, _) in enumerate(self._where):
+            if not hypothesis.amplitudes:
+                gains[i] = products[self._first[i]] - 0.5 * squares[self._first[i]]
+        return gains

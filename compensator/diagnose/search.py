@@ -1,65 +1,60 @@
-"""Search for the effects that a model lacks: added one after another, refitted together, compared by a criterion.
+"""Search for the effects that a model lacks: proposed by scans, compared by the evidence.
 
-An effect is worth its parameters where the residual's sum of squares falls by more than chance would make it fall
-with the number of hypotheses tried:
+    J = log p(residual | effects) − Σ_effects [ log M + margin ]
 
-    J = N/c · log(Σ e² + A) + Σ_effects [ p log(N/c) + 2 log M ]
+with M places (and forms of a place) tried. The evidence counts everything else: parameters and amplitudes cost what
+the data leave of their ranges, and what no effect explains is a slow rest and noise of learned size.
 
-with N samples, p parameters, M places tried, A what the base model's own error may leave, and *c* the variance
-inflation of the final residual: N/c is its effective number of samples.
+A rest that may be large hides slow effects from a scan, a small one shows them and is fooled by what is missing. So
+effects are proposed with both, and judged with the rest that fits each best.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
+from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Start, Term, columns_of, fit_terms
-from compensator.diagnose.scan import Scan
+from compensator.diagnose.fit import Fit, Term, fit_terms, raw_columns, settled
+from compensator.diagnose.likelihood import Likelihood, Points, Rest
+from compensator.diagnose.scan import Place, Scan
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, proposals
 
 #: Most effects looked for.
 MOST = 4
-#: Hypotheses that are fitted after each scan: for one effect more, and in the place of one.
-POLISHED, EXCHANGED = 12, 6
+#: What an effect must add to the logarithm of the evidence, beyond the number of places tried.
+MARGIN = 4.0
+#: Hypotheses that are fitted after each scan, and how many of those are judged.
+FITTED, JUDGED = 6, 4
 #: Columns of an effect that are larger than their sum by this much cancel each other.
 CANCELS = 6.0
-#: Effects that explain this share of what all explain leave the rest to a companion.
+#: A simpler effect on the same path gives its name where it explains this share of what a background effect explains.
 MOSTLY = 0.7
-#: Where forms are approximate, what one effect leaves up to this share of the sum of squares is due to its form.
-FORM_LEAVES = 0.08
-#: Where forms are approximate, an unobserved source may leave this share of what channels leave.
-UNOBSERVED_LEAVES = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
-    """A hypothesis that was fitted during the search.
+    """A hypothesis that was fitted in the place of an effect.
 
     Parameters
     ----------
+    term : Term
+        What was tried.
     fit : Fit
-        The fit, with the effects found before.
-    index : int
-        Which of its terms was tried.
-    score : float
-        *J*.
+        The fit, with the other effects.
+    rms_um : float
+        What it leaves, µm.
     """
 
+    term: Term
     fit: Fit
-    index: int
-    score: float
-
-    @property
-    def term(self) -> Term:
-        """What was tried."""
-        return self.fit.terms[self.index]
+    rms_um: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,15 +65,12 @@ class Selection:
     ----------
     before, fit : Fit
         The fit of nothing, and of the effects found.
-    variance_inflation : float
-        *c*.
     rivals : tuple of tuple of Candidate
         For each effect, what else was fitted in its place, best first.
     """
 
     before: Fit
     fit: Fit
-    variance_inflation: float = 1.0
     rivals: tuple[tuple[Candidate, ...], ...] = ()
 
 
@@ -86,220 +78,146 @@ class Search:
     """One search over one body of evidence."""
 
     def __init__(self, evidence: Evidence) -> None:
-        self.evidence = evidence
-        self.approximate = evidence.context.approximate
-        self.scan = Scan(evidence)
-        self.places = len({hypothesis.place for hypothesis in self.scan.hypotheses}) + 1
+        context = evidence.context
+        self.evidence, self.points = evidence, Points(evidence)
+        self.hypotheses = proposals(context)
+        if context.approximate:
+            self.hypotheses += proposals(context, background=True)
+        self._scan = Scan(self.points, self.hypotheses)
+        self._forms = Counter(hypothesis.place for hypothesis in self.hypotheses)
 
     def run(self, *, unobserved: bool = True) -> Selection:
-        """Search what the inputs explain, then whether a source that no channel shows explains it better.
+        """Search what the inputs explain, and a source that no channel shows.
 
         Parameters
         ----------
         unobserved : bool
             Whether an unobserved source is looked for.
         """
-        evidence = self.evidence
-        before = fit_terms(evidence, [])
-        left = evidence.without_nuisances(evidence.residual)
-        if evidence.noise.is_expected(float(left @ left)):
-            return Selection(before=before, fit=before)
-        path = self._forward([before])
-        others = self._beside_background(path[-1])
-        last = min([path[-1], *others], key=lambda fit: self.score(fit, 1.0))
-        structured = not self._is_noise(last) and not self._is_white(last)
-        if unobserved and structured and not self._is_one_effect([*path, *others], before):
-            others = [*others, *self._with_unobserved(path, last)]
-            last = min([last, *others], key=lambda fit: self.score(fit, 1.0))
-        inflation = evidence.variance_inflation(last.residual)
-        best = min([*path, *others], key=lambda fit: self.score(fit, inflation))
-        best = self._settle_background(self._pruned(best, inflation), before)
-        rivals = tuple(self._rivals(best, i) for i in range(len(best.terms)))
-        return Selection(before=before, fit=best, variance_inflation=inflation, rivals=rivals)
+        rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
+        before = best = fit_terms(Likelihood(self.points, rest), [])
+        while len(best.terms) < MOST:
+            candidates = [settled(fit) for fit in self._proposed(best, unobserved=unobserved)[:JUDGED]]
+            better = max(candidates, key=self.score, default=best)
+            if self.score(better) <= self.score(best):
+                break
+            best = self._exchanged(better)
+        best = self._with_simpler_name(self._pruned(best))
+        return Selection(before=before, fit=best, rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))))
 
-    def score(self, fit: Fit, variance_inflation: float) -> float:
+    def score(self, fit: Fit) -> float:
         """Return *J*."""
-        count = self.evidence.count / variance_inflation
-        penalty = fit.parameters * math.log(max(count, 2.0)) + 2.0 * len(fit.terms) * math.log(self.places)
-        return count * math.log(max(fit.cost + self.evidence.noise.allowance, 1e-12)) + penalty
+        return fit.log_evidence - sum(self._cost(term.hypothesis) for term in fit.terms)
 
-    # ------------------------------------------------------------------ order of the search
-
-    def _forward(self, path: list[Fit]) -> list[Fit]:
-        """Add one effect after another while each is worth it."""
-        while len(path) <= MOST:
-            last = path[-1]
-            if self._is_noise(last) and self._is_white(last):
-                break
-            step = [c for c in self._add(last) if self._is_worth(c.term.hypothesis, last, c.fit)]
-            if not step:
-                break
-            better = self._improved(step[0].fit)
-            inflation = self._inflation(better)
-            if self.score(better, inflation) >= self.score(last, inflation):
-                break
-            path.append(better)
-        return path
-
-    def _is_noise(self, fit: Fit) -> bool:
-        return self.evidence.noise.is_noise(fit.cost)
-
-    def _is_white(self, fit: Fit) -> bool:
-        return self.evidence.noise.is_white(self.evidence.variance_inflation(fit.residual))
-
-    def _is_one_effect(self, fits: Sequence[Fit], before: Fit) -> bool:
-        """Return whether one effect explains so much that its form, where forms are approximate, leaves the rest."""
-        return self.approximate and any(
-            len(_foreground(fit)) <= 1 and fit.cost < FORM_LEAVES * before.cost for fit in fits
+    def left(self, fit: Fit) -> Vector:
+        """Return what a fit leaves on every sample, nuisances projected out, µm; 0 where samples are not used."""
+        total = self.evidence.residual - sum(
+            (raw_columns(self.evidence, t.hypothesis, t.values) @ np.array(t.amplitudes or (1.0,)) for t in fit.terms),
+            np.zeros(self.evidence.used.size),
         )
+        return self.evidence.without_nuisances(np.where(self.evidence.used, total, 0.0))
 
-    def _inflation(self, fit: Fit) -> float:
-        """Return the variance inflation that counts while something may still be missing.
+    def rms(self, fit: Fit) -> float:
+        """Return the rms of what a fit leaves, µm."""
+        return float(np.sqrt(np.sum(self.left(fit) ** 2) / self.evidence.count))
 
-        On a real machine an effect has only approximately any form, and what it leaves is not noise: few effective
-        samples, so that the simpler of two wins. Where forms are exact, what is left is the effect that comes next.
-        """
-        return self.evidence.variance_inflation(fit.residual) if self.approximate else 1.0
+    @property
+    def _typical(self) -> Rest:
+        return self.points.typical_rest()
 
-    def _beside_background(self, last: Fit) -> list[Fit]:
-        """Return what is found beside a background effect; nothing where one effect alone leaves noise.
-
-        Altering a real machine changes its response to heat and ambient temperature, whatever else it does: what is
-        found beside that is not mistaken for it.
-        """
-        done = len(last.terms) < 2 and self.evidence.noise.is_bare_noise(last.cost)
-        if done or not self.approximate:
-            return []
-        starts = [(hypothesis, ()) for hypothesis in proposals(self.evidence.context, background=True)]
-        return self._forward([fit_terms(self.evidence, starts)])
-
-    def _settle_background(self, fit: Fit, before: Fit) -> Fit:
-        """Decide whether a background effect is an effect of its own, by which name, or is a companion of others.
-
-        Where other effects explain most without it, it only absorbs what they leave. Where it is alone and effects
-        of a simpler name explain most of it, it gets their name.
-        """
-        background = next((term for term in fit.terms if term.hypothesis.effect.background), None)
-        if background is None:
-            return fit
-        others = [term.start for term in _foreground(fit)]
-        if not others:
-            simpler: list[Start] = [(h, ()) for h in self.scan.hypotheses if h.effect.names_background]
-            if not self._explain_most(simpler, fit, before):
-                return fit
-            others = [start for start in simpler if start[0].place[1] == background.hypothesis.place[1]]
-        elif not self._explain_most(others, fit, before):
-            return fit
-        fitted = fit_terms(self.evidence, [*others, (background.hypothesis, ())])
-        *named, last = fitted.terms
-        return dataclasses.replace(fitted, terms=(*named, dataclasses.replace(last, companion=True)))
-
-    def _explain_most(self, some: Sequence[Start], fit: Fit, before: Fit) -> bool:
-        """Return whether some effects alone explain most of what all explain."""
-        return before.cost - fit_terms(self.evidence, some).cost > MOSTLY * (before.cost - fit.cost)
-
-    def _with_unobserved(self, path: Sequence[Fit], observed: Fit) -> list[Fit]:
-        """Return fits with an unobserved source beside what was found before it, or instead of it.
-
-        Steps at any time follow much that they do not cause. On a real machine, where forms are approximate, they must
-        leave half of what the best explanation by channels leaves.
-        """
-        found = []
-        for base in path[:3]:
-            source = switchings(self.evidence, base.residual)
-            if source is not None:
-                found.append(fit_terms(self.evidence, [*base.starts(), source]))
-        found.sort(key=lambda fit: self.score(fit, 1.0))
-        improved = [self._improved(fit) for fit in found[:1]]
-        if not self.approximate:
-            return improved
-        own = self.evidence.count * self.evidence.noise.own_error_um**2
-        return [fit for fit in improved if fit.cost + own < UNOBSERVED_LEAVES * (observed.cost + own)]
-
-    def _is_worth(self, hypothesis: Hypothesis, without: Fit, fit: Fit) -> bool:
-        """Return whether an effect explains enough, the base model's own error counted as still there."""
-        allowance, effect = self.evidence.noise.allowance, hypothesis.effect
-        share = effect.worth_with_others if self.approximate and _foreground(without) else effect.worth
-        return fit.cost + allowance < (1.0 - share) * (without.cost + allowance)
+    def _cost(self, hypothesis: Hypothesis) -> float:
+        """Return what an effect must add to the evidence."""
+        return MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
 
     # ------------------------------------------------------------------ steps
 
-    def _add(self, fit: Fit, without: int | None = None) -> list[Candidate]:
-        """Return fits with one effect more, or with one exchanged, best first."""
-        kept = [term for i, term in enumerate(fit.terms) if i != without]
-        starts = fit.starts(without)
-        base = fit_terms(self.evidence, starts) if without is not None else fit
-        found = []
-        for hypothesis, values in self.scan.ranked(base, kept)[: POLISHED if without is None else EXCHANGED]:
-            fitted = fit_terms(self.evidence, [*starts, (hypothesis, values)])
-            if self._is_plausible(fitted.terms[-1]):
-                found.append(Candidate(fit=fitted, index=len(starts), score=self.score(fitted, 1.0)))
-        if not found:
-            return []
-        inflation = self._inflation(min(found, key=lambda item: item.score).fit)
-        found = [dataclasses.replace(item, score=self.score(item.fit, inflation)) for item in found]
-        return sorted(found, key=lambda item: item.score)
+    def _views(self, fit: Fit) -> list[Rest]:
+        """Return the rests with which effects are proposed: as it is, small, and between."""
+        small = min(fit.rest.slow_um, max(self.evidence.probe_um, self.points.own_um))
+        views = [fit.rest]
+        if fit.rest.slow_um > 1.5 * small:
+            views.append(dataclasses.replace(fit.rest, slow_um=small))
+        if fit.rest.slow_um > 6.0 * small:
+            views.append(dataclasses.replace(fit.rest, slow_um=math.sqrt(fit.rest.slow_um * small)))
+        return views
 
-    def _improved(self, fit: Fit) -> Fit:
-        """Exchange effects one at a time as long as that helps: what was found first may have absorbed two."""
-        if len(fit.terms) < 2:
-            return fit
-        for _ in range(2):
-            changed = False
-            for i, term in enumerate(fit.terms):
-                if term.hypothesis.effect.background:
+    def _proposed(self, fit: Fit, *, unobserved: bool) -> list[Fit]:
+        """Return fits with one effect more, each with the view that suits it, best first."""
+        views = self._views(fit)
+        likelihoods = [Likelihood(self.points, rest) for rest in views]
+        found, seen = [], set()
+        for rest, likelihood in zip(views, likelihoods, strict=True):
+            starts = self._scan.ranked(rest, fit, self._cost)[:FITTED]
+            if unobserved and rest is views[-1] and all(t.hypothesis.effect.observed for t in fit.terms):
+                source = switchings(rest, fit)
+                starts += [source] if source else []
+            for start in starts:
+                if id(start[0]) in seen:
                     continue
-                others = self._add(fit, i) if term.hypothesis.effect.observed else self._switchings_again(fit, i)
-                if not others:
+                seen.add(id(start[0]))
+                added = fit_terms(likelihood, [*fit.starts(), start], evaluations=8)
+                if not self._is_plausible(added.terms[-1]):
                     continue
-                inflation = self._inflation(others[0].fit)
-                if self.score(others[0].fit, inflation) < self.score(fit, inflation) - 1e-6:
-                    fit, changed = others[0].fit, True
-            if not changed:
-                break
+                others = [
+                    fit_terms(other, added.starts(), evaluations=1) for other in likelihoods if other is not likelihood
+                ]
+                found.append(max([added, *others], key=self.score))
+        return sorted(found, key=self.score, reverse=True)
+
+    def _exchanged(self, fit: Fit) -> Fit:
+        """Exchange effects one at a time where that helps: what was found first may have absorbed two."""
+        for i in range(len(fit.terms) - 1):
+            others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
+            for candidate in self._proposed(others, unobserved=False)[:2]:
+                if candidate.places != fit.places:
+                    better = settled(candidate)
+                    fit = better if self.score(better) > self.score(fit) else fit
         return fit
 
-    def _switchings_again(self, fit: Fit, index: int) -> list[Candidate]:
-        """Look for the unobserved source again, with the other effects as they are now."""
-        kept = fit.starts(index)
-        source = switchings(self.evidence, fit_terms(self.evidence, kept).residual)
-        if source is None:
-            return []
-        fitted = fit_terms(self.evidence, [*kept[:index], source, *kept[index:]])
-        return [Candidate(fit=fitted, index=index, score=self.score(fitted, 1.0))]
-
-    def _pruned(self, fit: Fit, inflation: float) -> Fit:
-        """Leave out every effect that is not worth its parameters."""
+    def _pruned(self, fit: Fit) -> Fit:
+        """Leave out every effect that is not worth its cost."""
         while fit.terms:
-            fewer = [fit_terms(self.evidence, fit.starts(i)) for i in range(len(fit.terms))]
-            out = min(range(len(fewer)), key=lambda i: self.score(fewer[i], inflation))
-            small = not self._is_worth(fit.terms[out].hypothesis, fewer[out], fit)
-            if self.score(fewer[out], inflation) > self.score(fit, inflation) and not small:
+            fewer = [settled(fit_terms(fit.likelihood, fit.starts(i))) for i in range(len(fit.terms))]
+            best = max(fewer, key=self.score)
+            if self.score(best) <= self.score(fit):
                 return fit
-            fit = fewer[out]
+            fit = best
         return fit
 
     def _is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
         if len(term.amplitudes) < 2 or term.hypothesis.effect.ridge:
             return True
-        table = columns_of(self.evidence, *term.start)[0] * np.array(term.amplitudes)
+        table = raw_columns(self.evidence, term.hypothesis, term.values) * np.array(term.amplitudes)
+        table = table[self.evidence.used]
+        table = table - table.mean(axis=0)
         return bool(np.max(np.linalg.norm(table, axis=0)) < CANCELS * np.linalg.norm(table.sum(axis=1)))
+
+    def _with_simpler_name(self, fit: Fit) -> Fit:
+        """Name what can absorb any change of the paths by a simple effect that explains most of it."""
+        for i, term in enumerate(fit.terms):
+            if term.hypothesis.effect.background or (
+                self.evidence.context.approximate and term.hypothesis.effect.kind == "dynamics"
+            ):
+                without = self.rms(fit_terms(fit.likelihood, fit.starts(i), evaluations=1)) ** 2
+                all_of_it = without - self.rms(fit) ** 2
+                for hypothesis in self.hypotheses:
+                    if hypothesis.effect.names_background and hypothesis.place not in fit.places:
+                        starts = [*fit.starts(i)[:i], (hypothesis, ()), *fit.starts(i)[i:]]
+                        simple = settled(fit_terms(fit.likelihood, starts))
+                        if without - self.rms(simple) ** 2 > MOSTLY * all_of_it:
+                            return simple
+        return fit
 
     def _rivals(self, fit: Fit, index: int) -> tuple[Candidate, ...]:
         """Return what else explains the part of an effect, one for each place, best first."""
         if fit.terms[index].companion:
             return ()
         kept = fit.starts(index)
-        base = fit_terms(self.evidence, kept)
-        found: dict[tuple[str, str, str], Candidate] = {}
-        for hypothesis, values in self.scan.ranked(base, fit.terms):
-            if hypothesis.place not in found and len(found) < EXCHANGED:
-                fitted = fit_terms(self.evidence, [*kept, (hypothesis, values)], evaluations=10)
-                found[hypothesis.place] = Candidate(fit=fitted, index=len(kept), score=self.score(fitted, 1.0))
-        return tuple(sorted(found.values(), key=lambda item: item.fit.cost))
-
-
-def _foreground(fit: Fit) -> list[Term]:
-    """Return the effects that are no background."""
-    return [term for term in fit.terms if not term.hypothesis.effect.background]
+        base = fit_terms(fit.likelihood, kept, evaluations=1)
+        found: dict[Place, Candidate] = {}
+        for hypothesis, values in self._scan.ranked(fit.rest, base, self._cost):
+            if hypothesis.place not in found and hypothesis.place not in fit.places and len(found) < FITTED:
+                other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
+                found[hypothesis.place] = Candidate(term=other.terms[-1], fit=other, rms_um=self.rms(other))
+        return tuple(sorted(found.values(), key=lambda item: item.rms_um))
