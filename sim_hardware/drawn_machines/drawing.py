@@ -115,8 +115,8 @@ class _Draw:
         kinds = rng.choice(PROFILES, 3, p=(0.3, 0.35, 0.15, 0.2))
         hours = float(rng.choice(RECORD_H)), float(rng.uniform(12.0, 60.0)), float(rng.uniform(10.0, 48.0))
         self.record_duty, self.calibration_duty, self.fresh_duty = (
-            draw_duty(rng, self.habits, h, kind=str(kind), calibration=i == 1)
-            for i, (h, kind) in enumerate(zip(hours, kinds, strict=True))
+            draw_duty(rng, self.habits, h, kind=str(kind), use=use)
+            for use, h, kind in zip(("record", "calibration", "fresh"), hours, kinds, strict=True)
         )
         self.heat_known = bool(rng.random() < 0.5)
         self.growth_um = float(rng.uniform(30.0, 120.0))
@@ -164,9 +164,9 @@ class _Draw:
             calibration=self._table(
                 0, calibration, calibration, self.calibration_duty, heat=self.heat_known or self.published
             ),
-            record=self._table(1, healthy, response, self.record_duty, long_gap=True),
-            fresh=self._table(2, fresh, fresh_acted, self.fresh_duty),
-            healthy=self._table(2, fresh, fresh, self.fresh_duty),
+            record=self._table(1, healthy, response, self.record_duty),
+            fresh=self._table(2, fresh, fresh_acted, self.fresh_duty, guarded=True),
+            healthy=self._table(2, fresh, fresh, self.fresh_duty, guarded=True),
             truth=truth,
             noise_um=self.sensors.y_noise_um,
             noise_k=self.sensors.t_q_noise_k,
@@ -260,11 +260,11 @@ class _Draw:
         duty: Duty,
         *,
         heat: bool = False,
-        long_gap: bool = False,
+        guarded: bool = False,
     ) -> Table:
         rng = np.random.default_rng(self.seeds[number])
         return Table(
-            columns=self.sensors.table(rng, response, duty, heat=heat, long_gap=long_gap),
+            columns=self.sensors.table(rng, response, duty, heat=heat, guarded=guarded),
             true_um=healthy.y_um if self.entry.acts_on == "y" else response.y_um,
             part_um=response.y_um - healthy.y_um,
         )

@@ -143,7 +143,7 @@ def profile(rng: np.random.Generator, n: int, kind: str) -> Array:
     return out
 
 
-def draw_duty(rng: np.random.Generator, habits: Habits, hours: float, *, kind: str, calibration: bool = False) -> Duty:
+def draw_duty(rng: np.random.Generator, habits: Habits, hours: float, *, kind: str, use: str = "record") -> Duty:
     """Draw the inputs of a run.
 
     Parameters
@@ -152,10 +152,12 @@ def draw_duty(rng: np.random.Generator, habits: Habits, hours: float, *, kind: s
         Length of the recording.
     kind : str
         Profile of the heat.
-    calibration : bool
-        Whether it is a calibration: mostly from rest, in air without events.
+    use : {"record", "calibration", "fresh"}
+        A calibration is mostly from rest, in air without events. A fresh run always begins at rest: what a start on a warm
+        machine leaves is unknown to any model, and would hide what an effect leaves.
     """
-    before = 0 if rng.random() < (0.8 if calibration else 0.5) else int(rng.uniform(1.0, 8.0) * PER_H)
+    rests = rng.random() < {"record": 0.5, "calibration": 0.8, "fresh": 1.0}[use]
+    before = 0 if rests else int(rng.uniform(1.0, 8.0) * PER_H)
     n = before + round(hours * PER_H)
     hour = habits.start_h + (np.arange(n) - before) / PER_H
     works = (
@@ -171,7 +173,7 @@ def draw_duty(rng: np.random.Generator, habits: Habits, hours: float, *, kind: s
     if not before:  # Half an hour at rest, as a shift begins.
         for name in ("power_w", *CONTROLLED):
             columns[name][: PER_H // 2] = 0.0
-    air = _air(rng, habits, n, hour, events=not calibration)
+    air = _air(rng, habits, n, hour, events=use != "calibration")
     columns["air_degc"] = air
     columns["floor_degc"] = _floor(rng, habits, air)
     columns["coolant_degc"] = _coolant(rng, habits.hall_degc, columns["coolant_flow_lpm"] > 0.0, air)

@@ -65,7 +65,7 @@ class Sensors:
         )
 
     def table(
-        self, rng: np.random.Generator, response: Response, duty: Duty, *, heat: bool = False, long_gap: bool = False
+        self, rng: np.random.Generator, response: Response, duty: Duty, *, heat: bool = False, guarded: bool = False
     ) -> dict[str, Array]:
         """Return the columns of a run.
 
@@ -75,8 +75,8 @@ class Sensors:
             What the sensors see, the time before the recording cut off.
         heat : bool
             Whether a wattmeter reads the heat.
-        long_gap : bool
-            Whether, on a shop floor, half an hour to two hours may be missing.
+        guarded : bool
+            Whether outliers and a long gap are left out even on a shop floor: a service refuses those before its model.
         """
         n = response.y_um.size
         columns: dict[str, Array] = {
@@ -94,14 +94,14 @@ class Sensors:
             )
             columns[name] = true + noise * (true != 0.0)
         if self.shop_floor:
-            self._spoil(rng, columns, long_gap=long_gap)
+            self._spoil(rng, columns, guarded=guarded)
         for name, values in columns.items():
             quantum = self.y_quantum_um if name == "y_um" else 0.01 if name.endswith("degc") else 0.0
             if quantum:
                 columns[name] = np.round(values / quantum) * quantum
         return columns
 
-    def _spoil(self, rng: np.random.Generator, columns: dict[str, Array], *, long_gap: bool) -> None:
+    def _spoil(self, rng: np.random.Generator, columns: dict[str, Array], *, guarded: bool) -> None:
         """Add what a shop floor adds: slow noise, outliers, missing values, a gap, a sensor that steps."""
         n = columns["t_s"].size
         for name, size in (("y_um", rng.uniform(0.1, 0.3)), ("at_degc", 0.02), ("t_q_degc", 0.01)):
@@ -113,13 +113,13 @@ class Sensors:
                 0.5, 3.0
             )
         for name in ("t_q_degc", "at_degc", "y_um"):
-            wild = rng.random(n) < 0.001
+            wild = rng.random(n) < (0.0 if guarded else 0.001)
             wild[:60] = False
             columns[name][wild] += rng.choice([-1.0, 1.0], int(wild.sum())) * rng.uniform(10.0, 60.0, int(wild.sum()))
             missing = rng.random(n) < 0.004
             missing[:60] = False
             columns[name][missing] = np.nan
-        if long_gap and n > 1200 and rng.random() < 0.4:
+        if not guarded and n > 1200 and rng.random() < 0.4:
             first = int(rng.uniform(0.3, 0.7) * n)
             gap = slice(first, first + int(rng.uniform(30.0, 120.0)))
             for name, values in columns.items():

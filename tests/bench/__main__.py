@@ -2,12 +2,13 @@
 
 python -m tests.bench                    everything
 python -m tests.bench speed diagnosis    some of it
+python -m tests.bench drawn --help       drawn machines, with options of their own
 """
 
 import sys
 
 from compensator.blas import in_one_thread
-from tests.bench import audit, diagnosis, faults, identification, machines, shop, speed, spindle
+from tests.bench import audit, diagnosis, drawn, faults, identification, machines, shop, speed, spindle
 from tests.bench.figures import surroundings, table
 
 AREAS = {
@@ -15,6 +16,7 @@ AREAS = {
     "calibration": identification.report,
     "diagnosis": diagnosis.report,
     "machines": machines.report,
+    "drawn": drawn.report,
     "spindle": spindle.report,
     "faults": faults.report,
     "audit": audit.report,
@@ -23,6 +25,9 @@ AREAS = {
 
 
 def main(chosen):
+    if chosen[:1] == ["drawn"] and len(chosen) > 1 and chosen[1].startswith("-"):
+        drawn.main(chosen[1:])
+        return
     unknown = set(chosen) - set(AREAS)
     if unknown:
         sys.exit(f"unknown: {', '.join(sorted(unknown))}; expected some of: {', '.join(AREAS)}")
