@@ -178,7 +178,7 @@ class ConductionMachine:
                 u[here] @ (np.linalg.solve(rate, phi - np.eye(K.shape[0])) @ (B / self.capacity_j_per_k[:, None])).T
             )
         K, B = self.matrices(effect, strength)
-        degc = np.linalg.solve(K, B @ np.where([name in ("air", "floor", "coolant") for name in INPUTS], u[0], 0.0))
+        degc = np.linalg.solve(K, B @ self.inputs(duty.resting(), habits, effect, strength)[0])
         states = np.empty((duty.n, degc.size))
         for i, key in enumerate(level):
             degc = steps[key] @ degc + added[i]

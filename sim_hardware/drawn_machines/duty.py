@@ -102,6 +102,12 @@ class Duty:
         """Return a controlled channel as a share of its largest value."""
         return self.columns[name] / habits.full[name]
 
+    def resting(self) -> Duty:
+        """Return one step before the duty: its first air, floor and coolant, nothing running."""
+        still = {"power_w", "hidden", *CONTROLLED}
+        columns = {name: np.zeros(1) if name in still else values[:1] for name, values in self.columns.items()}
+        return Duty(columns=columns, before=0, profiles=self.profiles)
+
 
 def lag(values: Array, tau_min: float, step_min: float = STEP_S / 60.0) -> Array:
     """Return a signal behind a first-order lag that has settled at the signal's first value.
@@ -153,8 +159,8 @@ def draw_duty(rng: np.random.Generator, habits: Habits, hours: float, *, kind: s
     kind : str
         Profile of the heat.
     use : {"record", "calibration", "fresh"}
-        A calibration is mostly from rest, in air without events. A fresh run always begins at rest: what a start on a warm
-        machine leaves is unknown to any model, and would hide what an effect leaves.
+        A calibration is mostly from rest, in air without events. A fresh run always begins at rest: what a start on a
+        warm machine leaves is unknown to any model, and would hide what an effect leaves.
     """
     rests = rng.random() < {"record": 0.5, "calibration": 0.8, "fresh": 1.0}[use]
     before = 0 if rests else int(rng.uniform(1.0, 8.0) * PER_H)

@@ -168,7 +168,8 @@ class LumpedMachine:
         per_step = STEP_S / self.capacity_j_per_k
         if np.max(per_step * (b.max(axis=0) + 2.0 * np.abs(self.across).T @ links)) > 1.0:
             raise ValueError(f"{effect} of {strength:g}: too strong for steps of {STEP_S:g} s")
-        degc = self._settled(air[0], a[0], b[0], links)
+        rest_a, rest_b = self.linear(duty.resting(), habits, effect, strength)
+        degc = self._settled(air[0], rest_a[0], rest_b[0], links)
         states = np.empty((duty.n, degc.size))
         for i in range(duty.n):
             degc = degc + per_step * self.flows(degc, air[i], a[i], b[i], links)

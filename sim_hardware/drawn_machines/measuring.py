@@ -129,8 +129,8 @@ class Sensors:
 
 def _slow(rng: np.random.Generator, n: int, tau_min: float, std: float) -> Array:
     """Return noise with a time constant, its first value 0."""
-    noise = lag(rng.normal(0.0, 1.0, n), tau_min, 1.0)
-    return np.asarray(std * (noise - noise[0]) / max(float(np.std(noise)), 1e-12))
+    noise = lag(np.concatenate(([0.0], rng.normal(0.0, 1.0, n - 1))), tau_min, 1.0)
+    return np.asarray(std * noise / np.std(noise))
 
 
 def mismeasured_t_q(t_q_degc: Array, at_degc: Array, effect: str, strength: float) -> Array:

@@ -4,8 +4,8 @@ Each machine of `sim_hardware.drawn_machines` is calibrated by `identify` on a r
 ones have the published model), the record with the effect is diagnosed, and the extended model runs freely on a fresh
 run: all through `compensator`'s face, with the tables that a user would have.
 
-named cleanly   a right name of the true effect, and no other effect; where there is none, nothing. What this physics has
-                on every run apart from the effect (`truth.inherent`) counts neither way.
+named cleanly   a right name of the true effect, and no other effect; where there is none, nothing. What this physics
+                has on every run apart from the effect (`truth.inherent`) counts neither way.
 error           true displacement on the fresh run less the prediction, about its mean over the first 10 min.
 best            the error of the calibration where the effect is absent (`healthy`: the same run without it).
 removed %       of the mean square that the effect adds to the error: 100 (base² − extended²) / (base² − best²).
@@ -104,6 +104,8 @@ def run(cases, out, *, workers, resume=False):
     results = json.loads(out.read_text(encoding="utf-8")) if resume and out.exists() else []
     done = {(r["family"], r["seed"]) for r in results}
     cases = [case for case in cases if (case.family, case.seed) not in done]
+    # Families by turns, so that a run that is cut off says something of each.
+    cases.sort(key=lambda case: (case.seed, FAMILIES.index(case.family)))
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # Of the processes that are started now.
         os.environ.setdefault(name, "1")
     with ProcessPoolExecutor(workers) as pool:
