@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sim_hardware.drawn_machines.catalogue import CATALOGUE, EFFECTS
 from sim_hardware.drawn_machines.conduction import ConductionMachine
 from sim_hardware.drawn_machines.duty import PROFILES, Duty, Habits, draw_duty
-from sim_hardware.drawn_machines.fairness import believed_um, imitated_um
+from sim_hardware.drawn_machines.fairness import error_um, imitated_um
 from sim_hardware.drawn_machines.lumped import LumpedMachine
 from sim_hardware.drawn_machines.machine import Machine, Table, Truth
 from sim_hardware.drawn_machines.measuring import Sensors, mismeasured_t_q, mismeasured_y
@@ -143,7 +143,8 @@ class _Draw:
         fresh_acted = self._run(self.fresh_duty, strength)
         for each in (fresh, fresh_acted):
             self._within(each, "fresh")
-        if self.entry.deployable and self._size_um(fresh, fresh_acted) < 0.5 * LEAST_SMALL_UM:
+        least = 0.5 * (LEAST_SMALL_UM if self.effect in SMALL else SIZE_UM[0])
+        if self.entry.deployable and self._size_um(fresh, fresh_acted) < least:
             raise _UnfairError("the effect does not act on the fresh run")
         if self.entry.acts_on == "y":
             fresh_acted = fresh
@@ -229,9 +230,7 @@ class _Draw:
         return strength, unit, self._within(response, "record")
 
     def _size_um(self, healthy: Response, response: Response) -> float:
-        if self.entry.acts_on == "t_q":
-            return believed_um(healthy, response)
-        return float(np.std(response.y_um - healthy.y_um))
+        return float(np.std(error_um(healthy, response)))
 
     def _check_size(self, size_um: float) -> None:
         if self.effect == "none":
@@ -248,7 +247,7 @@ class _Draw:
         if own <= {""}:
             return
         channels = {name: self.record_duty.columns[name] for name in self.sensors.logged if name not in own}
-        left = imitated_um(response.y_um - healthy.y_um, healthy, channels, self.record_duty)
+        left = imitated_um(error_um(healthy, response), healthy, channels, self.record_duty)
         if left < OVER_IMITATION * float(np.hypot(self.sensors.y_noise_um, 0.3 * self.sensors.shop_floor)):
             raise _UnfairError("another channel does the same")
 

@@ -28,30 +28,29 @@ def left_um(part_um: Array, columns: Array) -> float:
     return float(np.std(part_um - design @ weights))
 
 
-def imitated_um(part_um: Array, healthy: Response, channels: Mapping[str, Array], duty: Duty) -> float:
-    """Return what the best imitation of an effect leaves, µm standard deviation.
+def imitated_um(error_um: Array, healthy: Response, channels: Mapping[str, Array], duty: Duty) -> float:
+    """Return what the best imitation of an effect's error leaves, µm standard deviation.
 
     Imitations: each other channel through lags; a ramp; heat and air together through lags, as if the model were wrong.
     """
-    n = part_um.size
+    n = error_um.size
     rivals = [bank(minutes(values)[-n:]) for values in channels.values()]
     rivals.append(np.arange(n, dtype=np.float64)[:, None])
     rivals.append(np.column_stack((bank(healthy.heat_w), bank(healthy.at_degc))))
-    return min(left_um(part_um, columns) for columns in rivals)
+    return min(left_um(error_um, columns) for columns in rivals)
 
 
-def believed_um(healthy: Response, response: Response) -> float:
-    """Return the error of a prediction that believes a mismeasured T_Q, µm standard deviation.
+def error_um(healthy: Response, response: Response) -> Array:
+    """Return the error that an effect makes in a prediction from T_Q and AT, µm, shape (n,).
 
-    Y is regressed on lags of the healthy T_Q − AT and of AT; the same weights are then given the mismeasured one.
+    Y is regressed on lags of T_Q − AT and of AT where the effect is absent; the same weights are then given T_Q as the
+    effect alters it. So heat that T_Q shows is no error, and a T_Q that is late or loose is one although Y is right.
     """
     air = bank(healthy.at_degc)
-    difference, wrong = (bank(r.t_q_degc - r.at_degc) for r in (healthy, response))
+    difference, altered = (bank(r.t_q_degc - r.at_degc) for r in (healthy, response))
     design = np.column_stack((difference, air, np.ones(air.shape[0])))
     scale = np.maximum(np.linalg.norm(design, axis=0), 1e-12)
     # Bounded weights: a direct part of noise-free signals would otherwise take any size.
-    penalty = 1e-4 * np.eye(scale.size)
-    weights = np.linalg.lstsq(
-        np.vstack((design / scale, penalty)), np.concatenate((healthy.y_um, np.zeros(scale.size))), rcond=None
-    )[0]
-    return float(np.std((wrong - difference) @ (weights / scale)[: difference.shape[1]]))
+    bounded = np.vstack((design / scale, 1e-4 * np.eye(scale.size)))
+    weights = np.linalg.lstsq(bounded, np.concatenate((healthy.y_um, np.zeros(scale.size))), rcond=None)[0] / scale
+    return np.asarray(response.y_um - healthy.y_um - (altered - difference) @ weights[: difference.shape[1]])

@@ -55,7 +55,7 @@ class Truth:
     unit : str
         Unit of that.
     size_um : float
-        Standard deviation of what it does on the record, µm: to Y, or to a prediction that believes T_Q.
+        Standard deviation of the error that it makes on the record in a prediction from T_Q and AT, µm.
     """
 
     effect: str
