@@ -1,13 +1,14 @@
 """All figures of the project, in one table at the end: `make bench`. Nothing passes or fails here.
 
-python -m tests.bench                    everything
+python -m tests.bench                    everything but `drawn`, which takes an hour or more
 python -m tests.bench speed diagnosis    some of it
+python -m tests.bench drawn --help       drawn machines, with options of their own
 """
 
 import sys
 
 from compensator.blas import in_one_thread
-from tests.bench import audit, diagnosis, faults, identification, machines, shop, speed, spindle
+from tests.bench import audit, diagnosis, drawn, faults, identification, machines, shop, speed, spindle
 from tests.bench.figures import surroundings, table
 
 AREAS = {
@@ -15,6 +16,7 @@ AREAS = {
     "calibration": identification.report,
     "diagnosis": diagnosis.report,
     "machines": machines.report,
+    "drawn": drawn.report,
     "spindle": spindle.report,
     "faults": faults.report,
     "audit": audit.report,
@@ -23,6 +25,9 @@ AREAS = {
 
 
 def main(chosen):
+    if chosen[:1] == ["drawn"] and len(chosen) > 1 and chosen[1].startswith("-"):
+        drawn.main(chosen[1:])
+        return
     unknown = set(chosen) - set(AREAS)
     if unknown:
         sys.exit(f"unknown: {', '.join(sorted(unknown))}; expected some of: {', '.join(AREAS)}")
@@ -30,7 +35,7 @@ def main(chosen):
     print(where + "\n", flush=True)
     figures = []
     try:
-        for name in chosen or AREAS:
+        for name in chosen or [name for name in AREAS if name != "drawn"]:
             figures.extend(AREAS[name]())
     finally:  # what was measured in an hour is not lost with what goes wrong after it
         print(f"\n{where}\n\n{table(figures)}")
