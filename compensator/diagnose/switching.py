@@ -111,6 +111,8 @@ class _Pursuit:
             step[1:] = (1.0 - part) * shape[1:room] + part * shape[: room - 1]
             step[0] *= 1.0 - part
             table[begin[record] + first : begin[record] + sizes[record], column] = step
+        if not where:
+            return np.zeros((self._residual.size, 0))
         averaged = self._averaged(table)
         whole = np.linalg.norm(averaged - averaged.mean(axis=0), axis=0)
         table = self._projection @ averaged
