@@ -1,0 +1,203 @@
+"""What all logged channels together explain, in a regularised way and without naming anything.
+
+Every channel acts on Y through a filter bank; the gains of a channel have a Gaussian prior of a common size, the sizes
+of all channels are nearly the same and learned from the data with the slow rest (empirical Bayes). Nothing is chosen,
+so nothing is chosen wrongly: it is the best linear use of the channels, a *ceiling* for what named effects explain,
+and a *remainder* that can be deployed beside them. Where the data say little its gains stay near zero, and their
+covariance says so.
+
+Sources: Tipping, Sparse Bayesian learning (2001); Pillonetto, Dinuzzo, Chen, De Nicolao, Ljung, Kernel methods in
+system identification (Automatica 2014).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+from compensator.arrays import Matrix, Vector
+from compensator.diagnose.evidence import Evidence
+from compensator.diagnose.likelihood import Points, Rest, Whitening
+from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, MOST_ROWS, Regression
+
+#: Lags of the filter bank, min; those that are longer than a third of the record are left out.
+LAGS_MIN = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0)
+#: Standard deviation of the logarithm of a channel's size about their mean: nearly one size for all.
+ALIKE = 0.2
+#: The same of the mean size about a tenth of the deformation's spread, and of the base's own paths.
+MEAN_FOLDS, PATH_FOLDS = 2.0, 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Regressed:
+    """A regularised linear response of all channels.
+
+    Parameters
+    ----------
+    effect : Regression
+        With the covariance of its gains.
+    added : numpy.ndarray, shape (n,)
+        What it adds to y on every sample, µm.
+    log_evidence : float
+        Logarithm of the probability of the data with it.
+    rest : Rest
+        What it leaves unexplained.
+    """
+
+    effect: Regression
+    added: Vector
+    log_evidence: float
+    rest: Rest
+
+
+class Background:
+    """All channels through filter banks.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        Residual and signals.
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        context = evidence.context
+        self._evidence = evidence
+        base = [DRIVE["heat" if context.has_ttf else "direct"], *([AMBIENT] if context.has_ambient else [])]
+        inputs = [(name, 1.0) for name in base]
+        inputs += [(name, 1.0) for name in context.channels]
+        inputs += [(name, 2.0) for name in context.channels if name in context.zeroed]
+        inputs = inputs[:MOST_CHANNELS]
+        taus = tuple(tau for tau in LAGS_MIN if tau <= context.minutes / 3.0)
+        self._template = Regression(
+            channels=tuple(name for name, _ in inputs),
+            exponents=tuple(exponent for _, exponent in inputs),
+            taus_min=taus,
+            gains=((0.0,) * len(taus),) * len(inputs),
+        )
+        blocks = self._template.blocks(context.period_min)
+        self._columns = np.concatenate([self._template.columns(record, blocks) for record in evidence.signals])
+        self._groups = np.repeat(np.arange(len(inputs)), len(taus))
+        self._is_path = np.arange(len(inputs)) < len(base)
+
+    def fitted(self, points: Points, explained: Vector, start: Rest, steps: int = 40) -> Regressed:
+        """Fit to what named effects leave.
+
+        Parameters
+        ----------
+        points : Points
+            Which samples take part.
+        explained : numpy.ndarray, shape (points,)
+            What the named effects add, µm.
+        start : Rest
+            Where the search of the rest begins.
+        steps : int
+            Most evaluations.
+        """
+        return _Problem(self, points, explained).solved(start, steps)
+
+    def response(self, effect: Regression) -> Vector:
+        """Return what a regression over these channels adds to y on every sample, µm."""
+        return np.asarray(self._columns @ np.ravel(effect.gains))
+
+
+class _Problem:
+    """The search of the sizes of all channels and of the rest."""
+
+    def __init__(self, background: Background, points: Points, explained: Vector) -> None:
+        self.background, self.points = background, points
+        table = points.averaged(background._columns)
+        self.scale = np.std(table[points.used], axis=0)
+        self.scale[self.scale < 1e-12] = np.inf
+        self.table = table / self.scale
+        self.target = points.residual - explained
+        self.groups, self.is_path = background._groups, background._is_path
+        self.typical = np.log([0.1 * points.spread_um, points.own_um])
+
+    def solved(self, start: Rest, steps: int) -> Regressed:
+        """Return the regression with the most probable sizes."""
+        count = self.is_path.size
+        sizes = np.where(self.is_path, self.typical[1], self.typical[0] - 1.0)
+        begin = np.concatenate([np.log([start.slow_um, start.tau_min]), sizes])
+        bounds = [(np.log(1e-3), np.log(1e3)), (np.log(3.0), np.log(3e3)), *[(-12.0, 8.0)] * count]
+        found = minimize(
+            self._with_gradient, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": steps}
+        )
+        return self._result(np.asarray(found.x), -float(found.fun))
+
+    def _rest(self, x: Vector) -> Rest:
+        return dataclasses.replace(
+            self.points.typical_rest(), slow_um=float(np.exp(x[0])), tau_min=float(np.exp(x[1])), own_um=1e-6
+        )
+
+    def _white(self, x: Vector) -> tuple[Matrix, float, int]:
+        nuisances = self.points.random(0.0)
+        whitening = Whitening(self.points, self._rest(x))
+        weights = np.exp(x[2:])[self.groups]
+        white = whitening.of(np.column_stack([self.target, nuisances, self.table]))
+        white[:, 1 + nuisances.shape[1] :] *= weights
+        return white, whitening.log_det, nuisances.shape[1]
+
+    def _value(self, x: Vector) -> tuple[float, Vector]:
+        white, log_det, fixed = self._white(x)
+        gram = white[:, 1:].T @ white
+        factor = cho_factor(np.eye(gram.shape[0]) + gram[:, 1:], lower=True, check_finite=False)
+        mean = cho_solve(factor, gram[:, 0], check_finite=False)
+        surprise = white[:, 0] @ white[:, 0] - gram[:, 0] @ mean + log_det + 2.0 * np.log(np.diag(factor[0])).sum()
+        variance = np.diag(cho_solve(factor, np.eye(mean.size), check_finite=False))
+        slopes = (variance - 1.0 + mean**2)[fixed:]
+        return -0.5 * float(surprise), np.bincount(self.groups, weights=slopes, minlength=self.is_path.size)
+
+    def _prior(self, x: Vector) -> tuple[float, Vector]:
+        sizes, channels = x[2:], ~self.is_path
+        slopes = np.zeros(x.size)
+        value = 0.0
+        logs = np.log([self.points.typical_rest().slow_um, self.points.typical_rest().tau_min])
+        value -= 0.5 * float(np.sum((x[:2] - logs) ** 2))
+        slopes[:2] -= x[:2] - logs
+        if channels.any():
+            mean = sizes[channels].mean()
+            apart = sizes[channels] - mean
+            off = mean - self.typical[0]
+            value -= 0.5 * float(np.sum(apart**2)) / ALIKE**2 + 0.5 * (off / MEAN_FOLDS) ** 2
+            slopes[2:][channels] -= apart / ALIKE**2 + off / MEAN_FOLDS**2 / channels.sum()
+        path = (sizes[self.is_path] - self.typical[1]) / PATH_FOLDS
+        value -= 0.5 * float(np.sum(path**2))
+        slopes[2:][self.is_path] -= path / PATH_FOLDS
+        return value, slopes
+
+    def _with_gradient(self, x: Vector) -> tuple[float, Vector]:
+        (value, sizes), (prior, slopes) = self._value(x), self._prior(x)
+        slopes[2:] += sizes
+        for i in range(2):
+            moved = x.copy()
+            moved[i] += 1e-3
+            slopes[i] += (self._value(moved)[0] - value) / 1e-3
+        return -(value + prior), -slopes
+
+    def _result(self, x: Vector, log_evidence: float) -> Regressed:
+        white, _, fixed = self._white(x)
+        gram = np.eye(white.shape[1] - 1) + white[:, 1:].T @ white[:, 1:]
+        weights = np.exp(x[2:])[self.groups] / self.scale
+        covariance = np.linalg.inv(gram)[fixed:, fixed:]
+        gains = (np.linalg.solve(gram, white[:, 1:].T @ white[:, 0])[fixed:]) * weights
+        root = np.linalg.cholesky(covariance + 1e-12 * np.eye(gains.size)) * weights[:, None]
+        # The directions of the covariance that matter most for y, over what was seen.
+        seen = self.table[self.points.used] * np.where(np.isfinite(self.scale), self.scale, 0.0)
+        _, _, directions = np.linalg.svd((seen - seen.mean(axis=0)) @ root, full_matrices=False)
+        factor = (root @ directions[:MOST_ROWS].T).T
+        template, lags = self.background._template, len(self.background._template.taus_min)
+        effect = dataclasses.replace(
+            template,
+            gains=tuple(map(tuple, gains.reshape(-1, lags).tolist())),
+            std_factor=tuple(map(tuple, factor.tolist())),
+        )
+        return Regressed(
+            effect=effect,
+            added=self.background.response(effect),
+            log_evidence=log_evidence,
+            rest=self._rest(x),
+        )
