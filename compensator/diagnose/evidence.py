@@ -150,6 +150,7 @@ def signals_of(model: ThermalModel, run: Run, number: int = 0) -> RecordSignals:
         channels={name: values for name, values in run.channels.items() if np.isfinite(values).all()},
         dtf=model.dtf.sampled,
         tdtf=tdtf,
+        share_of_ambient=model.dtf.sampled.response(drive_of(model, run.ambient_k)),
         number=number,
     )
 
@@ -242,5 +243,6 @@ def _context(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordS
         spans=spans,
         zeroed=frozenset(zeroed),
         approximate=model.held_out_rms_um is not None,
+        has_late_t_q=model.late_t_q is not None,
         functions={name: (path.b, path.a) for name, path in paths.items()},
     )

@@ -22,6 +22,7 @@ import numpy as np
 
 from compensator.errors import ModelError
 from compensator.model.effects import Effect
+from compensator.model.effects.lateness import Lateness
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction, continuous_image
 
 Kind = Literal["heat", "direct"]
@@ -153,6 +154,11 @@ class ThermalModel:
 
     def __post_init__(self) -> None:
         check_runnable(self)
+
+    @property
+    def late_t_q(self) -> Lateness | None:
+        """By how much T_Q is late, where an effect says so."""
+        return next((effect.lateness for effect in self.effects if effect.lateness is not None), None)
 
     def with_alternative(self, name: str) -> ThermalModel:
         """Return the model with one of its alternative paths in place.

@@ -1,7 +1,7 @@
 """`delay`: a path or its sensor is delayed.
 
 path     y += L(lag) · y_path(t − d) − y_path(t)
-sensor   y += y_path(t + d) + lag · dy_path/dt (t + d) − y_path(t): the machine was where the delayed sensor is now
+T_Q      T_Q = L(lag) · (TTF · heat + a)(t − d), or the heat alone is late: corrected where the heat is estimated
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Block, Delay, Lag, S, shifted
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits
+from compensator.model.effects.lateness import Lateness
 from compensator.model.effects.signals import RecordSignals, Signals
 
 #: Samples that a path is run on beyond a record's end.
@@ -57,36 +58,47 @@ class DelayedPath(Effect):
 
 @register
 class DelayedSensor(DelayedPath):
-    """A delayed sensor: the correction would need the future."""
+    """A late T_Q: the observer corrects it, so that every other effect gets the corrected signals too."""
 
-    deployable = False
+    path: str = text("TTF", "DTF")
+    form: str = text("sensor", "path")
+    delay_min: float = number(0.0, 240.0)
+    lag_min: float = number(0.0, 240.0)
+
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
+        return ()
+
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
+        """Return 0: the shares of the paths are corrected already."""
+        return signals.drive - signals.drive
+
+    @property
+    def lateness(self) -> Lateness:
+        return Lateness(lag_min=self.lag_min, delay_min=self.delay_min, of_ambient=self.form == "sensor")
 
     def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
-        """Return what the share would have been with an immediate sensor, less what it is."""
+        """Return what the share would have been with an immediate sensor, less what it is; it uses the future."""
         share, period_min = record.share(self.path), record.period_min
-        # Beyond the end of the record the path goes on with its drive as it is.
-        drive = record.source(self.path)
-        longer = record.function(self.path).response(np.concatenate((drive, np.full(AHEAD, drive[-1]))))
-        early = shifted(longer, -self.delay_min / period_min)
+        late = share + record.share_of_ambient if self.form == "sensor" else share
+        early = shifted(late, -self.delay_min / period_min)
         early = early + self.lag_min * np.gradient(early, period_min)
-        return np.asarray(early[: share.size] - share)[:, None]
+        return np.asarray(early - late)[:, None]
 
     def explain(self, rms_um: float) -> str:
-        sensor = "T_Q" if self.path == "TTF" else "AT"
+        what = "The sensor T_Q is late" if self.form == "sensor" else "The heat reaches T_Q late,"
         return (
-            f"The sensor {sensor} is delayed by {self._times()}, so the model is wrong after each change of the "
-            f"heat ({rms_um:.2g} µm rms). That cannot be corrected in real time: move the sensor closer to the source, "
-            "or mount it with better thermal contact."
+            f"{what} by {self._times()}, so the model is wrong after each change of the heat ({rms_um:.2g} µm rms). "
+            "The extended model corrects this in real time, except for the first minutes after a change. Better: move "
+            "the sensor closer to the source, or mount it with better thermal contact."
         )
 
     @classmethod
     def propose(cls, context: Context) -> Iterator[Hypothesis]:
-        """Propose T_Q with a dead time, a lag or both; in a direct model AT with one of them."""
-        if "DTF" not in context.paths:
+        """Propose T_Q with a dead time, a lag or both, with and without its share of the ambient."""
+        if "DTF" not in context.paths or context.has_late_t_q:
             return
-        path, prefix = ("TTF", "") if context.has_ttf else ("DTF", "sensor, ")
-        delayed = cls(path=path, delay_min=0.0, lag_min=0.0)
-        yield Hypothesis(effect=delayed, form=f"{prefix}dead time", free=(DELAY,))
-        yield Hypothesis(effect=delayed, form=f"{prefix}lag", free=(LAG,))
-        if context.has_ttf:
-            yield Hypothesis(effect=delayed, form="dead time and lag", free=(DELAY, LAG))
+        path = "TTF" if context.has_ttf else "DTF"
+        for form in ("sensor", "path"):
+            late = cls(path=path, form=form, delay_min=0.0, lag_min=0.0)
+            for words, free in (("dead time", (DELAY,)), ("lag", (LAG,)), ("dead time and lag", (DELAY, LAG))):
+                yield Hypothesis(effect=late, form=f"{form}, {words}", free=free)
