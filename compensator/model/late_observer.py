@@ -8,14 +8,18 @@ the filter (`Observer`).
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.arrays import NAN, Matrix
+from compensator.arrays import NAN, Matrix, Vector
 from compensator.model.observer import Observer, ObserverState
 from compensator.model.thermal_model import ThermalModel
 
+#: Samples after which the variance of y is steady, whatever the slowest modes still do.
+_STEADY_AFTER = 120
 #: Additional variance that stands for an AT that is missing.
 _MISSING = -1.0
 #: Value of AT and additional variance, K and K²; −1 where it is missing.
@@ -115,3 +119,55 @@ def observer_of(model: ThermalModel) -> Observer:
     """Return the observer that a model needs."""
     late = model.late_t_q
     return Observer(model) if late is None or late.samples(model.period_s) == 0 else LateObserver(model)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observed:
+    """What an observer makes of a record.
+
+    Parameters
+    ----------
+    drive, ambient_k : numpy.ndarray, shape (n,)
+        Heat, W (T_Q − AT, K, in a direct model), and change of the ambient, K.
+    y_dtf_um, y_tdtf_um : numpy.ndarray, shape (n,)
+        Share of each path, µm.
+    """
+
+    drive: Vector
+    ambient_k: Vector
+    y_dtf_um: Vector
+    y_tdtf_um: Vector
+
+
+def observe(model: ThermalModel, t_q_k: Vector, at_k: Vector) -> Observed:
+    """Run the observer of a model over a record from rest, with the bits of the engine.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        The model.
+    t_q_k, at_k : numpy.ndarray, shape (n,)
+        T_Q and AT as changes from their reference, K; NaN where missing.
+    """
+    observer = observer_of(model)
+    rows = []
+    for t_q, at in zip(t_q_k.tolist(), at_k.tolist(), strict=True):
+        observer.step(t_q, at)
+        rows.append((observer.drive, observer.ambient_k, *observer.shares_um()))
+    drive, ambient_k, dtf, tdtf = np.array(rows).T
+    return Observed(drive=drive, ambient_k=ambient_k, y_dtf_um=dtf, y_tdtf_um=tdtf)
+
+
+def late_variance_um2(model: ThermalModel) -> float:
+    """Return by how much the correction of a late T_Q raises the steady variance of y, µm²."""
+    if model.late_t_q is None:
+        return 0.0
+    prompt = dataclasses.replace(model, effects=tuple(e for e in model.effects if e.lateness is None))
+    late_um2, prompt_um2 = (_steady_variance_um2(observer_of(m)) for m in (model, prompt))
+    return max(late_um2 - prompt_um2, 0.0)
+
+
+def _steady_variance_um2(observer: Observer) -> float:
+    for _ in range(_STEADY_AFTER):
+        observer.step(0.0, 0.0)
+    return observer.y_variance_um2

@@ -197,6 +197,12 @@ def check_runnable(model: ThermalModel) -> None:
             _check_path(model, name, path)
     if model.ttf is not None:
         check_inverse(model.name, model.ttf.sampled)
+    late = [effect for effect in model.effects if effect.lateness is not None]
+    expected = "DTF" if model.ttf is None else "TTF"
+    if len(late) > 1:
+        raise ModelError(f"model {model.name}: {len(late)} effects of a late T_Q, expected one at most")
+    if late and late[0].path != expected:
+        raise ModelError(f"model {model.name}: effect delay of T_Q: path = {late[0].path!r}, expected {expected!r}")
 
 
 def _check_path(model: ThermalModel, name: str, path: Path) -> None:

@@ -62,7 +62,7 @@ def test_the_extended_model_removes_the_error_on_a_fresh_day(kind):
     assert diagnosis.effects[0].rms_after_um < 1.3 * diagnosis.noise_floor_um
 
 
-@pytest.mark.parametrize("kind", ["late sensor", "drift", "step", "periodic", "unobserved"])
+@pytest.mark.parametrize("kind", ["drift", "step", "periodic", "unobserved"])
 def test_what_cannot_be_deployed_is_explained_and_left_out(kind):
     scenario = draw(kind, 8)
     columns, _, _ = record([scenario], 1008, 24.0)

@@ -58,7 +58,7 @@ class DelayedPath(Effect):
 
 @register
 class DelayedSensor(DelayedPath):
-    """A late T_Q: the observer corrects it, so that every other effect gets the corrected signals too."""
+    """A late T_Q: the observer corrects it, so that every other effect gets corrected signals, too."""
 
     path: str = text("TTF", "DTF")
     form: str = text("sensor", "path")
@@ -98,7 +98,8 @@ class DelayedSensor(DelayedPath):
         if "DTF" not in context.paths or context.has_late_t_q:
             return
         path = "TTF" if context.has_ttf else "DTF"
+        searched = {"dead time": (DELAY,), "lag": (LAG,), "dead time and lag": (DELAY, LAG)}
         for form in ("sensor", "path"):
             late = cls(path=path, form=form, delay_min=0.0, lag_min=0.0)
-            for words, free in (("dead time", (DELAY,)), ("lag", (LAG,)), ("dead time and lag", (DELAY, LAG))):
+            for words, free in searched.items():
                 yield Hypothesis(effect=late, form=f"{form}, {words}", free=free)
