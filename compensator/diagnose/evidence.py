@@ -26,7 +26,7 @@ from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Context
 from compensator.model.effects.signals import RecordSignals
 from compensator.model.engine import Engine
-from compensator.model.late_observer import late_variance_um2, observe
+from compensator.model.late_observer import observe
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -218,7 +218,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     if used.sum() < 60:
         names = ", ".join(dict.fromkeys(run.name for run in runs))
         raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
-    noise_um = math.hypot(noise_floor(model, runs), math.sqrt(late_variance_um2(model)))
+    noise_um = math.hypot(noise_floor(model, runs), _late_error_um(model, runs, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)
     nuisances = np.asarray(block_diag(*(_nuisances(record, context) for record in signals)))
@@ -233,6 +233,19 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         context=context,
         noise=NoiseTest(count=int(used.sum()), noise_um=noise_um, own_error_um=own_error(model, noise_um, spread_um)),
     )
+
+
+def _late_error_um(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordSignals]) -> float:
+    """Return what the engine does not know in time of a late T_Q: against a correction with the future, µm rms."""
+    late = next((effect for effect in model.effects if effect.lateness is not None), None)
+    if late is None:
+        return 0.0
+    prompt = dataclasses.replace(model, effects=tuple(effect for effect in model.effects if effect is not late))
+    errors = []
+    for run, own in zip(runs, signals, strict=True):
+        seen = signals_of(prompt, run)
+        errors.append(own.y_dtf_um - seen.y_dtf_um - late.columns(seen, ())[:, 0])
+    return float(np.std(np.concatenate(errors)))
 
 
 def _basis(nuisances: Matrix, used: Mask) -> Matrix:

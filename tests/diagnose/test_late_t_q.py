@@ -17,6 +17,7 @@ from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.physics.effects import LateSensor
 from tests.diagnose.scenarios import Scenario, record, signals
 from tests.identify.quill_runs import runs_from
+from tests.model.test_late_t_q import run_of
 from tests.service.records import direct
 
 QUILL = load_model("quill")
@@ -64,9 +65,10 @@ def test_a_late_t_q_is_named_deployed_and_removed(lag_min: float, delay_min: flo
     assert "in real time" in effect.explanation
     assert removed(found, [late], []) > least
     # What is promised is what the engine leaves, and not what could be known afterwards.
-    left = np.sqrt(error(found.model, runs_from(record([late], 5100, 24.0)[0])[0], record([], 5100, 24.0)[1]))
-    assert found.after.rms_um == pytest.approx(np.hypot(left, 0.3), rel=0.25)
-    assert effect.rms_after_um == pytest.approx(found.after.rms_um, rel=0.1)
+    [run] = runs_from(columns)
+    left_um = np.sqrt(error(found.model, run, run.y_um))
+    assert found.after.rms_um == pytest.approx(left_um, rel=0.1)
+    assert effect.rms_after_um == pytest.approx(left_um, rel=0.1)
 
 
 def test_another_effect_beside_it_is_fitted_to_what_it_gets() -> None:
@@ -92,7 +94,7 @@ def test_the_signals_of_a_model_that_corrects_it_are_the_engines() -> None:
 
 
 def test_a_late_thermocouple_of_another_hand() -> None:
-    """Its lag and dead time act on the ambient, too, ten seconds a step, and the service's means are over a minute."""
+    """Ten seconds a step, and means over a minute."""
     duty = Duty.working_day(43, hours=36.0)
     sensors = usual_sensors(duty.extra_names, temperature_noise_k=0.05, y_noise_um=1.0)
 
@@ -104,11 +106,23 @@ def test_a_late_thermocouple_of_another_hand() -> None:
     late = LateSensor(delay_s=60.0, lag_s=180.0)
     found = diagnose(QUILL, runs_from(columns([late], 6)))
     assert [e.place for e in found.effects] == [PLACE]
-    assert found.effects[0].form.startswith("sensor")
+    # That thermocouple is late for the heat and prompt for the ambient.
+    assert found.effects[0].form.startswith("path")
     fresh, prompt = (runs_from(columns(effects, 7))[0] for effects in ([late], []))
     noise = error(QUILL, prompt, prompt.y_um)
     base, after = (error(model, fresh, fresh.y_um) for model in (QUILL, found.model))
     assert (base - after) / (base - noise) > 0.9
+
+
+def test_a_thermocouple_that_is_late_for_the_ambient_too() -> None:
+    t_q, at, y = run_of(1104, 36.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
+    noise = np.random.default_rng(2).normal(0.0, 0.3, y.size)
+    found = diagnose(QUILL, runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y + noise}))
+    assert [e.place for e in found.effects] == [PLACE]
+    assert found.effects[0].form.startswith("sensor")
+    t_q, at, y = run_of(1105, 24.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
+    [fresh] = runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y})
+    assert error(found.model, fresh, y) < 0.02 * error(QUILL, fresh, y)
 
 
 def test_a_direct_model_names_its_sensor() -> None:
