@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Start, Term, columns_of, fit_terms, late_term
+from compensator.diagnose.fit import Fit, Start, Term, as_deployed, columns_of, fit_terms, late_term
 from compensator.diagnose.noise import lead_noise_um2
 from compensator.diagnose.scan import Scan
 from compensator.diagnose.switching import switchings
@@ -285,21 +285,16 @@ class Search:
 
         What the correction leaves after a change of the heat is no further effect.
         """
-        late = late_term(fit)
-        if late is None or len(fit.terms) < 2:
-            return fit
-        corrected, _ = self.evidence.corrected(late.effect)
-        others = [term for term in fit.terms if term is not late]
-        while others:
-            whole = fit_terms(corrected, [term.start for term in others])
-            fewer = [fit_terms(corrected, [o.start for o in others if o is not term]) for term in others]
-            out = min(range(len(fewer)), key=lambda i: fewer[i].cost)
-            if self._is_worth(others[out].hypothesis, fewer[out], whole):
+        while (late := late_term(fit)) is not None and len(fit.terms) > 1:
+            whole, _ = as_deployed(self.evidence, fit)
+            others = [i for i, term in enumerate(fit.terms) if term is not late]
+            fewer = {i: fit_terms(self.evidence, fit.starts(i)) for i in others}
+            deployed = {i: as_deployed(self.evidence, fewer[i])[0] for i in others}
+            out = min(others, key=lambda i: deployed[i].cost)
+            if self._is_worth(fit.terms[out].hypothesis, deployed[out], whole):
                 break
-            del others[out]
-        if len(others) + 1 == len(fit.terms):
-            return fit
-        return fit_terms(self.evidence, [term.start for term in fit.terms if term is late or term in others])
+            fit = fewer[out]
+        return fit
 
     def _is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
