@@ -67,6 +67,8 @@ class Estimate(ABC):
         signal: Vector,
         rms_um: tuple[float, float],
         others: Iterable[tuple[Term, float]],
+        *,
+        searched_um: float | None = None,
     ) -> FoundEffect:
         """Return an effect with its explanation and rivals.
 
@@ -82,6 +84,8 @@ class Estimate(ABC):
             Residual without and with it, µm.
         others : iterable of (Term, float)
             Other explanations and the rms that each leaves, µm, best first.
+        searched_um : float, optional
+            What the search left, which rivals are compared with, where the deployed effect leaves more.
         """
         before, after = rms_um
         return FoundEffect(
@@ -90,5 +94,5 @@ class Estimate(ABC):
             rms_before_um=before,
             rms_after_um=after,
             signal=signal,
-            rivals=rivals_of(term, others, after),
+            rivals=rivals_of(term, others, after if searched_um is None else searched_um),
         )

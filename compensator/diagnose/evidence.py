@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -21,9 +22,11 @@ from compensator.data.runs import Run, noise_std
 from compensator.diagnose.noise import NoiseTest, drive_of, noise_floor, own_error
 from compensator.errors import DataError
 from compensator.identify.output_error import low_frequency_ratio
+from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Context
 from compensator.model.effects.signals import RecordSignals
 from compensator.model.engine import Engine
+from compensator.model.late_observer import observe
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -41,6 +44,8 @@ class Evidence:
 
     Parameters
     ----------
+    model : ThermalModel
+        The base model.
     runs : tuple of Run
         Measured data.
     signals : tuple of RecordSignals
@@ -59,6 +64,7 @@ class Evidence:
         What noise and the base model's own error may leave of the samples used.
     """
 
+    model: ThermalModel
     runs: tuple[Run, ...]
     signals: tuple[RecordSignals, ...]
     residual: Vector
@@ -112,6 +118,18 @@ class Evidence:
             noise=dataclasses.replace(self.noise, count=int(used.sum())),
         )
 
+    def corrected(self, late: Effect) -> tuple[Evidence, Vector]:
+        """Return the evidence with a late T_Q corrected as the engine does, and what that adds to y on every sample."""
+        model = dataclasses.replace(self.model, effects=(*self.model.effects, late))
+        signals = tuple(signals_of(model, run, number) for number, run in enumerate(self.runs))
+        before, after = (
+            np.concatenate([r.share("all") + effects_of(m, run) for r, run in zip(rs, self.runs, strict=True)])
+            for m, rs in ((self.model, self.signals), (model, signals))
+        )
+        added = after - before
+        residual = np.where(self.used, self.residual - added, 0.0)
+        return dataclasses.replace(self, model=model, signals=signals, residual=residual), added
+
     def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
         """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
 
@@ -138,18 +156,29 @@ class Evidence:
 
 
 def signals_of(model: ThermalModel, run: Run, number: int = 0) -> RecordSignals:
-    """Run the base model's paths over a run, the heat by the plain inverse: without lag, and linear."""
-    drive = drive_of(model, run.difference_k)
+    """Run the base model's paths over a run.
+
+    The heat is that of the plain inverse, without lag and linear; where the model corrects a late T_Q, that of the
+    engine, which cannot know more.
+    """
     tdtf = model.tdtf.sampled if model.tdtf else SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=model.period_s)
+    if model.late_t_q is None:
+        drive, ambient_k = drive_of(model, run.difference_k), run.ambient_k
+        y_dtf_um, y_tdtf_um = model.dtf.sampled.response(drive), tdtf.response(ambient_k)
+    else:
+        t_q_degc, at_degc = run.reference
+        seen = observe(model, run.t_q_degc - t_q_degc, run.at_degc - at_degc)
+        drive, ambient_k, y_dtf_um, y_tdtf_um = seen.drive, seen.ambient_k, seen.y_dtf_um, seen.y_tdtf_um
     return RecordSignals(
         period_min=model.period_s / 60.0,
         drive=drive,
-        ambient_k=run.ambient_k,
-        y_dtf_um=model.dtf.sampled.response(drive),
-        y_tdtf_um=tdtf.response(run.ambient_k),
+        ambient_k=ambient_k,
+        y_dtf_um=y_dtf_um,
+        y_tdtf_um=y_tdtf_um,
         channels={name: values for name, values in run.channels.items() if np.isfinite(values).all()},
         dtf=model.dtf.sampled,
         tdtf=tdtf,
+        share_of_ambient=model.dtf.sampled.response(drive_of(model, run.ambient_k)),
         number=number,
     )
 
@@ -158,8 +187,9 @@ def effects_of(model: ThermalModel, run: Run) -> Vector:
     """Return what the effects that the model already has add, µm."""
     if not model.effects:
         return np.zeros(run.t_s.size)
-    exact = dataclasses.replace(model, estimator=dataclasses.replace(model.estimator, method="inverse"))
-    engine = Engine(exact)
+    if model.late_t_q is None:
+        model = dataclasses.replace(model, estimator=dataclasses.replace(model.estimator, method="inverse"))
+    engine = Engine(model)
     engine.set_reference(*run.reference)
     return np.array([sum(e.y_effects_um) for e in engine.run(run.t_q_degc, run.at_degc, run.channels)])
 
@@ -188,11 +218,12 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     if used.sum() < 60:
         names = ", ".join(dict.fromkeys(run.name for run in runs))
         raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
-    noise_um = noise_floor(model, runs)
+    noise_um = math.hypot(noise_floor(model, runs), _late_error_um(model, runs, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)
     nuisances = np.asarray(block_diag(*(_nuisances(record, context) for record in signals)))
     return Evidence(
+        model=model,
         runs=tuple(runs),
         signals=tuple(signals),
         residual=np.where(used, residual, 0.0),
@@ -202,6 +233,19 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         context=context,
         noise=NoiseTest(count=int(used.sum()), noise_um=noise_um, own_error_um=own_error(model, noise_um, spread_um)),
     )
+
+
+def _late_error_um(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordSignals]) -> float:
+    """Return what the engine does not know in time of a late T_Q: against a correction with the future, µm rms."""
+    late = next((effect for effect in model.effects if effect.lateness is not None), None)
+    if late is None:
+        return 0.0
+    prompt = dataclasses.replace(model, effects=tuple(effect for effect in model.effects if effect is not late))
+    errors = []
+    for run, own in zip(runs, signals, strict=True):
+        seen = signals_of(prompt, run)
+        errors.append(own.y_dtf_um - seen.y_dtf_um - late.columns(seen, ())[:, 0])
+    return float(np.std(np.concatenate(errors)))
 
 
 def _basis(nuisances: Matrix, used: Mask) -> Matrix:
@@ -242,5 +286,6 @@ def _context(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordS
         spans=spans,
         zeroed=frozenset(zeroed),
         approximate=model.held_out_rms_um is not None,
+        has_late_t_q=model.late_t_q is not None,
         functions={name: (path.b, path.a) for name, path in paths.items()},
     )

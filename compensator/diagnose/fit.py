@@ -94,6 +94,28 @@ def summed(evidence: Evidence, terms: Sequence[Term]) -> Vector:
     return np.asarray(sum((response(evidence, term) for term in terms), np.zeros(evidence.used.size)))
 
 
+def late_term(fit: Fit) -> Term | None:
+    """Return the term of a late T_Q, if there is one."""
+    return next((term for term in fit.terms if term.effect.lateness is not None), None)
+
+
+def as_deployed(evidence: Evidence, fit: Fit) -> tuple[Fit, list[Vector]]:
+    """Return a fit as the engine runs it, and what each of its effects adds to y on every sample, µm.
+
+    A late T_Q is found with the future of the record, which the engine does not have. Here it is corrected as the
+    engine does, and the other effects are fitted to the corrected signals, which they get there.
+    """
+    late = late_term(fit)
+    if late is None:
+        return fit, [response(evidence, term) for term in fit.terms]
+    corrected, added = evidence.corrected(late.effect)
+    others = fit_terms(corrected, [term.start for term in fit.terms if term is not late])
+    rest = iter(others.terms)
+    terms = [late if term is late else dataclasses.replace(next(rest), companion=term.companion) for term in fit.terms]
+    responses = [added if term is late else response(corrected, term) for term in terms]
+    return dataclasses.replace(others, terms=tuple(terms)), responses
+
+
 def columns_of(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> tuple[Matrix, Vector | None]:
     """Return columns and fixed part on the samples used, nuisances projected out."""
     columns = np.concatenate([hypothesis.columns(record, values) for record in evidence.signals])

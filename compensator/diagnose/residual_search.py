@@ -13,9 +13,10 @@ from compensator.arrays import Vector
 from compensator.codes import Remark
 from compensator.diagnose.estimate import Estimate, Prediction
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import response, standard_errors, summed
+from compensator.diagnose.fit import as_deployed, standard_errors
 from compensator.diagnose.outcome import FoundEffect
-from compensator.diagnose.search import Candidate, Search, Selection
+from compensator.diagnose.search import Candidate, Search, Selection, without_lead_noise
+from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap
 
@@ -32,9 +33,10 @@ class ResidualSearch(Estimate):
     def __init__(self, evidence: Evidence) -> None:
         super().__init__(evidence)
         self._selection = found = Search(evidence).run()
-        self.effects = self._effects(found)
+        self._deployed, responses = as_deployed(evidence, found.fit)
+        self.effects = self._effects(found, responses)
         self.tried = self._ranked(found.rivals[0]) if found.rivals else ()
-        self.residual_before, self.residual_after = found.before.residual, found.fit.residual
+        self.residual_before, self.residual_after = found.before.residual, self._deployed.residual
 
     def predictions(self, views: Sequence[Evidence], executor_map: ExecutorMap) -> Iterable[Prediction]:
         """Repeat the search in each part of the evidence."""
@@ -51,8 +53,9 @@ class ResidualSearch(Estimate):
 
     def is_explained(self, before_um: float, after_um: float) -> bool:
         """Return whether the fit leaves noise; effects that do not hold on held-out data explain part at most."""
-        holds = not self._selection.fit.terms or after_um <= before_um
-        return holds and self.evidence.noise.is_explained(self._selection.fit.cost)
+        fit = self._selection.fit
+        holds = not fit.terms or after_um <= before_um
+        return holds and self.evidence.noise.is_explained(without_lead_noise(self.evidence, fit))
 
     def extended(
         self, model: ThermalModel, deployed: Sequence[FoundEffect], after_um: float
@@ -65,20 +68,23 @@ class ResidualSearch(Estimate):
         kept_out = [e.signal[self.evidence.used] for e in self.effects if not e.deployable]
         left = max(after_um**2 - self.evidence.noise.noise_um**2, 0.0)
         left += float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0
-        effects = (*model.effects, *(found.effect for found in deployed))
-        stated = max(model.y_std_um, float(np.sqrt(left)))
-        return dataclasses.replace(model, effects=effects, y_std_um=stated, sha256=""), ()
+        extended = dataclasses.replace(
+            model, effects=(*model.effects, *(found.effect for found in deployed)), sha256=""
+        )
+        # The engine states by itself what it cannot know of a late T_Q.
+        left = max(left - (late_variance_um2(extended) - late_variance_um2(model)), 0.0)
+        return dataclasses.replace(extended, y_std_um=max(model.y_std_um, float(np.sqrt(left)))), ()
 
-    def _effects(self, selection: Selection) -> tuple[FoundEffect, ...]:
-        evidence, fit = self.evidence, selection.fit
-        errors = standard_errors(evidence, fit, selection.variance_inflation)
-        after = self._rms(fit.cost)
+    def _effects(self, selection: Selection, responses: Sequence[Vector]) -> tuple[FoundEffect, ...]:
+        evidence, fit = self.evidence, self._deployed
+        errors = standard_errors(evidence, selection.fit, selection.variance_inflation)
+        after, searched = self._rms(fit.cost), self._rms(selection.fit.cost)
         effects = []
-        for term, std, rivals in zip(fit.terms, errors, selection.rivals, strict=True):
-            signal = response(evidence, term)
+        for term, std, rivals, signal in zip(fit.terms, errors, selection.rivals, responses, strict=True):
             without = fit.residual + evidence.without_nuisances(np.where(evidence.used, signal, 0.0))
             others = ((c.term, self._rms(c.fit.cost)) for c in rivals)
-            effects.append(self.found(term, std, signal, (self._rms(float(without @ without)), after), others))
+            rms_um = self._rms(float(without @ without)), after
+            effects.append(self.found(term, std, signal, rms_um, others, searched_um=searched))
         return tuple(sorted(effects, key=lambda e: -e.rms_before_um))
 
     def _ranked(self, candidates: Sequence[Candidate]) -> tuple[tuple[str, float], ...]:
@@ -94,4 +100,6 @@ class ResidualSearch(Estimate):
 
 def _predicted(seen: Evidence, *, unobserved: bool) -> Prediction:
     """Search in a part of the evidence; return what is found there on every sample of all, µm."""
-    return np.zeros(seen.used.size), summed(seen, Search(seen).run(unobserved=unobserved).fit.terms)
+    _, responses = as_deployed(seen, Search(seen).run(unobserved=unobserved).fit)
+    nothing = np.zeros(seen.used.size)
+    return nothing, np.asarray(sum(responses, nothing))

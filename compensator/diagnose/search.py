@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Start, Term, columns_of, fit_terms
+from compensator.diagnose.fit import Fit, Start, Term, as_deployed, columns_of, fit_terms, late_term
+from compensator.diagnose.noise import lead_noise_um2
 from compensator.diagnose.scan import Scan
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, proposals
@@ -113,7 +114,7 @@ class Search:
             last = min([last, *others], key=lambda fit: self.score(fit, 1.0))
         inflation = evidence.variance_inflation(last.residual)
         best = min([*path, *others], key=lambda fit: self.score(fit, inflation))
-        best = self._settle_background(self._pruned(best, inflation), before)
+        best = self._settle_background(self._worth_deployed(self._pruned(best, inflation)), before)
         rivals = tuple(self._rivals(best, i) for i in range(len(best.terms)))
         return Selection(before=before, fit=best, variance_inflation=inflation, rivals=rivals)
 
@@ -142,7 +143,7 @@ class Search:
         return path
 
     def _is_noise(self, fit: Fit) -> bool:
-        return self.evidence.noise.is_noise(fit.cost)
+        return self.evidence.noise.is_noise(without_lead_noise(self.evidence, fit))
 
     def _is_white(self, fit: Fit) -> bool:
         return self.evidence.noise.is_white(self.evidence.variance_inflation(fit.residual))
@@ -279,6 +280,22 @@ class Search:
             fit = fewer[out]
         return fit
 
+    def _worth_deployed(self, fit: Fit) -> Fit:
+        """Leave out every effect that is worth nothing once a late T_Q is corrected as the engine does.
+
+        What the correction leaves after a change of the heat is no further effect.
+        """
+        while (late := late_term(fit)) is not None and len(fit.terms) > 1:
+            whole, _ = as_deployed(self.evidence, fit)
+            others = [i for i, term in enumerate(fit.terms) if term is not late]
+            fewer = {i: fit_terms(self.evidence, fit.starts(i)) for i in others}
+            deployed = {i: as_deployed(self.evidence, fewer[i])[0] for i in others}
+            out = min(others, key=lambda i: deployed[i].cost)
+            if self._is_worth(fit.terms[out].hypothesis, deployed[out], whole):
+                break
+            fit = fewer[out]
+        return fit
+
     def _is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
         if len(term.amplitudes) < 2 or term.hypothesis.effect.ridge:
@@ -303,3 +320,12 @@ class Search:
 def _foreground(fit: Fit) -> list[Term]:
     """Return the effects that are no background."""
     return [term for term in fit.terms if not term.hypothesis.effect.background]
+
+
+def without_lead_noise(evidence: Evidence, fit: Fit) -> float:
+    """Return what a fit leaves, less the noise that the lead of a late T_Q adds to its column, µm²."""
+    late = late_term(fit)
+    lateness = late.effect.lateness if late is not None else None
+    if lateness is None:
+        return fit.cost
+    return fit.cost - evidence.count * lead_noise_um2(evidence.model, evidence.runs, lateness.lag_min)
