@@ -61,27 +61,32 @@ class Background:
     ----------
     evidence : Evidence
         Residual and signals.
+    channels : bool
+        Whether channels act, or only the base's own paths.
     """
 
-    def __init__(self, evidence: Evidence) -> None:
+    def __init__(self, evidence: Evidence, *, channels: bool = True) -> None:
         context = evidence.context
-        self._evidence = evidence
         base = [DRIVE["heat" if context.has_ttf else "direct"], *([AMBIENT] if context.has_ambient else [])]
         inputs = [(name, 1.0) for name in base]
-        inputs += [(name, 1.0) for name in context.channels]
-        inputs += [(name, 2.0) for name in context.channels if name in context.zeroed]
+        if channels:
+            inputs += [(name, 1.0) for name in context.channels]
+            inputs += [(name, 2.0) for name in context.channels if name in context.zeroed]
         inputs = inputs[:MOST_CHANNELS]
         taus = tuple(tau for tau in LAGS_MIN if tau <= context.minutes / 3.0)
-        self._template = Regression(
+        self.template = Regression(
             channels=tuple(name for name, _ in inputs),
             exponents=tuple(exponent for _, exponent in inputs),
             taus_min=taus,
             gains=((0.0,) * len(taus),) * len(inputs),
+            std_factor=(),
         )
-        blocks = self._template.blocks(context.period_min)
-        self._columns = np.concatenate([self._template.columns(record, blocks) for record in evidence.signals])
-        self._groups = np.repeat(np.arange(len(inputs)), len(taus))
-        self._is_path = np.arange(len(inputs)) < len(base)
+        blocks = self.template.blocks(context.period_min)
+        self.columns = np.concatenate([self.template.columns(record, blocks) for record in evidence.signals])
+        self.groups = np.repeat(np.arange(len(inputs)), len(taus))
+        self.inputs_of_base = len(base)
+        # Where nothing is known of the base's paths, they are inputs like others.
+        self.is_path = (np.arange(len(inputs)) < len(base)) & (not evidence.free_paths)
 
     def fitted(self, points: Points, explained: Vector, start: Rest, steps: int = 40) -> Regressed:
         """Fit to what named effects leave.
@@ -99,9 +104,14 @@ class Background:
         """
         return _Problem(self, points, explained).solved(start, steps)
 
+    def response_of_base(self, effect: Regression) -> Vector:
+        """Return the part of that which the base's own inputs add, µm."""
+        own = self.groups < self.inputs_of_base
+        return np.asarray(self.columns[:, own] @ np.ravel(effect.gains)[own])
+
     def response(self, effect: Regression) -> Vector:
         """Return what a regression over these channels adds to y on every sample, µm."""
-        return np.asarray(self._columns @ np.ravel(effect.gains))
+        return np.asarray(self.columns @ np.ravel(effect.gains))
 
 
 class _Problem:
@@ -109,12 +119,12 @@ class _Problem:
 
     def __init__(self, background: Background, points: Points, explained: Vector) -> None:
         self.background, self.points = background, points
-        table = points.averaged(background._columns)
+        table = points.averaged(background.columns)
         self.scale = np.std(table[points.used], axis=0)
         self.scale[self.scale < 1e-12] = np.inf
         self.table = table / self.scale
         self.target = points.residual - explained
-        self.groups, self.is_path = background._groups, background._is_path
+        self.groups, self.is_path = background.groups, background.is_path
         self.typical = np.log([0.1 * points.spread_um, points.own_um])
 
     def solved(self, start: Rest, steps: int) -> Regressed:
@@ -149,7 +159,8 @@ class _Problem:
         surprise = white[:, 0] @ white[:, 0] - gram[:, 0] @ mean + log_det + 2.0 * np.log(np.diag(factor[0])).sum()
         variance = np.diag(cho_solve(factor, np.eye(mean.size), check_finite=False))
         slopes = (variance - 1.0 + mean**2)[fixed:]
-        return -0.5 * float(surprise), np.bincount(self.groups, weights=slopes, minlength=self.is_path.size)
+        by_size = np.bincount(self.groups, weights=slopes, minlength=self.is_path.size)
+        return -0.5 * float(surprise), np.asarray(by_size, dtype=np.float64)
 
     def _prior(self, x: Vector) -> tuple[float, Vector]:
         sizes, channels = x[2:], ~self.is_path
@@ -189,7 +200,7 @@ class _Problem:
         seen = self.table[self.points.used] * np.where(np.isfinite(self.scale), self.scale, 0.0)
         _, _, directions = np.linalg.svd((seen - seen.mean(axis=0)) @ root, full_matrices=False)
         factor = (root @ directions[:MOST_ROWS].T).T
-        template, lags = self.background._template, len(self.background._template.taus_min)
+        template, lags = self.background.template, len(self.background.template.taus_min)
         effect = dataclasses.replace(
             template,
             gains=tuple(map(tuple, gains.reshape(-1, lags).tolist())),

@@ -1,29 +1,45 @@
 """From a model and measured runs to a verdict, the effects that the model lacks, and the model with them.
 
-The error before and after is measured on held-out blocks of time: for each block the whole search is repeated without
+The errors before and after are measured on held-out blocks of time: for each block the whole search is repeated without
 it, and what that finds is applied to the block.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
+import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 from compensator.arrays import Vector
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
-from compensator.diagnose.base_refit import FAR_OFF, BaseRefit, is_far_off
-from compensator.diagnose.estimate import Estimate
 from compensator.diagnose.evidence import Evidence, evidence_of
-from compensator.diagnose.outcome import FOLDS, Diagnosis, FoundEffect, Verdict, rms_of, warnings_of
-from compensator.diagnose.residual_search import ResidualSearch
+from compensator.diagnose.findings import Findings, findings_of, with_paths
+from compensator.diagnose.fit import standard_errors
+from compensator.diagnose.outcome import (
+    FOLDS,
+    HELD_OUT,
+    Ceiling,
+    Diagnosis,
+    FoundEffect,
+    Remainder,
+    Verdict,
+    described,
+    rivals_of,
+    rms_of,
+    warnings_of,
+)
+from compensator.model.effects import Effect
+from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
 
-#: A base refit replaces a search's answer where it leaves no more than this share.
-REFIT_LEAVES = 0.5
+#: A base whose own calibration left more than this share of the deformation's spread lacks something.
+FAR_OFF = 0.1
+#: How the errors are measured where nothing was known of the paths.
+HELD_OUT_PATHS = f"{HELD_OUT}; before: the paths of the first model alone, also refitted to the others"
 
 
 def diagnose(
@@ -48,87 +64,171 @@ def diagnose(
         If there is too little data.
     """
     evidence = evidence_of(model, runs)
+    if model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um:
+        evidence = evidence.with_free_paths()
     progress(0, FOLDS + 1)
-    if is_far_off(model, evidence):
-        return _diagnosed(model, BaseRefit(evidence), progress, executor_map)
-    searched = _diagnosed(model, ResidualSearch(evidence), progress, executor_map)
-    if not _doubtful(searched, evidence):
-        return searched
-    # What was found in the residual holds nowhere else, or nothing was: perhaps the paths themselves are bent.
-    refitted = _diagnosed(model, BaseRefit(evidence), progress, executor_map)
-    better = rms_of(refitted.held_out_after) < REFIT_LEAVES * rms_of(searched.held_out_before)
-    return refitted if refitted.effects and better else searched
-
-
-def _doubtful(searched: Diagnosis, evidence: Evidence) -> bool:
-    """Return whether the search did not help although much is left."""
-    if rms_of(searched.held_out_after) > rms_of(searched.held_out_before):
-        return True
-    return searched.verdict == "unexplained" and rms_of(searched.held_out_before) > FAR_OFF * evidence.spread_um
-
-
-def _diagnosed(model: ThermalModel, estimate: Estimate, progress: Progress, executor_map: ExecutorMap) -> Diagnosis:
-    """Return the diagnosis of an estimate, checked on held-out blocks."""
-    evidence = estimate.evidence
-    before, after = _held_out(estimate, progress, executor_map)
-    errors = rms_of(before), rms_of(after)
-    effects = tuple(effect for effect in estimate.effects if not effect.term.companion)
-    # A companion is of no use where the effect itself cannot be deployed.
-    helps = any(effect.deployable for effect in effects) and errors[1] <= errors[0]
-    deployed = [effect for effect in estimate.effects if effect.deployable] if helps else []
-    extended, remarks = estimate.extended(model, deployed, errors[1]) if deployed else (model, ())
+    found = findings_of(evidence)
+    effects = _effects(found)
+    held_out = _held_out(found, progress, executor_map)
+    # What depends on time alone is not known on other data: it is taken out of both errors.
+    helps = rms_of(held_out.whole) <= rms_of(held_out.nothing)
+    extended, remarks = _extended(model, found, effects) if helps else (model, ())
+    remainder = None
+    if found.remainder is not None:
+        remainder = Remainder(
+            deployed=extended is not model,
+            channels=tuple(dict.fromkeys(found.remainder.effect.channels_that_matter())),
+            rms_before_um=rms_of(held_out.named),
+            rms_after_um=rms_of(held_out.whole),
+        )
+    left = evidence.left(evidence.residual, found.whole, at_rest=False)
     return Diagnosis(
-        verdict=_verdict(estimate.effects, is_explained=estimate.is_explained(*errors)),
+        verdict=_verdict(found, held_out),
         effects=effects,
-        held_out=estimate.held_out,
+        held_out=HELD_OUT_PATHS if evidence.free_paths else HELD_OUT,
         model=extended,
         evidence=evidence,
-        residual_before=np.where(evidence.used, estimate.residual_before, np.nan),
-        residual_after=np.where(evidence.used, estimate.residual_after, np.nan),
-        held_out_before=before,
-        held_out_after=after,
-        tried=estimate.tried,
-        warnings=(*remarks, *warnings_of(effects, before, after), *_companions(estimate.effects)),
+        residual_before=np.where(evidence.used, found.search.left(found.selection.before) - found.paths, np.nan),
+        residual_after=np.where(evidence.used, left, np.nan),
+        held_out_before=held_out.nothing,
+        held_out_after=held_out.whole,
+        tried=_ranked(found),
+        warnings=(*remarks, *warnings_of(effects, held_out.nothing, held_out.whole)),
+        remainder=remainder,
+        ceiling=_ceiling(held_out),
     )
 
 
-def _held_out(estimate: Estimate, progress: Progress, executor_map: ExecutorMap) -> tuple[Vector, Vector]:
-    """Return the residual before and after on every sample, each block by an estimate that did not see it.
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _HeldOut:
+    """What is left on every sample by estimates that did not see it, µm; NaN where y is missing."""
 
-    Of several choices of nuisances, the one that leaves less before.
-    """
-    evidence = estimate.evidence
+    nothing: Vector
+    named: Vector
+    whole: Vector
+    ceiling: Vector
+
+
+def _held_out(found: Findings, progress: Progress, executor_map: ExecutorMap) -> _HeldOut:
+    """Repeat the search without each block; of two choices of nuisances, that which leaves less before."""
+    evidence = found.search.evidence
     progress(1, FOLDS + 1)
     blocks = list(evidence.blocks(FOLDS))
     views = [evidence.without(block) for block in blocks]
-    before, after = (defaultdict[int, Vector](lambda: np.full(evidence.used.size, np.nan)) for _ in range(2))
-    predictions = estimate.predictions(views, executor_map)
-    for done, (block, seen, predicted) in enumerate(zip(blocks, views, predictions, strict=True), start=2):
+    timed = [t.effect for t in found.terms if not t.effect.deployable]
+    only_unobserved = bool(found.terms) and not any(term.hypothesis.effect.observed for term in found.terms)
+    unobserved = any(not effect.observed for effect in timed) and not only_unobserved
+    predicted = executor_map(partial(_predictions, unobserved=unobserved), views)
+    left = np.full((2, 4, evidence.used.size), np.nan)
+    for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
         progress(done, FOLDS + 1)
-        for residuals, one in zip((before, after), predicted, strict=True):
-            for choice, residual in enumerate(estimate.left(seen, one)):
-                residuals[choice][block] = residual[block]
-    best = min(before, key=lambda choice: rms_of(before[choice]))
-    return before[best], after[best]
+        for choice in (0, 1):
+            for i, one in enumerate(several):
+                left[choice, i, block] = seen.left(evidence.residual, one, at_rest=choice == 0)[block]
+    best = min((0, 1), key=lambda choice: rms_of(left[choice, 0]))
+    return _HeldOut(nothing=left[best, 0], named=left[best, 1], whole=left[best, 2], ceiling=left[best, 3])
 
 
-def _companions(everything: Sequence[FoundEffect]) -> tuple[Remark, ...]:
-    """Return a warning for each effect that is deployed without being named."""
-    return tuple(
-        Remark(
-            ModelWarning.ROUNDED_OFF,
-            "What the effect leaves is absorbed by a filter bank on heat and ambient "
-            f"({float(np.std(e.signal)):.2g} µm rms), an effect of kind {e.place[0]} in model.toml.",
+def _predictions(seen: Evidence, *, unobserved: bool) -> tuple[Vector, Vector, Vector, Vector]:
+    """Search in a part of the evidence; return what is predicted on every sample of all, µm."""
+    found = findings_of(seen, unobserved=unobserved)
+    return found.paths, found.named, found.whole, found.ceiling
+
+
+def _effects(found: Findings) -> tuple[FoundEffect, ...]:
+    """Return the named effects, that which removes most first."""
+    evidence, search = found.search.evidence, found.search
+    selection = found.selection
+
+    def rms_without(responses: Sequence[Vector]) -> float:
+        left = evidence.residual - sum(responses, np.zeros(evidence.used.size))
+        return rms_of(evidence.without_nuisances(np.where(evidence.used, left, 0.0))[evidence.used])
+
+    after, searched = rms_without(found.responses), search.rms(selection.fit)
+    effects = []
+    errors = standard_errors(selection.fit)
+    for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
+        signal = found.responses[i]
+        effects.append(
+            FoundEffect(
+                term=term,
+                effect=described(term, std, signal[evidence.used]),
+                rms_before_um=rms_without([*found.responses[:i], *found.responses[i + 1 :]]),
+                rms_after_um=after,
+                signal=signal,
+                rivals=rivals_of(term, ((c.term, c.rms_um) for c in rivals), searched),
+            )
         )
-        for e in everything
-        if e.term.companion
+    return tuple(sorted(effects, key=lambda effect: -effect.rms_before_um))
+
+
+def _extended(
+    model: ThermalModel, found: Findings, effects: Sequence[FoundEffect]
+) -> tuple[ThermalModel, tuple[Remark, ...]]:
+    """Return the model with every effect that can be deployed, the remainder, and the error that is left."""
+    evidence = found.search.evidence
+    deployed: list[Effect] = [effect.effect for effect in effects if effect.deployable]
+    remarks: tuple[Remark, ...] = ()
+    base = model
+    if found.remainder is not None:
+        rest = dataclasses.replace(found.remainder.effect)
+        if evidence.free_paths:
+            base, remainder = with_paths(model, rest)
+            base = dataclasses.replace(base, held_out_rms_um=None)
+            remarks = (Remark(ModelWarning.FITTED_ANEW, _refitted(model, base)),)
+        else:
+            remainder = rest
+        if remainder is not None:
+            deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(float(np.std(found.whole)))))
+    if not deployed and base is model:
+        return model, ()
+    kept_out = [effect.signal[evidence.used] for effect in effects if not effect.deployable]
+    left = found.rest_um**2 + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
+    extended = dataclasses.replace(base, effects=(*model.effects, *deployed), sha256="")
+    # The engine states by itself what it cannot know of a late T_Q.
+    left = max(left - (late_variance_um2(extended) - late_variance_um2(model)), 0.0)
+    return dataclasses.replace(extended, y_std_um=float(np.sqrt(left))), remarks
+
+
+def _refitted(old: ThermalModel, new: ThermalModel) -> str:
+    paths = [("DTF", old.dtf, new.dtf), *([("TDTF", old.tdtf, new.tdtf)] if old.tdtf and new.tdtf else [])]
+    gains = ", ".join(
+        f"{name} from {a.sampled.dc_gain:.3g} to {b.sampled.dc_gain:.3g} {a.unit.replace('um', 'µm')}"
+        for name, a, b in paths
+    )
+    return (
+        "The first model was calibrated while this acted and misses much of its own data, so its paths were refitted "
+        f"together with it; gains changed: {gains}."
     )
 
 
-def _verdict(everything: Sequence[FoundEffect], *, is_explained: bool) -> Verdict:
-    observed = [found.effect.observed for found in everything]
+def _ceiling(held_out: _HeldOut) -> Ceiling | None:
+    """Return what all channels could explain, and how much of that the named effects do."""
+    before, after, least = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
+    if least >= before:
+        return None
+    return Ceiling(
+        rms_um=float(np.sqrt(least)), explained_pct=float(np.clip((before - after) / (before - least), 0, 1)) * 100
+    )
+
+
+def _ranked(found: Findings) -> tuple[tuple[str, float], ...]:
+    best: dict[str, float] = {}
+    for candidate in found.selection.rivals[0] if found.selection.rivals else ():
+        label = candidate.term.hypothesis.label
+        best[label] = min(candidate.rms_um, best.get(label, np.inf))
+    return tuple(sorted(best.items(), key=lambda item: item[1]))
+
+
+def _verdict(found: Findings, held_out: _HeldOut) -> Verdict:
+    """Return the verdict in one word."""
+    evidence = found.search.evidence
+    observed = [term.hypothesis.effect.observed for term in found.terms]
+    left = evidence.left(evidence.residual, found.whole, at_rest=False)[evidence.used]
+    is_noise = evidence.noise.is_explained(float(left @ left))
     if not observed:
-        return "adequate" if is_explained else "unexplained"
+        return "adequate" if is_noise and not evidence.free_paths else "unexplained"
     if not any(observed):
         return "unexplained"
-    return "explained" if is_explained and all(observed) else "partly_explained"
+    holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)
+    return "explained" if is_noise and holds and all(observed) else "partly_explained"

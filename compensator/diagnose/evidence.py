@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -22,9 +23,11 @@ from compensator.diagnose.noise import NoiseTest, drive_of, noise_floor, own_err
 from compensator.diagnose.smoothing import course
 from compensator.errors import DataError
 from compensator.identify.output_error import low_frequency_ratio
+from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Context
 from compensator.model.effects.signals import RecordSignals
 from compensator.model.engine import Engine
+from compensator.model.late_observer import observe
 from compensator.model.thermal_model import ThermalModel
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -44,6 +47,8 @@ class Evidence:
 
     Parameters
     ----------
+    model : ThermalModel
+        The base model.
     runs : tuple of Run
         Measured data.
     signals : tuple of RecordSignals
@@ -62,8 +67,11 @@ class Evidence:
         What noise and the base model's own error may leave of the samples used.
     probe_um : float
         White noise of the measured deformation, µm.
+    free_paths : bool
+        Whether nothing is known of the base's paths: the residual is then the measured deformation itself.
     """
 
+    model: ThermalModel
     runs: tuple[Run, ...]
     signals: tuple[RecordSignals, ...]
     residual: Vector
@@ -73,6 +81,7 @@ class Evidence:
     context: Context
     noise: NoiseTest
     probe_um: float
+    free_paths: bool = False
 
     @property
     def count(self) -> int:
@@ -118,6 +127,22 @@ class Evidence:
             noise=dataclasses.replace(self.noise, count=int(used.sum())),
         )
 
+    def with_free_paths(self) -> Evidence:
+        """Return the evidence for a base that is far off, whose paths are estimated with everything else."""
+        return dataclasses.replace(self, residual=self.deformation_um, free_paths=True)
+
+    def corrected(self, late: Effect) -> tuple[Evidence, Vector]:
+        """Return the evidence with a late T_Q corrected as the engine does, and what that adds to y on every sample."""
+        model = dataclasses.replace(self.model, effects=(*self.model.effects, late))
+        signals = tuple(signals_of(model, run, number) for number, run in enumerate(self.runs))
+        before, after = (
+            np.concatenate([r.share("all") + effects_of(m, run) for r, run in zip(rs, self.runs, strict=True)])
+            for m, rs in ((self.model, self.signals), (model, signals))
+        )
+        added = after - before
+        residual = np.where(self.used, self.residual - added, 0.0)
+        return dataclasses.replace(self, model=model, signals=signals, residual=residual), added
+
     def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
         """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
 
@@ -144,18 +169,29 @@ class Evidence:
 
 
 def signals_of(model: ThermalModel, run: Run, number: int = 0) -> RecordSignals:
-    """Run the base model's paths over a run, the heat by the plain inverse: without lag, and linear."""
-    drive = drive_of(model, run.difference_k)
+    """Run the base model's paths over a run.
+
+    The heat is that of the plain inverse, without lag and linear; where the model corrects a late T_Q, that of the
+    engine, which cannot know more.
+    """
     tdtf = model.tdtf.sampled if model.tdtf else SampledTransferFunction(b=(0.0,), a=(1.0,), period_s=model.period_s)
+    if model.late_t_q is None:
+        drive, ambient_k = drive_of(model, run.difference_k), run.ambient_k
+        y_dtf_um, y_tdtf_um = model.dtf.sampled.response(drive), tdtf.response(ambient_k)
+    else:
+        t_q_degc, at_degc = run.reference
+        seen = observe(model, run.t_q_degc - t_q_degc, run.at_degc - at_degc)
+        drive, ambient_k, y_dtf_um, y_tdtf_um = seen.drive, seen.ambient_k, seen.y_dtf_um, seen.y_tdtf_um
     return RecordSignals(
         period_min=model.period_s / 60.0,
         drive=drive,
-        ambient_k=run.ambient_k,
-        y_dtf_um=model.dtf.sampled.response(drive),
-        y_tdtf_um=tdtf.response(run.ambient_k),
+        ambient_k=ambient_k,
+        y_dtf_um=y_dtf_um,
+        y_tdtf_um=y_tdtf_um,
         channels={name: values for name, values in run.channels.items() if np.isfinite(values).all()},
         dtf=model.dtf.sampled,
         tdtf=tdtf,
+        share_of_ambient=model.dtf.sampled.response(drive_of(model, run.ambient_k)),
         number=number,
     )
 
@@ -164,8 +200,9 @@ def effects_of(model: ThermalModel, run: Run) -> Vector:
     """Return what the effects that the model already has add, µm."""
     if not model.effects:
         return np.zeros(run.t_s.size)
-    exact = dataclasses.replace(model, estimator=dataclasses.replace(model.estimator, method="inverse"))
-    engine = Engine(exact)
+    if model.late_t_q is None:
+        model = dataclasses.replace(model, estimator=dataclasses.replace(model.estimator, method="inverse"))
+    engine = Engine(model)
     engine.set_reference(*run.reference)
     return np.array([sum(e.y_effects_um) for e in engine.run(run.t_q_degc, run.at_degc, run.channels)])
 
@@ -192,21 +229,23 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     DataError
         If there is no y in it.
     """
-    noise_um, probe_um = noise_floor(model, runs), noise_of(runs)["y_um"]
-    runs = [_without_noise(run) for run in runs]
-    signals = [signals_of(model, run, number) for number, run in enumerate(runs)]
+    courses = [_without_noise(run) for run in runs]
+    signals = [signals_of(model, run, number) for number, run in enumerate(courses)]
     parts = [
-        run.y_um - own.y_dtf_um - own.y_tdtf_um - effects_of(model, run) for run, own in zip(runs, signals, strict=True)
+        run.y_um - own.y_dtf_um - own.y_tdtf_um - effects_of(model, run)
+        for run, own in zip(courses, signals, strict=True)
     ]
     residual = np.concatenate(parts)
     used = np.isfinite(residual)
     if used.sum() < 60:
         names = ", ".join(dict.fromkeys(run.name for run in runs))
         raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
+    noise_um = math.hypot(noise_floor(model, runs), _late_error_um(model, courses, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)
     nuisances = np.asarray(block_diag(*(_nuisances(record, context) for record in signals)))
     return Evidence(
+        model=model,
         runs=tuple(runs),
         signals=tuple(signals),
         residual=np.where(used, residual, 0.0),
@@ -215,8 +254,21 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         basis=_basis(nuisances, used),
         context=context,
         noise=NoiseTest(count=int(used.sum()), noise_um=noise_um, own_error_um=own_error(model, noise_um, spread_um)),
-        probe_um=max(probe_um, LEAST_NOISE_UM),
+        probe_um=max(noise_of(runs)["y_um"], LEAST_NOISE_UM),
     )
+
+
+def _late_error_um(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordSignals]) -> float:
+    """Return what the engine does not know in time of a late T_Q: against a correction with the future, µm rms."""
+    late = next((effect for effect in model.effects if effect.lateness is not None), None)
+    if late is None:
+        return 0.0
+    prompt = dataclasses.replace(model, effects=tuple(effect for effect in model.effects if effect is not late))
+    errors = []
+    for run, own in zip(runs, signals, strict=True):
+        seen = signals_of(prompt, run)
+        errors.append(own.y_dtf_um - seen.y_dtf_um - late.columns(seen, ())[:, 0])
+    return float(np.std(np.concatenate(errors)))
 
 
 def _basis(nuisances: Matrix, used: Mask) -> Matrix:
@@ -257,5 +309,6 @@ def _context(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordS
         spans=spans,
         zeroed=frozenset(zeroed),
         approximate=model.held_out_rms_um is not None,
+        has_late_t_q=model.late_t_q is not None,
         functions={name: (path.b, path.a) for name, path in paths.items()},
     )

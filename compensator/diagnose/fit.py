@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Likelihood, Rest
+from compensator.diagnose.likelihood import Likelihood, Points, Rest
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis
 
@@ -114,6 +114,27 @@ def response(evidence: Evidence, term: Term) -> Vector:
 def summed(evidence: Evidence, terms: Sequence[Term]) -> Vector:
     """Return what some effects add to y on every sample, µm."""
     return np.asarray(sum((response(evidence, term) for term in terms), np.zeros(evidence.used.size)))
+
+
+def late_term(fit: Fit) -> Term | None:
+    """Return the term of a late T_Q, if there is one."""
+    return next((term for term in fit.terms if term.effect.lateness is not None), None)
+
+
+def as_deployed(fit: Fit) -> tuple[tuple[Term, ...], list[Vector]]:
+    """Return the terms of a fit as the engine runs them, and what each adds to y on every sample, µm.
+
+    A late T_Q is found with the future of the record, which the engine does not have. Here it is corrected as the
+    engine does, and the other effects are fitted to the corrected signals, which they get there.
+    """
+    late, evidence = late_term(fit), fit.likelihood.points.evidence
+    if late is None:
+        return fit.terms, [response(evidence, term) for term in fit.terms]
+    corrected, added = evidence.corrected(late.effect)
+    starts = [term.start for term in fit.terms if term is not late]
+    others = iter(fit_terms(Likelihood(Points(corrected), fit.rest), starts).terms)
+    terms = tuple(late if term is late else next(others) for term in fit.terms)
+    return terms, [added if term is late else response(corrected, term) for term in terms]
 
 
 def raw_columns(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> Matrix:

@@ -39,6 +39,8 @@ EXACT_OWN = 0.3
 FORM_ERROR = (0.02, 0.1)
 #: The zero is free; an initial state moves y by about the spread of the deformation.
 ZERO_TIMES = 100.0
+#: Typical slow rest where nothing is known of the paths, as a share of the spread of the deformation.
+SLOW_SHARE = 0.03
 #: Typical time constant of the slow rest, min, and how far (in e-folds) the rest may be from what is typical.
 REST_MIN, REST_FOLDS = 60.0, (0.4, 1.0, 1.0)
 #: Furthest that the search of the rest goes, in e-folds.
@@ -93,12 +95,18 @@ class Points:
         self.relative_variance = stride / self._counts
         self.spread_um = max(evidence.spread_um, 1e-9)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
-        self.own_um = max(noise.own_error_um, (EXACT_OWN if self.is_exact else 1.0) * evidence.probe_um)
+        self.is_exact = self.is_exact or evidence.free_paths
+        self.own_um = (
+            self.spread_um
+            if evidence.free_paths
+            else max(noise.own_error_um, (EXACT_OWN if self.is_exact else 1.0) * evidence.probe_um)
+        )
         point_noise = evidence.probe_um / math.sqrt(stride)
         if not self.is_exact:
             # What a calibration missed is no slow process: it is largest right after the heat is switched.
             point_noise = math.hypot(point_noise, self.own_um)
-        self._typical = np.log([max(point_noise, 1e-3), self.own_um, REST_MIN])
+        slow = SLOW_SHARE * self.spread_um if evidence.free_paths else self.own_um
+        self._typical = np.log([max(point_noise, 1e-3), slow, REST_MIN])
         self._own = self._own_columns()
         scale = np.full(evidence.nuisances.shape[1], self.spread_um)
         scale[:: evidence.nuisances.shape[1] // len(evidence.signals)] *= ZERO_TIMES

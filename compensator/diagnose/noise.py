@@ -27,6 +27,8 @@ SEARCH_TIMES = 1.3
 VERDICT_TIMES = 1.5
 #: A residual whose variance inflation is below this is white.
 WHITE_BELOW = 1.3
+#: An impulse, as long as the slow modes need.
+_IMPULSE = np.concatenate(([1.0], np.zeros(2999)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,12 +95,23 @@ def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:
     White noise of the probe, and that of both thermocouples through the model.
     """
     noise = noise_of(runs)
-    impulse = np.zeros(3000)
-    impulse[0] = 1.0
-    by_t_q = model.dtf.sampled.response(drive_of(model, impulse))
-    by_at = -by_t_q + (model.tdtf.sampled.response(impulse) if model.tdtf else 0.0)
+    by_t_q = _by_t_q(model)
+    by_at = -by_t_q + (model.tdtf.sampled.response(_IMPULSE) if model.tdtf else 0.0)
     parts = (noise["y_um"], noise["t_q_degc"] * np.linalg.norm(by_t_q), noise["at_degc"] * np.linalg.norm(by_at))
     return float(np.sqrt(sum(part**2 for part in parts)))
+
+
+def lead_noise_um2(model: ThermalModel, runs: Sequence[Run], lag_min: float) -> float:
+    """Return what the lead that reverses a lag of T_Q adds to the variance of the residual, µm²."""
+    by_t_q = _by_t_q(model)
+    led = by_t_q + lag_min * np.gradient(by_t_q, model.period_s / 60.0)
+    power = float(led @ led - by_t_q @ by_t_q)
+    return noise_of(runs)["t_q_degc"] ** 2 * max(power, 0.0)
+
+
+def _by_t_q(model: ThermalModel) -> Vector:
+    """Return the response of the DTF's share to an impulse of T_Q, µm/K."""
+    return model.dtf.sampled.response(drive_of(model, _IMPULSE))
 
 
 def drive_of(model: ThermalModel, difference_k: Vector) -> Vector:

@@ -20,7 +20,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, fit_terms, raw_columns, settled
+from compensator.diagnose.fit import Fit, Term, fit_terms, raw_columns, settled, summed
 from compensator.diagnose.likelihood import Likelihood, Points, Rest
 from compensator.diagnose.scan import Place, Scan
 from compensator.diagnose.switching import switchings
@@ -81,7 +81,10 @@ class Search:
         context = evidence.context
         self.evidence, self.points = evidence, Points(evidence)
         self.hypotheses = proposals(context)
-        if context.approximate:
+        if evidence.free_paths:
+            # The paths are estimated with everything else; nothing can be said of how they differ from a base.
+            self.hypotheses = [hypothesis for hypothesis in self.hypotheses if hypothesis.effect.kind == "input"]
+        elif context.approximate:
             self.hypotheses += proposals(context, background=True)
         self._scan = Scan(self.points, self.hypotheses)
         self._forms = Counter(hypothesis.place for hypothesis in self.hypotheses)
@@ -94,6 +97,7 @@ class Search:
         unobserved : bool
             Whether an unobserved source is looked for.
         """
+        unobserved = unobserved and not self.evidence.free_paths
         rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
         before = best = fit_terms(Likelihood(self.points, rest), [])
         while len(best.terms) < MOST:
@@ -111,11 +115,8 @@ class Search:
 
     def left(self, fit: Fit) -> Vector:
         """Return what a fit leaves on every sample, nuisances projected out, µm; 0 where samples are not used."""
-        total = self.evidence.residual - sum(
-            (raw_columns(self.evidence, t.hypothesis, t.values) @ np.array(t.amplitudes or (1.0,)) for t in fit.terms),
-            np.zeros(self.evidence.used.size),
-        )
-        return self.evidence.without_nuisances(np.where(self.evidence.used, total, 0.0))
+        left = self.evidence.residual - summed(self.evidence, fit.terms)
+        return self.evidence.without_nuisances(np.where(self.evidence.used, left, 0.0))
 
     def rms(self, fit: Fit) -> float:
         """Return the rms of what a fit leaves, µm."""

@@ -18,7 +18,8 @@ import numpy as np
 from compensator.arrays import NAN, Vector
 from compensator.errors import ModelError
 from compensator.model.effects import EffectStream, Signals
-from compensator.model.observer import Observer, ObserverState
+from compensator.model.late_observer import observer_of
+from compensator.model.observer import ObserverState
 from compensator.model.thermal_model import ThermalModel
 
 #: Longest run of incomplete samples that is repeated once both temperatures are back.
@@ -175,7 +176,7 @@ class Engine:
     def __init__(self, model: ThermalModel, *, bridge_samples: int = BRIDGE_SAMPLES) -> None:
         self.model = model
         self.bridge_samples = bridge_samples
-        self._observer = Observer(model)
+        self._observer = observer_of(model)
         self._start_effects()
         self.channels = tuple(dict.fromkeys(c for effect in self._effects for c in effect.channels))
         self._period_min = model.period_s / 60.0

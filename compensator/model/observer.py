@@ -5,8 +5,10 @@ T_Q − AT, K, in a direct model) and the ambient change *a* as random walks:
 
     x[k+1] = F x[k] + w,   w_q ~ N(0, drive_walk²),  w_a ~ N(0, at_walk²)
     AT     = a + v_a
-    T_Q    = C₁ x₁ + D₁ q + a + v_q
+    T_Q    = C₁ x₁ + D₁ q + C₄ x₄ + D₄ a + v_q
     y      = C₂ x₂ + D₂ q + C₃ x₃ + D₃ a
+
+The fourth path leads from the ambient to T_Q: 1, or the lag of a late T_Q, which is then in the first path, too.
 
 Both ways to estimate the heat are observers of this system; only their gains differ:
 
@@ -80,12 +82,18 @@ class Observer:
 
     def __init__(self, model: ThermalModel) -> None:
         ttf = model.ttf.sampled if model.ttf else _UNITY
+        ambient = _UNITY
+        late = model.late_t_q
+        if late is not None:
+            lag = late.within_a_sample(model.period_s, invertible=model.estimator.method == "inverse")
+            ttf = ttf.times(lag)
+            ambient = lag if late.of_ambient else _UNITY
         tdtf = model.tdtf.sampled if model.tdtf else _ZERO
         estimator = model.estimator
         self._kalman = estimator.method == "kalman"
         self._r_tq = estimator.t_q_noise_std_k**2
         self._r_at = estimator.at_noise_std_k**2
-        self._lay_out(ttf, model.dtf.sampled, tdtf)
+        self._lay_out(ttf, model.dtf.sampled, tdtf, ambient)
         self._walk = np.zeros(self.size)
         self._walk[self._q] = estimator.drive_walk_std**2
         self._walk[self._a] = estimator.at_walk_std_k**2
@@ -103,7 +111,7 @@ class Observer:
         self._d: list[float] = []
         rows: list[tuple[int, int, int, float, float]] = []
         start = 0
-        for function, source in zip(functions, (self._q, self._q, self._a), strict=True):
+        for function, source in zip(functions, (self._q, self._q, self._a, self._a), strict=True):
             a, b, d = function.observer_form()
             n = function.order
             self._first.append(start if n else nil)
@@ -165,7 +173,8 @@ class Observer:
 
     def _expected_t_q(self) -> float:
         x = self._x
-        return x[self._first[0]] + self._d[0] * x[self._q] + x[self._a]
+        expected = x[self._first[0]] + self._d[0] * x[self._q] + self._d[3] * x[self._a]
+        return expected + x[self._first[3]]
 
     # ------------------------------------------------------------------ covariance
 
@@ -218,12 +227,12 @@ class Observer:
 
     def _t_q_column(self, p: Matrix, variance: float) -> tuple[Matrix, float]:
         """Return the covariance of the states with T_Q, and the variance of T_Q as it is measured."""
-        column = self._d[0] * p[:, self._q] + p[:, self._a]
-        first = self._first[0]
-        if first < self.size:
+        column = self._d[0] * p[:, self._q] + self._d[3] * p[:, self._a]
+        states = [first for first in (self._first[0], self._first[3]) if first < self.size]
+        for first in states:
             column = column + p[:, first]
-        s = self._d[0] * float(column[self._q]) + float(column[self._a]) + variance
-        if first < self.size:
+        s = self._d[0] * float(column[self._q]) + self._d[3] * float(column[self._a]) + variance
+        for first in states:
             s += float(column[first])
         return column, s
 
@@ -259,6 +268,26 @@ class Observer:
         return max(total, 0.0)
 
     # ------------------------------------------------------------------ estimates
+
+    @property
+    def x(self) -> list[float]:
+        """State vector after the last update, and a zero."""
+        return self._x
+
+    @property
+    def covariance(self) -> Matrix:
+        """Its covariance."""
+        return self._P
+
+    @property
+    def settled(self) -> bool:
+        """Whether the covariance has reached its steady value."""
+        return self._settled
+
+    @property
+    def started(self) -> bool:
+        """Whether there was a sample since it was at rest."""
+        return self._started
 
     @property
     def drive(self) -> float:

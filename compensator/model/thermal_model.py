@@ -23,6 +23,7 @@ import numpy as np
 from compensator.display import Shown, Table, Words, with_std
 from compensator.errors import ModelError
 from compensator.model.effects import Effect
+from compensator.model.effects.lateness import Lateness
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction, continuous_image
 
 Kind = Literal["heat", "direct"]
@@ -191,6 +192,11 @@ class ThermalModel(Shown):
             parts.append(Table(head=["valid for", "from", "to"], rows=ranges))
         return parts
 
+    @property
+    def late_t_q(self) -> Lateness | None:
+        """By how much T_Q is late, where an effect says so."""
+        return next((effect.lateness for effect in self.effects if effect.lateness is not None), None)
+
     def with_alternative(self, name: str) -> ThermalModel:
         """Return the model with one of its alternative paths in place.
 
@@ -241,6 +247,12 @@ def check_runnable(model: ThermalModel) -> None:
             effect.check_base(model.kind)
         except ModelError as error:
             raise ModelError(f"model {model.name}: {error}") from error
+    late = [effect for effect in model.effects if effect.lateness is not None]
+    expected = "DTF" if model.ttf is None else "TTF"
+    if len(late) > 1:
+        raise ModelError(f"model {model.name}: {len(late)} effects of a late T_Q, expected one at most")
+    if late and late[0].path != expected:
+        raise ModelError(f"model {model.name}: effect delay of T_Q: path = {late[0].path!r}, expected {expected!r}")
 
 
 def _check_path(model: ThermalModel, name: str, path: Path) -> None:

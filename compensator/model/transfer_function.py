@@ -116,6 +116,12 @@ class SampledTransferFunction:
         """Return whether every pole lies inside the unit circle."""
         return bool(np.all(np.abs(self.poles()) < 1.0))
 
+    def times(self, other: SampledTransferFunction) -> SampledTransferFunction:
+        """Return this function and another of the same period in series."""
+        return SampledTransferFunction(
+            b=tuple(_product(self.b, other.b)), a=tuple(_product(self.a, other.a)), period_s=self.period_s
+        )
+
     def observer_form(self) -> tuple[tuple[float, ...], tuple[float, ...], float]:
         """Return the observer canonical state space.
 

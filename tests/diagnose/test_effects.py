@@ -55,6 +55,10 @@ def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
         engine = Engine(model)
         engine.set_reference(*run.reference)
         streamed = [e.y_effects_um[0] for e in engine.run(run.t_q_degc, run.at_degc, run.channels)]
+        if table.lateness is not None:
+            # Corrected in the heat, and not added to y; what the search uses knows the future.
+            assert not any(streamed)
+            continue
         whole = response(evidence, term)
         scale = max(1.0, float(np.max(np.abs(whole))))
         assert streamed == pytest.approx(whole, abs=2e-6 * scale), (hypothesis.place, hypothesis.form)

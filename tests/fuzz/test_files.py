@@ -197,7 +197,7 @@ def test_stores_of_models(place: Path, seed: int) -> None:
         store.adopt(quill + b"\n# another\n", name="another", time_utc_ns=1)
         (place / "adopted.json").write_bytes((folder / "adopted.json").read_bytes())
     (folder / "adopted.json").write_bytes(mutated(seed, (place / "adopted.json").read_bytes()))
-    for use in (store.in_use, store.adopted):
+    for use in (store.in_use, store.before):
         try:
             use()
         except CompensatorError as error:

@@ -84,6 +84,12 @@ def with_effects(base: ThermalModel = QUILL) -> ThermalModel:
     return dataclasses.replace(base, effects=effects, sha256="e" * 64)
 
 
+def late(base: ThermalModel, **changes: Any) -> ThermalModel:
+    """A model with a late T_Q, beside the effects that it has."""
+    table = {"path": "TTF", "form": "sensor", "delay_min": 2.5, "lag_min": 3.0} | changes
+    return dataclasses.replace(base, effects=(*base.effects, effect_from("delay", table)), sha256="a" * 64)
+
+
 def direct(method: str) -> ThermalModel:
     """A model from T_Q − AT straight to the deformation."""
     function = TransferFunction(numerator=(4.0, 20.0), denominator=(1.0, 120.0), unit="um/K")

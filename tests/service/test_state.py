@@ -17,7 +17,7 @@ from compensator.model.effects import kinds
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.state import decode_state, encode_state
-from tests.service.records import EFFECTS, QUILL, day, direct, with_effects, with_method
+from tests.service.records import EFFECTS, QUILL, day, direct, late, with_effects, with_method
 from tests.service.simulated import TABLE, config
 
 CHANNELS = [*TABLE["channel"], {"name": "spindle_rpm", "device": "module", "input": 4}]
@@ -37,6 +37,11 @@ MODELS = {
     "effects": with_effects(),
     "effects inverse": with_effects(with_method("inverse")),
     "absolute": dataclasses.replace(QUILL, inputs="absolute"),
+    "lag": late(QUILL, delay_min=0.0),
+    "late": late(QUILL, form="path"),
+    "late inverse": late(with_method("inverse")),
+    "late direct": late(direct("kalman"), path="DTF"),
+    "late, effects": late(with_effects()),
 }
 LOST = {
     "t_q_degc": [range(3), range(90, 96), range(150, 230), range(300, 305)],

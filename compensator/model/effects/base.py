@@ -19,6 +19,7 @@ import numpy as np
 
 from compensator.arrays import NAN, Matrix, Vector
 from compensator.model.effects.blocks import Block, FilterBank, S
+from compensator.model.effects.lateness import Lateness
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import TomlTable
 
@@ -172,6 +173,11 @@ class Effect:
         """Time constants, min: how long its state remembers."""
         tau = getattr(self, "tau_min", ())
         return tau if isinstance(tau, tuple) else (tau,)
+
+    @property
+    def lateness(self) -> Lateness | None:
+        """By how much T_Q is late: not added to y, but corrected in the estimate of the heat."""
+        return None
 
     def effective_parameters(self, count: int) -> int:
         """Return how many parameters the data spend on it, of `count` that are searched or linear."""
@@ -336,7 +342,9 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
     known = dict.fromkeys([f.name for form in candidates for f in _read(form)] + ["form", *_FOUND])
     keys = TomlTable(f"effect {kind}", table, tuple(known))
     choices = {choice: form for form in candidates for choice in _choices(form)}
-    form = choices[keys.text("form", tuple(choices))] if choices else candidates[0]
+    plain = [form for form in candidates if not _choices(form)]
+    named = not plain or (choices and "form" in table)
+    form = choices[keys.text("form", tuple(choices))] if named else plain[0]
     found = {key: table[key] for key in _FOUND if key in table}
     return form(**{f.name: f.metadata["read"](keys, f.name) for f in _read(form)}, **found)
 

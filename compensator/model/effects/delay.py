@@ -1,7 +1,7 @@
 """`delay`: a path or its sensor is delayed.
 
 path     y += L(lag) · y_path(t − d) − y_path(t)
-sensor   y += y_path(t + d) + lag · dy_path/dt (t + d) − y_path(t): the machine was where the delayed sensor is now
+T_Q      T_Q = L(lag) · (TTF · heat + a)(t − d), or the heat alone is late: corrected where the heat is estimated
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Block, Delay, Lag, S, shifted
 from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
+from compensator.model.effects.lateness import Lateness
 from compensator.model.effects.signals import RecordSignals, Signals
 
-#: Samples by which a path is continued beyond a record's end.
-AHEAD = 64
 DELAY = Free(name="delay_min", low=0.0, high=60.0, grid=(0.5, 1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 40.0), log=False)
 LAG = Free(name="lag_min", low=0.05, high=60.0, grid=(0.5, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0))
 
@@ -50,38 +49,51 @@ class DelayedPath(Effect):
 
 @register
 class DelayedSensor(DelayedPath):
-    """A delayed sensor: the correction would need the future."""
+    """A late T_Q: the observer corrects it, so that every other effect gets corrected signals, too."""
 
-    deployable = False
+    path: str = text("TTF", "DTF")
+    form: str = text("sensor", "path")
+    delay_min: float = number(0.0, 240.0)
+    lag_min: float = number(0.0, 240.0)
+
+    def blocks(self, period_min: float) -> tuple[Block, ...]:
+        return ()
+
+    def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
+        """Return 0: the shares of the paths are corrected already."""
+        return signals.drive - signals.drive
+
+    @property
+    def lateness(self) -> Lateness:
+        return Lateness(lag_min=self.lag_min, delay_min=self.delay_min, of_ambient=self.form == "sensor")
 
     def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
+        """Return what the share would have been with an immediate sensor, less what it is; it uses the future."""
         share, period_min = record.share(self.path), record.period_min
-        # Beyond the end of the record the path continues with its last drive.
-        drive = record.source(self.path)
-        longer = record.function(self.path).response(np.concatenate((drive, np.full(AHEAD, drive[-1]))))
-        early = shifted(longer, -self.delay_min / period_min)
+        late = share + record.share_of_ambient if self.form == "sensor" else share
+        early = shifted(late, -self.delay_min / period_min)
         early = early + self.lag_min * np.gradient(early, period_min)
-        return np.asarray(early[: share.size] - share)[:, None]
+        return np.asarray(early - late)[:, None]
 
     def explain(self, rms_um: float) -> str:
-        sensor = "T_Q" if self.path == "TTF" else "AT"
+        what = "The sensor T_Q is late" if self.form == "sensor" else "The heat reaches T_Q late,"
         return (
-            f"The sensor {sensor} is delayed by {self._times()}, so the model is wrong after each change of the "
-            f"heat ({rms_um:.2g} µm rms). That cannot be corrected in real time: move the sensor closer to the source, "
-            "or mount it with better thermal contact."
+            f"{what} by {self._times()}, so the model is wrong after each change of the heat ({rms_um:.2g} µm rms). "
+            "The extended model corrects this in real time, except for the first minutes after a change. Better: move "
+            "the sensor closer to the source, or mount it with better thermal contact."
         )
 
 
 @proposes
 def delays(context: Context) -> Iterator[Hypothesis]:
-    """Propose a dead time of every path; T_Q with a dead time, a lag or both; in a direct model AT with one of them."""
+    """Propose a dead time of every path; T_Q with a dead time, a lag or both, its share of the ambient late or not."""
     for path in context.paths:
         yield Hypothesis(effect=DelayedPath(path=path, delay_min=0.0, lag_min=0.0), form="dead time", free=(DELAY,))
-    if "DTF" not in context.paths:
+    if "DTF" not in context.paths or context.has_late_t_q:
         return
-    path, prefix = ("TTF", "") if context.has_ttf else ("DTF", "sensor, ")
-    sensor = DelayedSensor(path=path, delay_min=0.0, lag_min=0.0)
-    yield Hypothesis(effect=sensor, form=f"{prefix}dead time", free=(DELAY,))
-    yield Hypothesis(effect=sensor, form=f"{prefix}lag", free=(LAG,))
-    if context.has_ttf:
-        yield Hypothesis(effect=sensor, form="dead time and lag", free=(DELAY, LAG))
+    path = "TTF" if context.has_ttf else "DTF"
+    searched = {"dead time": (DELAY,), "lag": (LAG,), "dead time and lag": (DELAY, LAG)}
+    for form in ("sensor", "path"):
+        late = DelayedSensor(path=path, form=form, delay_min=0.0, lag_min=0.0)
+        for words, free in searched.items():
+            yield Hypothesis(effect=late, form=f"{form}, {words}", free=free)

@@ -149,6 +149,8 @@ class Context:
     approximate : bool
         Whether effects match the forms only approximately, as on a machine that the model was identified on:
         filter banks are then proposed in addition to the exact forms.
+    has_late_t_q : bool
+        Whether the model corrects a late T_Q already.
     """
 
     has_ambient: bool
@@ -161,6 +163,7 @@ class Context:
     zeroed: frozenset[str] = frozenset()
     functions: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
     approximate: bool = False
+    has_late_t_q: bool = False
 
     @property
     def channels(self) -> tuple[str, ...]:

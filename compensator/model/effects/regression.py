@@ -136,6 +136,10 @@ class Regression(BankEffect, Effect):
     def measured(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name in self.channels if not _is_of_base(name)))
 
+    def channels_that_matter(self) -> tuple[str, ...]:
+        """Return the channels with a gain."""
+        return tuple(name for name, row in zip(self.channels, self.gains, strict=True) if any(row))
+
     @property
     def time_constants_min(self) -> tuple[float, ...]:
         return self.taus_min

@@ -56,6 +56,8 @@ class RecordSignals(Signals[Vector]):
         Sample period, min.
     dtf, tdtf : SampledTransferFunction
         Paths of the base model.
+    share_of_ambient : numpy.ndarray, shape (n,)
+        What the DTF would make of the ambient's change if T_Q alone showed it, µm.
     number : int
         Which of several records this is.
     """
@@ -63,6 +65,7 @@ class RecordSignals(Signals[Vector]):
     period_min: float
     dtf: SampledTransferFunction
     tdtf: SampledTransferFunction
+    share_of_ambient: Vector = field(default_factory=lambda: np.zeros(1))
     number: int = 0
 
     @property

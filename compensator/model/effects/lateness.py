@@ -1,0 +1,56 @@
+"""By how much T_Q is late: what an effect asks of the observer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from compensator.model.transfer_function import SampledTransferFunction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lateness:
+    """Lag and dead time of T_Q.
+
+    Parameters
+    ----------
+    lag_min, delay_min : float
+        Time constant of a first-order lag, and dead time, min.
+    of_ambient : bool
+        Whether the ambient's change reaches T_Q as late as the heat does: the sensor is late, and not the heat's way.
+    """
+
+    lag_min: float
+    delay_min: float
+    of_ambient: bool
+
+    def samples(self, period_s: float) -> int:
+        """Return the whole samples of the dead time."""
+        return math.floor(self.delay_min * 60.0 / period_s)
+
+    def within_a_sample(self, period_s: float, *, invertible: bool) -> SampledTransferFunction:
+        """Return the lag, and what whole samples leave of the dead time.
+
+        The lag is that of the backward difference, whose inverse is a lead that does not ring (Tustin's has a zero at
+        z = −1). A part of a sample is a straight line between two of them, whose inverse may ring, or as a lag.
+
+        Parameters
+        ----------
+        period_s : float
+            Sample period, s.
+        invertible : bool
+            Whether it will be inverted.
+        """
+        part = self.delay_min * 60.0 / period_s - self.samples(period_s)
+        function = _lag(self.lag_min * 60.0 / period_s, period_s)
+        if part == 0.0:
+            return function
+        if invertible:
+            return function.times(_lag(part, period_s))
+        return function.times(SampledTransferFunction(b=(1.0 - part, part), a=(1.0,), period_s=period_s))
+
+
+def _lag(samples: float, period_s: float) -> SampledTransferFunction:
+    pole = samples / (samples + 1.0)
+    a = (1.0, -pole) if pole > 0.0 else (1.0,)
+    return SampledTransferFunction(b=(1.0 - pole,), a=a, period_s=period_s)

@@ -1,0 +1,137 @@
+"""A late T_Q is named, deployed, and on a fresh day most of what can be removed is removed in real time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from compensator.data.runs import Run
+from compensator.diagnose.diagnosis import Diagnosis, diagnose
+from compensator.diagnose.evidence import evidence_of
+from compensator.identify.calibration import predict
+from compensator.model.model_file import load_model, parse_model
+from compensator.model.model_writer import dump_model
+from compensator.model.thermal_model import ThermalModel
+from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
+from sim_hardware.physics.effects import LateSensor
+from tests.diagnose.scenarios import Scenario, record, signals
+from tests.identify.quill_runs import runs_from
+from tests.model.test_late_t_q import run_of
+from tests.service.records import direct
+
+QUILL = load_model("quill")
+PLACE = ("delay", "TTF", "")
+
+
+def sensor(lag_min: float, delay_min: float) -> Scenario:
+    """The way of the heat to T_Q, late."""
+
+    def act(difference: np.ndarray) -> np.ndarray:
+        keep = np.exp(-1.0 / lag_min) if lag_min else 0.0
+        lagged = lfilter([1.0 - keep], [1.0, -keep], difference)
+        k = np.arange(lagged.size)
+        return np.asarray(np.interp(k - delay_min, k, lagged))
+
+    return Scenario(place=PLACE, act=lambda s: np.zeros(s[0]), sensor=act)
+
+
+def error(model: ThermalModel, run: Run, y: np.ndarray) -> float:
+    return float(np.var(y - predict(model, run)))
+
+
+def removed(found: Diagnosis, late: list[Scenario], others: list[Scenario]) -> float:
+    """The share that the model file removes, on a fresh day, of what a T_Q that is not late would remove."""
+    deployed = parse_model(dump_model(found.model).encode(), source="model.toml")
+    (columns, true, _), (prompt, _, effect) = (record(scenarios, 5100, 24.0) for scenarios in (late + others, others))
+    base = error(QUILL, runs_from(columns)[0], true)
+    possible = base - error(QUILL, runs_from(prompt)[0], true - effect)
+    return (base - error(deployed, runs_from(columns)[0], true)) / possible
+
+
+@pytest.mark.parametrize(
+    ("lag_min", "delay_min", "least"), [(6.0, 0.0, 0.97), (2.0, 0.0, 0.97), (0.0, 2.0, 0.95), (0.0, 4.0, 0.9)]
+)
+def test_a_late_t_q_is_named_deployed_and_removed(lag_min: float, delay_min: float, least: float) -> None:
+    late = sensor(lag_min, delay_min)
+    columns, _, _ = record([late], 1100, 36.0)
+    found = diagnose(QUILL, runs_from(columns))
+    [effect] = found.effects
+    assert effect.place == PLACE
+    assert effect.deployable
+    assert found.verdict == "explained"
+    total = sum(value for name, value in effect.named.items() if name.endswith("_min"))
+    assert total == pytest.approx(lag_min + delay_min, abs=0.6)
+    assert "in real time" in effect.explanation
+    assert removed(found, [late], []) > least
+    # What is promised is what the engine leaves, and not what could be known afterwards.
+    [run] = runs_from(columns)
+    left_um = np.sqrt(error(found.model, run, run.y_um))
+    assert found.after.rms_um == pytest.approx(left_um, rel=0.1)
+    assert effect.rms_after_um == pytest.approx(left_um, rel=0.1)
+
+
+def test_another_effect_beside_it_is_fitted_to_what_it_gets() -> None:
+    late = sensor(0.0, 3.0)
+    weaker = Scenario(place=("gain", "DTF", ""), act=lambda s: -0.2 * s[4])
+    columns, _, _ = record([late, weaker], 1101, 36.0)
+    found = diagnose(QUILL, runs_from(columns))
+    assert sorted(e.place for e in found.effects) == [PLACE, ("gain", "DTF", "")]
+    gain = next(e for e in found.effects if e.kind == "gain")
+    assert gain.named["change"] == pytest.approx(-0.2, abs=0.02)
+    assert removed(found, [late], [weaker]) > 0.95
+
+
+def test_the_signals_of_a_model_that_corrects_it_are_the_engines() -> None:
+    late = sensor(3.0, 2.0)
+    columns, _, _ = record([late], 1102, 24.0)
+    runs = runs_from(columns)
+    found = diagnose(QUILL, runs)
+    [own] = evidence_of(found.model, runs).signals
+    np.testing.assert_array_equal(own.share("all"), predict(found.model, runs[0]))
+    again = diagnose(found.model, runs)
+    assert [e.place for e in again.effects] == []
+
+
+def test_a_late_thermocouple_of_another_hand() -> None:
+    """Ten seconds a step, and means over a minute."""
+    duty = Duty.working_day(43, hours=36.0)
+    sensors = usual_sensors(duty.extra_names, temperature_noise_k=0.05, y_noise_um=1.0)
+
+    def columns(effects: list[LateSensor], seed: int) -> dict[str, np.ndarray]:
+        table = World(PublishedQuill(effects=effects), duty, sensors, seed).record(60.0)
+        table.pop("t_s")
+        return table
+
+    late = LateSensor(delay_s=60.0, lag_s=180.0)
+    found = diagnose(QUILL, runs_from(columns([late], 6)))
+    assert [e.place for e in found.effects] == [PLACE]
+    # That thermocouple is late for the heat and prompt for the ambient.
+    assert found.effects[0].form.startswith("path")
+    fresh, prompt = (runs_from(columns(effects, 7))[0] for effects in ([late], []))
+    noise = error(QUILL, prompt, prompt.y_um)
+    base, after = (error(model, fresh, fresh.y_um) for model in (QUILL, found.model))
+    assert (base - after) / (base - noise) > 0.9
+
+
+def test_a_thermocouple_that_is_late_for_the_ambient_too() -> None:
+    t_q, at, y = run_of(1104, 36.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
+    noise = np.random.default_rng(2).normal(0.0, 0.3, y.size)
+    found = diagnose(QUILL, runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y + noise}))
+    assert [e.place for e in found.effects] == [PLACE]
+    assert found.effects[0].form.startswith("sensor")
+    t_q, at, y = run_of(1105, 24.0, 0.02, form="sensor", lag_min=5.0, delay_min=0.0)
+    [fresh] = runs_from({"t_q_degc": t_q, "at_degc": at, "y_um": y})
+    assert error(found.model, fresh, y) < 0.02 * error(QUILL, fresh, y)
+
+
+def test_a_direct_model_names_its_sensor() -> None:
+    late, base = sensor(4.0, 0.0), direct("kalman")
+    columns, _, _ = record([late], 1103, 36.0)
+    _, _, _, _, _, y_tdtf, difference = signals(1103, 36.0)
+    y = base.dtf.sampled.response(difference) + y_tdtf
+    columns["y_um"] = y + np.random.default_rng(1).normal(0.0, 0.1, y.size)
+    found = diagnose(base, runs_from(columns))
+    assert [e.place for e in found.effects] == [("delay", "DTF", "")]
+    assert found.model.late_t_q is not None
+    assert found.after.rms_um < 0.6 * found.before.rms_um
