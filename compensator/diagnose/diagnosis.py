@@ -70,8 +70,8 @@ def diagnose(
     found = findings_of(evidence)
     effects = _effects(found)
     held_out = _held_out(found, progress, executor_map)
-    # What depends on time alone is not known on other data: it is taken out of both errors.
-    helps = rms_of(held_out.whole) <= rms_of(held_out.nothing)
+    # A base that is far off is replaced by the most probable one even where every block holds an event of its own.
+    helps = evidence.free_paths or rms_of(held_out.whole) <= rms_of(held_out.nothing)
     extended, remarks = _extended(model, found, effects) if helps else (model, ())
     remainder = None
     if found.remainder is not None:

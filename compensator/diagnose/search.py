@@ -176,14 +176,24 @@ class Search:
         return fit
 
     def _pruned(self, fit: Fit) -> Fit:
-        """Leave out every effect that is not worth its cost."""
+        """Leave out every effect that is not worth its cost, or too small to name."""
         while fit.terms:
             fewer = [settled(fit_terms(fit.likelihood, fit.starts(i))) for i in range(len(fit.terms))]
-            best = max(fewer, key=self.score)
-            if self.score(best) <= self.score(fit):
-                return fit
-            fit = best
+            best = max(range(len(fewer)), key=lambda i: self.score(fewer[i]))
+            small = [i for i, term in enumerate(fit.terms) if not self._is_worth_naming(term.hypothesis, fewer[i], fit)]
+            if self.score(fewer[best]) <= self.score(fit):
+                if not small:
+                    return fit
+                best = max(small, key=lambda i: self.score(fewer[i]))
+            fit = fewer[best]
         return fit
+
+    def _is_worth_naming(self, hypothesis: Hypothesis, without: Fit, fit: Fit) -> bool:
+        """Return whether an effect explains enough of what is left, the base model's own error counted in."""
+        own, effect = self.evidence.noise.own_error_um, hypothesis.effect
+        others = self.evidence.context.approximate and len(fit.terms) > 1
+        share = effect.worth_with_others if others else effect.worth
+        return self.rms(fit) ** 2 + own**2 < (1.0 - share) * (self.rms(without) ** 2 + own**2)
 
     def _is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
