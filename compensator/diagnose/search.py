@@ -32,6 +32,8 @@ MOST = 4
 MARGIN = 4.0
 #: Hypotheses that are fitted after each scan, and how many of those are judged.
 FITTED, JUDGED = 6, 4
+#: Shortest period that averaged points show for what it is, points.
+ALIAS_FREE = 3.0
 #: Columns of an effect that are larger than their sum by this much cancel each other.
 CANCELS = 6.0
 #: A simpler effect on the same path gives its name where it explains this share of what a background effect explains.
@@ -86,6 +88,7 @@ class Search:
             self.hypotheses = [hypothesis for hypothesis in self.hypotheses if hypothesis.effect.kind == "input"]
         elif context.approximate:
             self.hypotheses += proposals(context, background=True)
+        self.hypotheses = [_above(hypothesis, ALIAS_FREE * self.points.period_min) for hypothesis in self.hypotheses]
         self._scan = Scan(self.points, self.hypotheses)
         self._forms = Counter(hypothesis.place for hypothesis in self.hypotheses)
 
@@ -232,3 +235,14 @@ class Search:
                 other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
                 found[hypothesis.place] = Candidate(term=other.terms[-1], fit=other, rms_um=self.rms(other))
         return tuple(sorted(found.values(), key=lambda item: item.rms_um))
+
+
+def _above(hypothesis: Hypothesis, shortest_min: float) -> Hypothesis:
+    """Return a hypothesis without periods that averaged points would show as others."""
+    free = tuple(
+        dataclasses.replace(f, low=max(f.low, shortest_min), grid=tuple(g for g in f.grid if g > shortest_min))
+        if f.name == "period_min"
+        else f
+        for f in hypothesis.free
+    )
+    return dataclasses.replace(hypothesis, free=free)
