@@ -16,7 +16,7 @@ from compensator.data.runs import Run, noise_of
 from compensator.model.thermal_model import ThermalModel
 
 #: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
-OWN_SHARE = 0.02
+OWN_SHARE = 0.1
 #: No effect is looked for below this many times the base model's own error.
 OWN_TIMES = 1.3
 #: A residual up to this many times the base model's own error may come by itself on another day.
