@@ -104,7 +104,10 @@ class Search:
         rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
         before = best = fit_terms(Likelihood(self.points, rest), [])
         while len(best.terms) < MOST:
-            candidates = [settled(fit) for fit in self._proposed(best, unobserved=unobserved)[:JUDGED]]
+            proposed = self._proposed(best, unobserved=unobserved)
+            # A source with many switchings looks poor until the rest is settled with it.
+            late = [fit for fit in proposed[JUDGED:] if not fit.terms[-1].hypothesis.effect.observed]
+            candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
             better = max(candidates, key=self.score, default=best)
             if self.score(better) <= self.score(best):
                 break
