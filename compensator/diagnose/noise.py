@@ -21,12 +21,8 @@ OWN_SHARE = 0.1
 OWN_TIMES = 1.3
 #: A residual up to this many times the base model's own error may come by itself on another day.
 EXPECTED_TIMES = 1.4
-#: In a search, a sum of squares up to this many times that of noise and own error is noise.
-SEARCH_TIMES = 1.3
 #: For the verdict, what is left counts as noise up to this many times its level (rms).
 VERDICT_TIMES = 1.5
-#: A residual whose variance inflation is below this is white.
-WHITE_BELOW = 1.3
 #: An impulse, as long as the slow modes need.
 _IMPULSE = np.concatenate(([1.0], np.zeros(2999)))
 
@@ -58,26 +54,9 @@ class NoiseTest:
         """Return whether a residual, before any search, may come by itself on another day."""
         return cost < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
 
-    def is_noise(self, cost: float) -> bool:
-        """Return whether a search has nothing left to find in a sum of squares."""
-        return cost < SEARCH_TIMES * (self.count * self.noise_um**2 + self.allowance)
-
-    def is_bare_noise(self, cost: float) -> bool:
-        """Return the same with the own error as it is stated, without a margin."""
-        return cost < SEARCH_TIMES * self.count * (self.noise_um**2 + self.own_error_um**2)
-
     def is_explained(self, cost: float) -> bool:
         """Return whether the verdict may say that what is left is noise."""
         return cost < VERDICT_TIMES**2 * (self.count * self.noise_um**2 + self.allowance)
-
-    def is_explained_held_out(self, rms_um: float) -> bool:
-        """Return the same of a held-out error of a refitted base, whose own error is not known beforehand."""
-        return rms_um < VERDICT_TIMES * self.noise_um
-
-    @staticmethod
-    def is_white(variance_inflation: float) -> bool:
-        """Return whether a residual has no structure in time."""
-        return variance_inflation < WHITE_BELOW
 
 
 def own_error(model: ThermalModel, noise_um: float, spread_um: float) -> float:

@@ -103,7 +103,7 @@ class Search:
         unobserved = unobserved and not self.evidence.free_paths
         rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
         before = best = fit_terms(Likelihood(self.points, rest), [])
-        while len(best.terms) < MOST:
+        while len(best.terms) < MOST and not self._is_expected(best):
             proposed = self._proposed(best, unobserved=unobserved)
             # A source with many switchings looks poor until the rest is settled with it.
             late = [fit for fit in proposed[JUDGED:] if not fit.terms[-1].hypothesis.effect.observed]
@@ -194,12 +194,17 @@ class Search:
             fit = fewer[best]
         return fit
 
+    def _is_expected(self, fit: Fit) -> bool:
+        """Return whether what is left may come by itself on another day, where the calibration states its error."""
+        noise = self.evidence.noise
+        return noise.own_error_um > 0.0 and noise.is_expected(self.rms(fit) ** 2 * self.evidence.count)
+
     def _is_worth_naming(self, hypothesis: Hypothesis, without: Fit, fit: Fit) -> bool:
         """Return whether an effect explains enough of what is left, the base model's own error counted in."""
-        own, effect = self.evidence.noise.own_error_um, hypothesis.effect
+        effect, allowance = hypothesis.effect, self.evidence.noise.allowance / self.evidence.count
         others = self.evidence.context.approximate and len(fit.terms) > 1
         share = effect.worth_with_others if others else effect.worth
-        return self.rms(fit) ** 2 + own**2 < (1.0 - share) * (self.rms(without) ** 2 + own**2)
+        return self.rms(fit) ** 2 + allowance < (1.0 - share) * (self.rms(without) ** 2 + allowance)
 
     def _is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""

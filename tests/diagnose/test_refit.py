@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from compensator.data.measurement import read, runs_in
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.refit import refit
+from compensator.diagnose.findings import findings_of, with_paths
 from compensator.identify.calibration import calibrate, predict
 from compensator.identify.settings import Settings
 from tests.bench.spindle import FILE, SPLITS, one
@@ -65,11 +65,11 @@ def test_the_channel_and_its_curve_are_named(found):
     effect = found.effects[0]
     assert effect.term.hypothesis.effect.curve == "square"
     assert effect.deployable
-    gain, half_time = effect.named["gain_um_per_rpm2"], effect.named["half_time_min"]
+    gain, tau = effect.named["gain_um_per_rpm2"], effect.named["tau_min"]
     assert gain == pytest.approx(-2.4e-6, rel=0.25)
-    assert half_time == pytest.approx(70.0 * np.log(2.0), rel=0.35)
+    assert tau == pytest.approx(70.0, rel=0.35)
     assert 0.0 < effect.std["gain_um_per_rpm2"] < 0.2 * abs(gain)
-    assert effect.std["half_time_min"] > 0.0
+    assert effect.std["tau_min"] > 0.0
 
 
 def test_blocks_that_took_no_part_and_a_run_of_other_speeds_come_out_right(found, runs):
@@ -83,7 +83,7 @@ def test_blocks_that_took_no_part_and_a_run_of_other_speeds_come_out_right(found
 
 
 def test_the_extended_model_says_what_error_it_has_left(found):
-    assert found.model.y_std_um == found.model.held_out_rms_um < 1.5
+    assert 0.0 < found.model.y_std_um < 1.5
     assert any("were refitted" in str(words) for words in found.warnings)
 
 
@@ -104,34 +104,36 @@ def test_what_is_not_logged_is_not_made_up(runs):
     assert all(e.place[2] != "second_um" for e in result.effects)
 
 
-def test_the_paths_are_what_the_fit_says(runs):
-    """The filter banks, written as transfer functions, give the same deformation."""
-    evidence = evidence_of(calibrated(runs), runs)
-    whole = refit(evidence)
+def test_the_paths_are_what_the_regression_says(runs):
+    """The filter banks of heat and ambient, written as transfer functions, give the same deformation."""
+    model = calibrated(runs)
+    evidence = evidence_of(model, runs).with_free_paths()
+    found = findings_of(evidence)
+    extended, rest = with_paths(model, found.remainder.effect)
     record = evidence.signals[0]
-    y = whole.dtf.response(record.drive - record.drive[0]) + whole.tdtf.response(record.ambient_k - record.ambient_k[0])
-    for term in whole.terms:
-        y = y + term.hypothesis.columns(record, ()) @ np.array(term.amplitudes)
-    zero = whole.predicted - y
-    assert zero == pytest.approx(np.full(zero.size, zero[0]), abs=1e-6)
+    y = extended.dtf.sampled.response(record.drive) + extended.tdtf.sampled.response(record.ambient_k)
+    difference = found.own_paths - y
+    # From rest, the one begins at its first input and the other at 0.
+    assert difference[600:] == pytest.approx(np.full(difference[600:].size, difference[-1]), abs=0.05)
+    assert set(rest.channels) == set(found.remainder.effect.channels) - {"t_q_degc - at_degc", "at_degc"}
 
 
 def test_held_out_samples_do_not_take_part(runs):
     evidence = evidence_of(calibrated(runs), runs)
     block = next(evidence.blocks(3))
-    seen = evidence.without(block)
-    before = refit(seen)
+    before = findings_of(evidence.with_free_paths().without(block)).whole
     disturbed = runs_from(
         {
             "t_q_degc": runs[0].t_q_degc,
             "at_degc": runs[0].at_degc,
-            "y_um": np.where(block, 77.0, runs[0].y_um),
+            "y_um": np.where(block, runs[0].y_um + 3.0, runs[0].y_um),
             **runs[0].channels,
         }
     )
-    again = refit(evidence_of(calibrated(runs), disturbed).without(block))
-    assert again.rms_um == pytest.approx(before.rms_um, rel=1e-6)
-    assert not seen.deformation_um[block].any()
+    other = evidence_of(calibrated(runs), disturbed)
+    other = dataclasses.replace(other, probe_um=evidence.probe_um, runs=evidence.runs)
+    again = findings_of(other.with_free_paths().without(block)).whole
+    assert again == pytest.approx(before, rel=1e-6)
 
 
 @pytest.mark.skipif(not FILE.exists(), reason="the measured spindle's data is not here")

@@ -1,5 +1,7 @@
 """The search names kind and place of an effect that it is not given, and what it adds holds on another day."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.fit import fit_terms, standard_errors
+from compensator.diagnose.likelihood import Likelihood, Points
 from compensator.diagnose.search import Search
 from compensator.diagnose.summary import figures, verdict
 from compensator.identify.calibration import predict
@@ -107,9 +110,10 @@ def test_standard_errors_are_what_scatters():
         columns["y_um"] = columns["y_um"] + rng.normal(0.0, 1.0, columns["y_um"].size)
         evidence = evidence_of(QUILL, runs_from(columns))
         hypothesis = next(h for h in proposals(evidence.context) if h.place == ("gain", "DTF", ""))
-        fit = fit_terms(evidence, [(hypothesis, ())])
+        points = Points(evidence)
+        fit = fit_terms(Likelihood(points, points.typical_rest()), [(hypothesis, ())])
         values.append(fit.terms[0].amplitudes[0])
-        stds.append(standard_errors(evidence, fit, evidence.variance_inflation(fit.residual))[0]["change"])
+        stds.append(standard_errors(fit)[0]["change"])
     assert 0.5 * np.std(values) < np.mean(stds) < 2.0 * np.std(values)
 
 
@@ -121,11 +125,10 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     held_out = diagnosis_module._held_out
 
     def worse(*arguments):
-        before, _ = held_out(*arguments)
-        return before, 1.1 * before
+        errors = held_out(*arguments)
+        return dataclasses.replace(errors, named=1.1 * errors.nothing, whole=1.1 * errors.nothing)
 
     monkeypatch.setattr(diagnosis_module, "_held_out", worse)
-    monkeypatch.setattr(diagnosis_module, "_doubtful", lambda *_: False)
     bad = diagnose(QUILL, runs_from(columns))
     assert bad.verdict == "partly_explained" and not bad.model.effects
     assert "made_worse" in [warning.code for warning in bad.warnings]
