@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> Answer:
             checked_file(arguments.out, "--out", read=(*paths, Path(arguments.model)), ending=".csv")
         return _compare(paths, arguments.model, arguments.out, page)
     if arguments.out is not None:
-        raise UsageError("--out: requires --model")
+        raise UsageError("--out: is for --model, which is not given")
     public_key = arguments.public_key
     if arguments.scheduler is not None:
         # Workers may run in other folders, so paths must be absolute.

@@ -191,7 +191,7 @@ def test_the_command(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
         (["x.csv"], "x.csv: not an MCAP file, expected a recording"),
         ([str(folder), "--out", "page.txt"], "--out page.txt: expected a name that ends in .html, .pdf or .png"),
         ([str(folder), "--out", "none/page.html"], "--out none/page.html: no such folder"),
-        ([str(tmp_path / "empty")], "empty: neither recordings (*.mcap) nor pages"),
+        ([str(tmp_path / "empty")], "empty: contains neither recordings (*.mcap) nor pages"),
     ):
         (tmp_path / "empty").mkdir(exist_ok=True)
         assert main(["report", *arguments]) == 2, arguments
