@@ -223,7 +223,10 @@ def test_a_folder_with_results_leads_to_its_pages(tmp_path: Path, capsys: pytest
     (inner / "other.html").write_text("<h1>not ours</h1>")
     assert main(["report", str(inner.parent), "--out", str(tmp_path / "all.html")]) == 0
     said = capsys.readouterr().out
-    assert "something is left. Drift." in said and "0.50 µm rms in free run (9.0 without compensation)" in said
+    assert (
+        "part of the residual remains unexplained. Drift." in said
+        and "0.50 µm rms in free run (9.0 without compensation)" in said
+    )
     page = (tmp_path / "all.html").read_text(encoding="utf-8")
     assert re.findall(r'<a href="([^"]*)"', page) == ["demo%20out/report.html", "demo%20out/calibration/report.html"]
     assert '<p class="verdict warn"><b>⚠ Caution</b>Part of what' in page and "not ours" not in page
