@@ -108,7 +108,7 @@ def rewrite(
     Raises
     ------
     OSError
-        If the copy cannot be written; the file stays as it is.
+        If the copy cannot be written; the file is not changed.
     DataError
         If the file is damaged, or the copy differs from it when read back; the file is not changed.
     """

@@ -95,7 +95,7 @@ def write(path: Path, page: Page) -> Path:
     Raises
     ------
     CompensatorError
-        If there is no browser, or it does not print the page in time; an existing file then stays as it is.
+        If there is no browser, or it does not print the page in time; an existing file is then not changed.
     OSError
         If the file cannot be written.
     """

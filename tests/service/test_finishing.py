@@ -128,7 +128,7 @@ def test_a_failure_is_said_and_the_recording_goes_on(tmp_path: Path, monkeypatch
     service.recorder.start_new()
     service.run(5).stop()
     remarks = service.recorder.remarks()
-    assert len(remarks) == 2 and "could not be made compact and stays as it is" in remarks[0][0]
+    assert len(remarks) == 2 and "could not be compacted and remains unchanged" in remarks[0][0]
     found = audit(recordings(tmp_path, MACHINE))
     assert found.clean and found.samples == 10
 
@@ -232,7 +232,7 @@ def test_a_disk_that_refuses_the_copy_is_made_room_on(tmp_path: Path, monkeypatc
     service = days(tmp_path, 6, keep_days=2.5)
     remarks = service.recorder.remarks()
     assert [data["removed"][0][7:15] for _, data in remarks if "removed" in data] == ["20260105", "20260106"]
-    assert sum("could not be made compact and stays as it is" in text for text, _ in remarks) >= 5
+    assert sum("could not be compacted and remains unchanged" in text for text, _ in remarks) >= 5
     live = service.recorder.path
     service.kill()
     left = recordings(tmp_path, MACHINE)
