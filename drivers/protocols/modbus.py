@@ -68,8 +68,8 @@ def exception_text(code: int) -> str:
 def fence_for(requests: tuple[Request, ...]) -> Request:
     """Choose a request whose answer cannot be confused with that of any of a device's requests.
 
-    It is the first request after a missing answer. A device answers in order, so after the fence's own answer no earlier
-    answer can arrive. The fence reads the start of the first block, with a length that no other request has.
+    It is the first request after a missing answer. A device answers in order, so after the fence's own answer no
+    earlier answer can arrive. The fence reads the start of the first block, with a length that no other request has.
 
     Parameters
     ----------
