@@ -82,7 +82,7 @@ def test_without_the_service_the_model_is_kept_for_its_next_start(
     assert in_use(idle, capsys) == configured
     assert main(["back", "--config", str(idle)]) == 1
     error = capsys.readouterr().err
-    assert "none before it" in error and error.count("\n") == 1
+    assert "no previous model" in error and error.count("\n") == 1
 
 
 def test_an_adopted_model_that_was_damaged_is_said_and_the_configured_one_stands_in(

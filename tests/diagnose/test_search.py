@@ -129,4 +129,4 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     bad = diagnose(QUILL, runs_from(columns))
     assert bad.verdict == "partly_explained" and not bad.model.effects
     assert "made_worse" in [warning.code for warning in bad.warnings]
-    assert "does not hold on held-out data" in verdict(bad) and "is found" not in verdict(bad)
+    assert "increases the error on held-out data" in verdict(bad) and "were found" not in verdict(bad)
