@@ -4,7 +4,7 @@ Data replies contain no address, so a late one could be taken for another module
 
 - Before each command all received bytes are dropped, and only one command is sent at a time.
 - After a missing or broken data reply the module is *unsettled*. The line first waits until it is quiet,
-and the module is asked for its name (`$AAM`) until it answers: name replies contain the address, and a module
+  and the module is asked for its name (`$AAM`) until it answers: name replies contain the address, and a module
   answers in order, so after its name no data reply of it is pending.
 - For `LOOSE_S` after a missing data reply the *other* modules' data are confirmed: each is asked for
   its name right after its data. With the late reply there would be two data replies before the name; then

@@ -5,7 +5,7 @@ Faults, and how they are handled:
 - *Late answer (RTU).* An RTU frame does not say which request it answers. After a missing, broken or
   refused answer the unit is *unsettled*: before its next request the line first waits until it is quiet,
   then sends a fence (`drivers.protocols.modbus.fence_for`), whose answer differs from all other answers of
-the unit. A device answers in order, so after the fence's answer no late answer is pending. Answers of other
+  the unit. A device answers in order, so after the fence's answer no late answer is pending. Answers of other
   units differ by their unit id.
 - *Late answer (TCP).* Recognised by the transaction number. A stream out of step is disconnected.
 - *Dead device.* Its attempts are delayed by a back-off (`drivers.lines.backoff`); the other devices continue.

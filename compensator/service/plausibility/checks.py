@@ -3,7 +3,7 @@
 Three checks, each on only if the configuration has its limit:
 
 - *exchanged*: T_Q is below AT by more than `guards.t_q_below_at_max_k` for longer than `t_q_below_at_after_min`.
-Without heat both are equal, so exchanged wires show only once the machine heats up; by then the offset has the wrong
+  Without heat both are equal, so exchanged wires show only once the machine heats up; by then the offset has the wrong
   sign. The state is `fault`, latched until `resume` or a zero at rest.
 - *at rest*: while a channel shows that nothing heats the machine, T_Q − AT must return to its value at the zero. The
   reason remains until a later rest clears it.
