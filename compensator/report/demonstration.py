@@ -176,6 +176,6 @@ def _comparison(paper: Sequence[Comparison]) -> Table:
     return dataclasses.replace(
         comparison_table(paper),
         title="",
-        note="Identified from a run with 1 % measurement error and one step of 90 W in still air: the TTF is recovered, "
-        "the slow part of DTF and TDTF only within its standard errors.",
+        note="Identified from a run with 1 % measurement error and one step of 90 W in still air: the TTF is "
+        "recovered, the slow part of DTF and TDTF only within its standard errors.",
     )

@@ -146,4 +146,4 @@ def test_a_file_that_no_service_wrote_is_no_clean_recording(
     assert not said.out and said.err.count("\n") == 1 and f"foreign.mcap: {expected}" in said.err
     for other in (["replay", str(foreign), "--model", "quill"], ["report", str(foreign), "--out", f"{foreign}.html"]):
         assert main(other) == 2
-        assert "foreign.mcap: no samples," in capsys.readouterr().err
+        assert "foreign.mcap: no samples" in capsys.readouterr().err

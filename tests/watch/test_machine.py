@@ -163,7 +163,7 @@ def test_what_was_lost_is_told_from_a_restart(heard: Heard) -> None:
     assert heard.machine["missed"] == 13
     heard.hear(status=status(20, started_ns=START_NS + 660 * NS))
     assert heard.machine["missed"] == 2
-    assert any("2 message(s) never arrived" in text for text in heard.machine["warnings"])
+    assert any("2 message(s) did not arrive" in text for text in heard.machine["warnings"])
 
 
 def test_two_services_below_one_prefix_are_told(heard: Heard) -> None:
@@ -196,7 +196,7 @@ def test_a_probe_that_sees_more_than_the_service_states_is_told_after_half_an_ho
     for i in range(30, 60):
         minute(i, -6.5)
     assert heard.machine["tone"] == "warn" and heard.machine["warning_codes"] == ["misfit"]
-    assert heard.machine["shown"] == "ok" and "6.5 µm apart" in heard.machine["to_do"]
+    assert heard.machine["shown"] == "ok" and "differed by 6.5 µm" in heard.machine["to_do"]
     assert "compensator diagnose" in heard.machine["to_do"] and "Nothing." not in heard.machine["to_do"]
     minute(60, -6.5, y_offset_std_um=4.0)  # one minute changes nothing
     assert heard.machine["warning_codes"] == ["misfit"]
