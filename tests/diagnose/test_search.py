@@ -8,7 +8,7 @@ from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.fit import fit_terms, standard_errors
 from compensator.diagnose.search import Search
-from compensator.diagnose.summary import verdict
+from compensator.diagnose.summary import figures, verdict
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model
@@ -117,7 +117,7 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     """However well it fits: the verdict must not say found, and the model is left as it was."""
     columns, _, _ = record([draw("gain DTF", 3)], 77, hours=24.0)
     good = diagnose(QUILL, runs_from(columns))
-    assert good.verdict == "explained" and good.model.effects and "is found" in verdict(good)
+    assert good.verdict == "explained" and good.model.effects and "were found" in verdict(figures(good))
     held_out = diagnosis_module._held_out
 
     def worse(*arguments):
@@ -129,4 +129,4 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     bad = diagnose(QUILL, runs_from(columns))
     assert bad.verdict == "partly_explained" and not bad.model.effects
     assert "made_worse" in [warning.code for warning in bad.warnings]
-    assert "increases the error on held-out data" in verdict(bad) and "were found" not in verdict(bad)
+    assert "increases the error on held-out data" in verdict(figures(bad)) and "were found" not in verdict(figures(bad))
