@@ -115,7 +115,7 @@ def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest
     )
     try:
         assert process.stdin is not None and process.stderr is not None
-        assert any("Ctrl-C ends it" in line for line in process.stderr)
+        assert any("Ctrl-C ends the demo" in line for line in process.stderr)
         process.stdin.write("break t_q\n")
         process.stdin.flush()
         assert any(line == "break t_q: done; visible within two minutes\n" for line in process.stderr)
