@@ -310,7 +310,7 @@ class _Warnings:
             return None
         return Remark(
             ModelWarning.COMMON_CAUSE,
-            f"The heat and the ambient temperature changed together (correlation {together:.2f}): the shares of the "
+            f"The drive of the DTF and the ambient temperature changed together (correlation {together:.2f}): the shares of the "
             "DTF and the TDTF in the deformation are ambiguous.",
         )
 
