@@ -310,8 +310,8 @@ class _Warnings:
             return None
         return Remark(
             ModelWarning.COMMON_CAUSE,
-            f"The drive of the DTF and the ambient temperature changed together (correlation {together:.2f}): the shares of the "
-            "DTF and the TDTF in the deformation are ambiguous.",
+            f"The drive of the DTF and the ambient temperature changed together (correlation {together:.2f}): the "
+            "shares of the DTF and the TDTF in the deformation are ambiguous.",
         )
 
     def undetermined_gain(self) -> list[Remark]:
