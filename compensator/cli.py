@@ -110,7 +110,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         Arguments without the program's name; by default those of `sys.argv`.
     """
     one_thread_from_start()
-    given = _parser().parse_args(argv)
+    given, unknown = _parser().parse_known_args(argv)
+    if unknown:
+        # argparse itself would name the help of the whole program.
+        given.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s", force=True)
     try:
         answer = load(given.command)(given)
@@ -165,7 +168,7 @@ def _parser() -> argparse.ArgumentParser:
         one = subparsers.add_parser(
             command.name, description=command.text, epilog=f"example: compensator {command.example}"
         )
-        one.set_defaults(command=command)
+        one.set_defaults(command=command, parser=one)
         one.add_argument("--debug", action="store_true", help="show where an error comes from")
         one.add_argument("--json", action="store_true", help="print the result as JSON")
         command.describe(one)

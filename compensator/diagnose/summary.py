@@ -14,8 +14,8 @@ from compensator.display import Table, Words, warnings_of, with_std
 from compensator.model.simulation import SCORE_HEAD, Scores
 
 _VERDICTS = {
-    "adequate": "The model is adequate: the residual is noise.",
-    "explained": "The missing effects were found; the remaining residual is noise.",
+    "adequate": "The model is adequate: the residual is within the noise and the model's own error.",
+    "explained": "The missing effects were found; what remains is within the noise and the model's own error.",
     "partly_explained": "Some of the missing effects were found; part of the residual remains unexplained.",
     "unexplained": "The model lacks an effect that no channel shows.",
 }
