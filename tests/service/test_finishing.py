@@ -258,13 +258,15 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_on_a_full_disk_the_limit_makes_the_room_that_the_recording_needs(small_disk: Path) -> None:
-    service = days(small_disk, 4, keep_days=3.5)
+    # Finished files are small: several must go for a live one.
+    service = days(small_disk, 9, keep_days=8.5)
+    service.recorder._finisher.wait()
     before = recordings(small_disk, MACHINE)
     with (small_disk / "other").open("wb", buffering=0) as other, suppress(OSError):
         while other.write(bytes(4096)) == 4096:
             pass
-    # A week later: the day's end does not fit any more, nor does the new file.
-    service.start_ns += 7 * DAY_NS
+    # Two weeks later: the day's end does not fit any more, nor does the new file.
+    service.start_ns += 14 * DAY_NS
     with pytest.raises(OSError, match="No space"):
         service._write([], service.compensation.state())
     service.recorder._finisher.wait()
@@ -279,7 +281,7 @@ def test_on_a_full_disk_the_limit_makes_the_room_that_the_recording_needs(small_
     service.run(1).stop()
     found = audit(recordings(small_disk, MACHINE))
     assert found.clean, found.findings
-    assert f"continues {before[2].name}, which the retention limit removed" in " ".join(found.remarks)
+    assert f"continues {before[-2].name}, which the retention limit removed" in " ".join(found.remarks)
 
 
 def test_over_weeks_the_folder_stays_below_the_limit(tmp_path: Path) -> None:
