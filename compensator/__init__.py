@@ -7,7 +7,7 @@
     why = tc.diagnose(found.model, run)
     tc.compare({"first": found.model, "extended": why.model}, run)
 
-The verbs are loaded when they are first used.
+The functions are imported when they are first used.
 """
 
 from __future__ import annotations
@@ -65,10 +65,10 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """The package: `identify` and `diagnose` are its verbs, although two of its rooms have these names."""
+    """The package: `identify` and `diagnose` are functions, although two subpackages have the same names."""
 
     def __setattr__(self, name: str, value: object) -> None:
-        # An import of `compensator.identify.…` would set the room in the verb's place.
+        # An import of `compensator.identify.…` would otherwise replace the function by the subpackage.
         if not (name in _MODULES and isinstance(value, ModuleType)):
             super().__setattr__(name, value)
 

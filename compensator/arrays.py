@@ -1,4 +1,4 @@
-"""Array types that signatures share, and numbers that all rooms share."""
+"""Array types for signatures, and constants that all packages share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 #: A missing value.
 NAN = math.nan
-#: No measurement, coefficient, gain or noise is as large; powers of larger numbers would not be finite.
+#: Larger than any measurement, coefficient, gain or noise; powers of larger numbers would not be finite.
 LARGEST = 1e30
 
 #: One number for each sample or parameter, shape (n,).

@@ -14,23 +14,23 @@ from compensator.errors import UsageError
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[TextIO]:
-    r"""Open a text file that replaces another one when it is complete; after an error it is removed.
+    r"""Open a text file that replaces the target when it is complete; after an error it is removed.
 
     Parameters
     ----------
     path : pathlib.Path
-        The file; its folder must exist. The present file stays until it is replaced. A link stays a link, and what is
-        not a regular file (`/dev/null`, a pipe) is written to directly.
+        The file; its folder must exist. An existing file remains until it is replaced. A link remains a link, and a
+        target that is not a regular file (`/dev/null`, a pipe) is written directly.
 
     Yields
     ------
     typing.TextIO
-        Open for UTF-8 text; line ends are written as they are given.
+        Open for UTF-8 text; line ends are written unchanged.
 
     Raises
     ------
     UsageError
-        If there is no such folder.
+        If the folder does not exist.
 
     Examples
     --------
@@ -54,7 +54,7 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
         yield file
         file.flush()
         os.fsync(descriptor)
-        # Root's umask may be narrower, and then the service could not read its own model.
+        # With a restrictive umask of root, the service could not read its own model.
         os.fchmod(descriptor, 0o644)
 
 
@@ -64,14 +64,14 @@ def require_folder(path: Path) -> None:
     Raises
     ------
     UsageError
-        Naming the path.
+        If the folder does not exist; the error names the path.
     """
     if not path.absolute().parent.is_dir():
         raise UsageError(f"{path}: no such folder")
 
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = True) -> None:
-    """Replace a file by another one; a link is replaced, not followed.
+    """Replace a file; a link is replaced, not followed.
 
     Parameters
     ----------
@@ -82,12 +82,12 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = Tru
     mode : int
         Its permissions, before the umask.
     sync : bool
-        Whether to bring the file and its name to disk: a power cut then leaves the old file or the new one.
+        Whether to sync the file and its name to disk, so that a power cut leaves the old file or the new one.
 
     Raises
     ------
     OSError
-        If it cannot be written; the old file stays.
+        If it cannot be written; the old file is kept.
     """
     with _replacement(path, mode) as descriptor, os.fdopen(descriptor, "wb") as file:
         file.write(data)
@@ -99,12 +99,12 @@ def replace_file(path: Path, data: bytes, *, mode: int = 0o666, sync: bool = Tru
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to disk, so that a new file's name survives a power cut.
+    """Sync the names in a folder to disk, so that a new file's name survives a power cut.
 
     Raises
     ------
     OSError
-        If the disk refuses it.
+        If the sync fails.
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -115,7 +115,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def _replacement(path: Path, mode: int) -> Iterator[int]:
-    """Open a new file in the same folder; at the end it takes the name, after an error it is removed."""
+    """Open a new file in the same folder; at the end it replaces the target, after an error it is removed."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(temporary, flags, mode)

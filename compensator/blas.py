@@ -1,4 +1,4 @@
-"""One thread for linear algebra: matrices here are small, and sums in another order end in other digits."""
+"""One thread for linear algebra: matrices are small, and sums in another order would change the last digits."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ T = TypeVar("T")
 
 
 def one_thread_from_start() -> None:
-    """Have the libraries of this process start no threads: for an entry point, before numpy is loaded."""
+    """Limit the numerical libraries of this process to one thread; for entry points, before numpy is imported."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def in_one_thread(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a function while BLAS has one thread, in whatever process this is."""
+    """Call a function while BLAS is limited to one thread, in any process."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1, user_api="blas"):
@@ -25,7 +25,7 @@ def in_one_thread(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -
 
 
 def one_thread(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a function that computes, so that its figures depend neither on cores nor on who calls it."""
+    """Decorate a function so that its results do not depend on the number of cores or on the caller."""
 
     @functools.wraps(function)
     def alone(*args: P.args, **kwargs: P.kwargs) -> T:

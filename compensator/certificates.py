@@ -1,4 +1,4 @@
-"""TLS files are checked before they are used: with a bad one Zenoh reports only that it cannot connect.
+"""Checks TLS files before they are used: for an invalid file Zenoh reports only that it cannot connect.
 
 Certificates are read with the package `cryptography` (extra `tls`); without it only the presence and the permissions
 of the files are checked.
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from compensator.codes import Remark, ServiceWarning
 from compensator.errors import ConfigError
 
-#: Days before its end from which on a certificate is warned of.
+#: Number of days before the expiry of a certificate from which a warning is given.
 SOON_DAYS = 30.0
 MISSING = "certificates are not checked without the package cryptography: pip install quill-compensator[tls]"
 
@@ -26,7 +26,7 @@ class TlsFiles(NamedTuple):
     Parameters
     ----------
     ca, certificate, key : pathlib.Path
-        Authority of the other side, own certificate, own private key; PEM.
+        Authority of the peer, own certificate, own private key; PEM.
     names : tuple of str
         Their keys in the configuration.
     """
@@ -45,7 +45,7 @@ class Certificate(NamedTuple):
     common_name : str
         Its owner.
     begins, ends : datetime.datetime
-        When it is valid, UTC.
+        Period of validity, UTC.
     """
 
     common_name: str
@@ -53,7 +53,7 @@ class Certificate(NamedTuple):
     ends: datetime.datetime
 
     def wrong_at(self, now: datetime.datetime) -> str | None:
-        """Return why it cannot be used at a time, None if it can."""
+        """Return why it cannot be used at a time; None if it can."""
         if now > self.ends:
             return f"certificate of {self.common_name!r} has expired on {self.ends:%Y-%m-%d %H:%M} UTC"
         if now < self.begins:
@@ -69,12 +69,12 @@ def check_files(source: str, files: TlsFiles) -> Certificate | None:
     source : str
         The configuration, for the message.
     files : TlsFiles
-        What to check.
+        Files to check.
 
     Returns
     -------
     Certificate or None
-        The own certificate, valid now or not; None without the package `cryptography`.
+        The own certificate, even if not valid now; None without the package `cryptography`.
 
     Raises
     ------
@@ -87,8 +87,8 @@ def check_files(source: str, files: TlsFiles) -> Certificate | None:
     mode = stat.S_IMODE(files.key.stat().st_mode)
     if mode & 0o037:
         raise ConfigError(
-            f"{source}: {files.names[2]} = {str(files.key)!r}: mode {mode:04o}, expected 0600, or 0640 where a "
-            f"group of the service's own reads it: others can use the key"
+            f"{source}: {files.names[2]} = {str(files.key)!r}: mode {mode:04o}, expected 0600, or 0640 if "
+            "the service's own group reads it; otherwise other users could use the key"
         )
     try:
         from cryptography import x509
@@ -101,7 +101,9 @@ def check_files(source: str, files: TlsFiles) -> Certificate | None:
     if own[0].public_key() != key.public_key():
         raise ConfigError(f"{source}: {files.names[2]} = {str(files.key)!r}: not the key of {files.certificate}")
     if len(own) == 1 and not any(_issued(own[0], authority) for authority in authorities):
-        raise ConfigError(f"{source}: {files.names[1]} = {str(files.certificate)!r}: not of the authority {files.ca}")
+        raise ConfigError(
+            f"{source}: {files.names[1]} = {str(files.certificate)!r}: not issued by the authority {files.ca}"
+        )
     return Certificate(_common_name(own[0]), own[0].not_valid_before_utc, own[0].not_valid_after_utc)
 
 
@@ -130,7 +132,7 @@ def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[Rem
     if days >= SOON_DAYS:
         return []
     figures = (
-        f"The certificate of {certificate.common_name!r} ends on {certificate.ends:%Y-%m-%d}, in {days:.0f} day(s)."
+        f"The certificate of {certificate.common_name!r} expires on {certificate.ends:%Y-%m-%d}, in {days:.0f} day(s)."
     )
     return [Remark(ServiceWarning.CERTIFICATE_ENDS, figures)]
 
@@ -141,7 +143,9 @@ def _read(source: str, name: str, path: Path, load: Callable[[bytes], Any]) -> A
     except OSError as error:
         raise ConfigError(f"{source}: {name} = {str(path)!r}: {error.strerror or error}") from error
     except (ValueError, TypeError) as error:
-        raise ConfigError(f"{source}: {name} = {str(path)!r}: no PEM of that kind without a password") from error
+        raise ConfigError(
+            f"{source}: {name} = {str(path)!r}: not a PEM file of this kind without a password"
+        ) from error
 
 
 def _issued(certificate: Any, authority: Any) -> bool:

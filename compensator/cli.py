@@ -24,16 +24,16 @@ log = logging.getLogger("compensator")
 
 
 class Command(NamedTuple):
-    """A command; its arguments are described by the function of its name in `commands.arguments`.
+    """A command; the function of the same name in `commands.arguments` adds its arguments.
 
     Parameters
     ----------
     name, text, example : str
         Its name, one line for the help, and an example.
     place : str
-        Module of the package, and function, that run it; by default `run` in the module of its name in `commands`.
-        The module is loaded when the command is called; the function takes the arguments and returns an `Answer`, or
-        None where there is nothing to print.
+        Module and function that run it, as `MODULE:FUNCTION`; by default `run` in the module of the same name in
+        `commands`. The module is imported when the command is called; the function takes the arguments and returns an
+        `Answer`, or None if there is nothing to print.
     """
 
     name: str
@@ -46,54 +46,56 @@ class Command(NamedTuple):
         getattr(arguments, self.name)(parser)
 
 
-#: The commands by the user who needs them.
+#: The commands, grouped by user.
 USERS = {
-    "to try it": (Command("demo", "the whole loop on simulated hardware", "demo --out demo-out", "demo.command:run"),),
+    "evaluation": (
+        Command("demo", "run the whole loop on simulated hardware", "demo --out demo-out", "demo.command:run"),
+    ),
     "calibration engineer": (
-        Command("identify", "a model from measured runs", "identify run.csv --validate other.csv --out model.toml"),
+        Command("identify", "fit a model to measured runs", "identify run.csv --validate other.csv --out model.toml"),
         Command("simulate", "run a model over measured data", "simulate run.csv --model quill --out predicted.csv"),
         Command(
             "diagnose",
-            "what a model lacks, from measured data",
+            "find what a model lacks, from measured data",
             "diagnose day.mcap --model model.toml --out diagnosis",
         ),
         Command(
             "adopt",
-            "bring another model into the running service, without a jump",
+            "switch the running service to another model without a jump",
             "adopt diagnosis/model.toml --config machine.toml",
             "commands.adopt:adopt",
         ),
-        Command("back", "return to the model before", "back --config machine.toml", "commands.adopt:back"),
+        Command("back", "return to the previous model", "back --config machine.toml", "commands.adopt:back"),
     ),
     "operator": (
-        Command("watch", "live view of one machine or many", "watch --connect tcp/127.0.0.1:7447 --prefix shop"),
-        Command("explain", "a state, reason or warning in words", "explain degraded"),
+        Command("watch", "show one machine or many, live", "watch --connect tcp/127.0.0.1:7447 --prefix shop"),
+        Command("explain", "explain a state, reason or warning", "explain degraded"),
         Command("zero", "set the machine's present state as zero", "zero --config machine.toml", "commands.order:zero"),
         Command("hold", "freeze the offset", "hold --config machine.toml", "commands.order:hold"),
         Command(
             "resume",
-            "let the offset follow again after hold",
+            "let the offset follow the model again after hold",
             "resume --prefix shop/vmc-07 --zenoh operator.json5",
             "commands.order:resume",
         ),
-        Command("report", "a page of recordings, or of a folder with results", "report recordings/"),
+        Command("report", "make a page from recordings or a folder of results", "report recordings/"),
     ),
     "CNC integrator": (
         Command("bridge", "write the offset to a control that speaks OPC UA", "bridge opcua --config bridge.toml"),
-        Command("router", "a Zenoh router, where no zenohd is installed", "router --config router.json5"),
+        Command("router", "run a Zenoh router where no zenohd is installed", "router --config router.json5"),
     ),
     "auditor": (
         Command(
             "replay",
-            "audit recordings: nothing was changed, every sample is reproduced",
+            "audit recordings: detect changes, reproduce every sample",
             "replay recordings/*.mcap",
         ),
-        Command("export", "recordings as a table", "export day.mcap --out day.csv"),
+        Command("export", "export recordings as a table", "export day.mcap --out day.csv"),
     ),
-    "at the machine": (
-        Command("check", "validate a configuration; opens nothing", "check --config machine.toml"),
-        Command("probe", "one reading of every device", "probe --config machine.toml"),
-        Command("run", "the service", "run --config machine.toml"),
+    "commissioning": (
+        Command("check", "validate a configuration without opening devices", "check --config machine.toml"),
+        Command("probe", "read every device once", "probe --config machine.toml"),
+        Command("run", "run the service", "run --config machine.toml"),
     ),
 }
 COMMANDS = tuple(command for commands in USERS.values() for command in commands)
@@ -105,10 +107,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv : sequence of str, optional
-        Arguments without the program's name; `sys.argv` where none are given.
+        Arguments without the program's name; by default those of `sys.argv`.
     """
     one_thread_from_start()
-    given = _parser().parse_args(argv)
+    given, unknown = _parser().parse_known_args(argv)
+    if unknown:
+        # argparse itself would name the help of the whole program.
+        given.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(message)s", force=True)
     try:
         answer = load(given.command)(given)
@@ -141,11 +146,11 @@ def _in_words(error: Exception) -> str:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports wrong usage in one line, like every other error, and where the options are listed."""
+    """Argument parser that reports wrong usage in one line, like every other error."""
 
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""
-        self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` has all options\n")
+        self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` lists all options\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -153,7 +158,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="compensator",
         usage="compensator [-h] [--version] COMMAND ...",
         description=f"Thermal error compensation for machine tools.\n\n{_overview()}",
-        epilog="`compensator COMMAND --help` has its options and an example.\nexample: compensator demo --out demo-out",
+        epilog="`compensator COMMAND --help` shows options and an example.\nexample: compensator demo --out demo-out",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=__version__)
@@ -163,7 +168,7 @@ def _parser() -> argparse.ArgumentParser:
         one = subparsers.add_parser(
             command.name, description=command.text, epilog=f"example: compensator {command.example}"
         )
-        one.set_defaults(command=command)
+        one.set_defaults(command=command, parser=one)
         one.add_argument("--debug", action="store_true", help="show where an error comes from")
         one.add_argument("--json", action="store_true", help="print the result as JSON")
         command.describe(one)
@@ -171,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _overview() -> str:
-    """Return the commands by user, one line each."""
+    """Return the commands grouped by user, one line each."""
     groups = (
         f"{user}:\n" + "\n".join(f"  {command.name:<10} {command.text}" for command in commands)
         for user, commands in USERS.items()

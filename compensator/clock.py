@@ -1,4 +1,4 @@
-"""The clock that is handed in: the machine's own, or a virtual one in which a day takes seconds."""
+"""Clocks: the computer's own, or a virtual one in which a day takes seconds."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ NS = 1_000_000_000
 
 
 class Clock(Protocol):
-    """What the service needs of a clock."""
+    """Interface of a clock for the service."""
 
     def utc_ns(self) -> int:
         """Return the wall clock, ns since 1970 UTC. It may be set back or forward."""
 
     def monotonic_ns(self) -> int:
-        """Return a clock that is never set, ns."""
+        """Return a monotonic clock, ns."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait."""
@@ -27,7 +27,7 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The clock of the machine."""
+    """The clock of the computer."""
 
     def utc_ns(self) -> int:
         """Return the wall clock, ns since 1970 UTC."""
@@ -48,15 +48,15 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock that does not move during work and jumps ahead on `sleep`.
+    """A clock that stands still during computations and jumps ahead on `sleep`.
 
-    Only one task may sleep on it, the sampling loop. What it awaits with `settle` runs in real time, within its own
-    limits, while virtual time does not move.
+    Only one task may sleep on it, the sampling loop. Tasks awaited with `settle` run in real time, within their own
+    limits, while virtual time stands still.
 
     Parameters
     ----------
     start_utc_ns : int
-        Where it starts, ns since 1970 UTC.
+        Start of the clock, ns since 1970 UTC.
     on_advance : callable, optional
         Awaited with the seconds since the start whenever time has advanced, to advance a simulated machine.
     """
@@ -87,6 +87,6 @@ class VirtualClock:
         await asyncio.sleep(0)
 
     async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
-        """Wait until the tasks are done, however long that takes in real time."""
+        """Wait until the tasks are done, without a limit in real time."""
         if tasks:
             await asyncio.wait(tasks)

@@ -1,7 +1,7 @@
-"""Every code with its words: what it means, and what to do.
+"""All codes, each with its meaning and the recommended action.
 
-Each domain has an enumeration of its own, derived from `Code`. A member is the code itself: it compares, formats and
-encodes as the text in messages, recordings and JSON. A new code is a member here, and nothing else.
+Each domain has its own enumeration, derived from `Code`. A member is a string: it compares, formats and encodes as
+the code in messages, recordings and JSON. To add a code, add a member here.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from types import MappingProxyType
 
 
 class Code(StrEnum):
-    """A code of a domain; derive from it, and give each member its code, meaning and action.
+    """Base class of the enumerations; each member consists of a code, its meaning and an action.
 
     Attributes
     ----------
     meaning : str
-        What it means, one sentence.
+        What the code means, one sentence.
     action : str
         What to do, one sentence.
 
@@ -33,7 +33,7 @@ class Code(StrEnum):
     action: str
 
     def __new__(cls, code: str, meaning: str, action: str) -> Code:
-        """Make a member of its code, meaning and action."""
+        """Create a member from its code, meaning and action."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.meaning, member.action = meaning, action
@@ -41,20 +41,20 @@ class Code(StrEnum):
 
 
 class Remark(str):
-    """A warning or remark: what was noticed, with its figures, and what to do; it knows its code.
+    """A warning or remark as text (the observation with its figures, then the action), with its code.
 
     Parameters
     ----------
     code : Code
-        Its code; `compensator explain` explains it.
+        The code, which `compensator explain` explains.
     figures : str
-        What was noticed here; what to do is appended.
+        The observation with its figures; the action of the code is appended.
 
     Examples
     --------
     >>> remark = Remark(ModelWarning.TWIN_MODES, "Two time constants of the DTF coincide at 20 min.")
     >>> remark
-    'Two time constants of the DTF coincide at 20 min. Try one mode less with --order.'
+    'Two time constants of the DTF coincide at 20 min. Try one mode fewer with --order.'
     >>> remark.code
     <ModelWarning.TWIN_MODES: 'twin_modes'>
     """
@@ -63,7 +63,7 @@ class Remark(str):
     code: Code
 
     def __new__(cls, code: Code, figures: str) -> Remark:
-        """Append what to do to what was noticed."""
+        """Append the action of the code to the figures."""
         remark = super().__new__(cls, f"{figures} {code.action}")
         remark.code = code
         return remark
@@ -78,36 +78,36 @@ class Remark(str):
 
 
 def _restored(code: Code, words: str) -> Remark:
-    """Return a remark that was pickled or copied."""
+    """Rebuild a remark that was pickled or copied."""
     remark = str.__new__(Remark, words)
     remark.code = code
     return remark
 
 
 class State(Code):
-    """How far the published offset can be relied on."""
+    """State of the service: how reliable the published offset is."""
 
     STARTING = (
         "starting",
-        "The service runs but has no zero yet, so there is no offset.",
+        "The service is running but has no zero yet, so there is no offset.",
         "Wait for the first good sample of T_Q and AT; if none comes, run `compensator probe`.",
     )
     OK = "ok", "Everything is measured and the offset follows the model.", "Nothing."
     DEGRADED = (
         "degraded",
-        "The service compensates, but something is missing or limited; the reasons say what.",
-        "Look at the reasons.",
+        "The service compensates with a restriction, which the reasons name.",
+        "See the reasons.",
     )
     HOLD = (
         "hold",
-        "The last good offset stays as it is and does not follow the machine.",
-        "Look at the reasons; find the cause before the next precise cut.",
+        "The offset is frozen at its last good value and does not follow the machine.",
+        "See the reasons; correct the cause before the next precise cut.",
     )
-    FAULT = "fault", "There is no reliable offset.", "Do not rely on compensation; look at the reasons and the events."
+    FAULT = "fault", "There is no reliable offset.", "Do not rely on compensation; see the reasons and the events."
 
 
 class Reason(Code):
-    """Why the state is not `ok`; some carry a channel after a colon."""
+    """Why the state is not `ok`; some reasons are followed by a colon and a channel."""
 
     NO_ZERO = "no_zero", "No zero has been set yet.", "Restore T_Q and AT, or send the command zero."
     T_Q_MISSING = (
@@ -122,7 +122,7 @@ class Reason(Code):
     )
     CHANNEL_MISSING = (
         "channel_missing",
-        "A channel that an effect of the model uses is missing; its last good value is used instead.",
+        "A channel used by an effect of the model is missing; its last good value is used instead.",
         "Check the sensor of that channel.",
     )
     PREDICTING = (
@@ -132,74 +132,74 @@ class Reason(Code):
     )
     PREDICTION_EXPIRED = (
         "prediction_expired",
-        "A temperature has been missing for longer than the model may predict.",
+        "A temperature has been missing for longer than loss.predict_for_min, so the offset is held.",
         "Repair the sensor; the offset then moves to its correct value at the permitted rate.",
     )
     OUTSIDE_VALIDITY = (
         "outside_validity",
-        "T_Q, AT or the heat is outside the range that the model was made for.",
-        "Calibrate on a wider range, or bring the machine back into it.",
+        "T_Q, AT or the heat is outside the range of validity.",
+        "Calibrate over a wider range, or bring the machine back into the range.",
     )
     OFFSET_LIMITED = (
         "offset_limited",
-        "The offset has reached its largest permitted value.",
+        "The offset has reached its limit, limits.offset_max_um.",
         "Check sensors and model before raising limits.offset_max_um.",
     )
     RATE_LIMITED = (
         "rate_limited",
-        "The offset moves at its largest permitted rate and has not reached its value yet.",
+        "The offset is changing at the maximum permitted rate and has not reached its target yet.",
         "Wait; if it persists, check sensors and limits.offset_rate_max_um_per_min.",
     )
     MODEL_CHANGED = (
         "model_changed",
         "Another model was adopted; the offset is still moving to its new value at the permitted rate.",
-        "Wait until it has arrived; `compensator back` returns to the previous model.",
+        "Wait until the offset has reached it; `compensator back` returns to the previous model.",
     )
     COLD_START = (
         "cold_start",
-        "No record shows how much heat the machine had stored, so the model started from the temperatures it found.",
-        "Allow for the standard deviation, or let the machine come to rest and send the command zero.",
+        "The heat stored in the machine was unknown at the start, so the model started from the measured temperatures.",
+        "Allow for the larger standard deviation, or let the machine come to rest and send the command zero.",
     )
     T_Q_AT_EXCHANGED = (
         "t_q_at_exchanged",
-        "T_Q has been below AT for too long: the two are exchanged, or a thermocouple has come off.",
-        "Check wires, terminals and addresses of both; let the machine rest and send the command zero, or resume.",
+        "T_Q has been below AT for too long: the two sensors are exchanged, or a thermocouple has come off.",
+        "Check wires, terminals and addresses of both; then send the command zero with the machine at rest, or resume.",
     )
     T_Q_AT_APART = (
         "t_q_at_apart",
-        "At rest, T_Q and AT did not return to the difference they had at the zero.",
-        "Compare both thermocouples; if they are good, send the command zero at rest.",
+        "At rest, the difference T_Q − AT did not return to its value at the zero.",
+        "Compare both thermocouples; if both are good, send the command zero at rest.",
     )
     IMPLAUSIBLE = (
         "implausible",
-        "Measured and predicted Y drift apart; the likeliest cause follows the colon: a sensor, or the model.",
-        "Check that sensor, its wire and its seat; for the model, run `compensator diagnose` on the recordings.",
+        "Measured and predicted Y diverge; the most likely cause, a sensor or the model, is named after the colon.",
+        "Check that sensor, its wiring and its mounting; for the model, run `compensator diagnose` on the recordings.",
     )
     RESIDUAL_TOO_LARGE = (
         "residual_too_large",
         "Measured and predicted Y differ by more than plausibility.residual_hold_um.",
-        "Find the sensor that the reasons suspect; then send the command zero at rest.",
+        "Check the sensor named in the reasons; then send the command zero at rest.",
     )
     OPERATOR_HOLD = "operator_hold", "An operator has frozen the offset.", "Send the command resume."
     RECORDING_FAILED = (
         "recording_failed",
-        "The disk refused the sample, which waits to be written; compensation continues.",
+        "The sample could not be written to disk and is queued; compensation continues.",
         "Check free space, permissions and the disk.",
     )
     RECORDING_LATE = (
         "recording_late",
-        "The disk is slow: the offset was published before its sample was written; the sample follows.",
+        "The disk is slow: the offset was published before its sample was on disk; the sample is written later.",
         "Check the disk: its health, other programs that write to it, a network share.",
     )
     INTERNAL_ERROR = (
         "internal_error",
-        "An internal error occurred in the service; it holds the offset.",
-        "Report the event with its text.",
+        "An internal error occurred in the service; the offset is held.",
+        "Report the error with the text of its event.",
     )
 
 
 class SampleQuality(Code):
-    """Whether a channel's value can be used in a sample; qualities and errors of devices, and checks of the service."""
+    """Quality of a channel's value in a sample, from the device, its errors or the checks of the service."""
 
     GOOD = "good", "The value can be used.", "Nothing."
     OPEN_CIRCUIT = "open_circuit", "The thermocouple or its wiring is broken.", "Check thermocouple and terminals."
@@ -213,25 +213,25 @@ class SampleQuality(Code):
         "The value is below the range of the device or sensor.",
         "Check sensor, range and wiring.",
     )
-    STALE = "stale", "The device gives no new values.", "Check device and connection."
+    STALE = "stale", "The device delivers no new values.", "Check device and connection."
     INVALID = "invalid", "The device marks the value as invalid.", "Check the device."
-    TOO_FEW = "too_few", "Too few good readings in the sample.", "See the channel's errors: line, module, noise."
+    TOO_FEW = "too_few", "The sample has too few good readings.", "See the channel's errors: line, module, noise."
     OUTLIER = (
         "outlier",
         "A single reading far from the others of its sample was left out.",
-        "Nothing for a few; check the line for noise if there are many.",
+        "Nothing if this is rare; if it is frequent, check the line for noise.",
     )
     OUT_OF_RANGE = "out_of_range", "The value is outside the channel's plausible range.", "Check sensor and range."
     TOO_FAST = (
         "too_fast",
-        "The value changed faster than is possible where the sensor sits.",
+        "The value changed faster than rate_max_per_min of the channel.",
         "Check for a loose sensor or a noisy line.",
     )
-    STUCK = "stuck", "The value has not changed for too long.", "Check that sensor and module still measure."
+    STUCK = "stuck", "The value has not changed for too long.", "Check that the sensor and its module work."
     T_Q_BELOW_AT = (
         "t_q_below_at",
         "T_Q is below AT although the machine is heated.",
-        "Check for exchanged sensors, or one that has come off.",
+        "Check whether the sensors are exchanged or one has come off.",
     )
     DEVICE_TIMEOUT = "device_timeout", "The device did not answer in time.", "Check power, address and line."
     DEVICE_DISCONNECTED = (
@@ -246,7 +246,7 @@ class SampleQuality(Code):
     )
     DEVICE_GARBLED = (
         "device_garbled",
-        "The device sent no valid frame.",
+        "The device's reply was not a valid frame.",
         "Check line settings, termination and shielding.",
     )
     DEVICE_ERROR = "device_error", "The device could not be read.", "See the message in the events."
@@ -258,12 +258,12 @@ class SampleQuality(Code):
 
 
 class ModelWarning(Code):
-    """What identification and diagnosis warn of."""
+    """Warnings of identification and diagnosis."""
 
     WORSE_THAN_NOTHING = (
         "worse_than_nothing",
         "On a run that was not used for the fit, the model is worse than no model.",
-        "Do not use it there; find how that run differs from the fitted ones, and fit both together.",
+        "Do not use it there; find out how that run differs from the fitted runs, and fit them together.",
     )
     QUIET_AMBIENT = (
         "quiet_ambient",
@@ -272,8 +272,8 @@ class ModelWarning(Code):
     )
     UNDETERMINED_AMBIENT = (
         "undetermined_ambient",
-        "The ambient temperature moved, and yet the data do not determine its effect well.",
-        "Add a record in which the ambient moves while the heat is steady.",
+        "The ambient temperature changed, but the data do not determine its effect well.",
+        "Add a record in which the ambient temperature changes while the heat is steady.",
     )
     SHORT_RECORD = (
         "short_record",
@@ -283,12 +283,12 @@ class ModelWarning(Code):
     DRIFTING_MODE = (
         "drifting_mode",
         "The slowest mode is slower than the record: there is a drift that the inputs do not explain.",
-        "Record longer, and let compensator diagnose look for the cause of the drift.",
+        "Record for longer, and run `compensator diagnose` to find the cause of the drift.",
     )
     COMMON_CAUSE = (
         "common_cause",
-        "Drive and ambient moved together: the data do not show which of DTF and TDTF caused the deformation.",
-        "Heat at another time of the day.",
+        "The heat and the ambient temperature changed together: the data do not separate the DTF from the TDTF.",
+        "Add a record that is heated at another time of day.",
     )
     UNDETERMINED_GAIN = (
         "undetermined_gain",
@@ -297,18 +297,18 @@ class ModelWarning(Code):
     )
     ZERO_OUTSIDE = (
         "zero_outside",
-        "A path has a zero outside the unit circle: its response starts the wrong way.",
-        "Look at its step response; if the machine does not start the wrong way, try a lower --order.",
+        "A path has a zero outside the unit circle: its response starts in the wrong direction.",
+        "Check its step response; if the machine does not respond like this, try a lower --order.",
     )
     TURNING_RESPONSE = (
         "turning_response",
         "The step response of a path reverses before it settles.",
-        "Check whether the machine does that; if not, try a lower --order.",
+        "Check its step response; if the machine does not respond like this, try a lower --order.",
     )
     TWIN_MODES = (
         "twin_modes",
-        "Two time constants of a path coincide: their standard errors mean nothing.",
-        "Try one mode less with --order.",
+        "Two time constants of a path coincide: their standard errors are meaningless.",
+        "Try one mode fewer with --order.",
     )
     INVERSE_NOISE = (
         "inverse_noise",
@@ -317,58 +317,58 @@ class ModelWarning(Code):
     )
     COLOURED_RESIDUAL = (
         "coloured_residual",
-        "The residual is not white noise: the model lacks something.",
-        "Let compensator diagnose look for it.",
+        "The residual is not white noise: the model is incomplete.",
+        "Run `compensator diagnose` to find what is missing.",
     )
     VALIDITY_RANGE = (
         "validity_range",
-        "The model is valid for the measured temperatures plus a third of their range; outside, the service holds.",
+        "The model is valid for the measured temperatures plus a third of their range; outside, the offset is held.",
         "Calibrate over the machine's whole working range if that is wider.",
     )
     MADE_WORSE = (
         "made_worse",
-        "On held-out data the effects that were found increase the error, so the model was left unchanged.",
-        "Record longer, with more change in the inputs.",
+        "The effects that were found increase the error on held-out data, so the model was left unchanged.",
+        "Record for longer, with more change in the inputs.",
     )
     HARDLY_DETERMINED = (
         "hardly_determined",
         "The standard error of a parameter is larger than the parameter.",
-        "Before relying on it, record more change of the input that drives the effect.",
+        "Before relying on it, record data in which the input of the effect changes more.",
     )
     NEARLY_AS_GOOD = (
         "nearly_as_good",
-        "Another explanation leaves almost the same error.",
-        "Run the experiment that is named with it: it tells them apart.",
+        "Another effect explains the residual almost as well.",
+        "Run the experiment given with it, which distinguishes the two.",
     )
     ROUNDED_OFF = (
         "rounded_off",
-        "A term without a name of its own is deployed together with the effect that was found.",
+        "An unnamed correction term is deployed together with the effect that was found.",
         "Check the extended model on another day before relying on it.",
     )
     FITTED_ANEW = (
         "fitted_anew",
-        "The first model was calibrated while the effect acted, so its paths were fitted again together with it.",
+        "The base model was calibrated while the effect acted, so its paths were refitted together with the effect.",
         "Check the extended model on another day before relying on it.",
     )
 
 
 class DataRemark(Code):
-    """What was noticed in tables and recordings that are read as data."""
+    """Remarks on tables and recordings that are read as data."""
 
     ESTIMATES_LEFT_OUT = (
         "estimates_left_out",
-        "The table is an exported recording; values that the service estimated or published are no measurements.",
-        "Nothing; a measured heat is in heat_measured_w and is used.",
+        "The table is an exported recording; values that the service estimated or published are not measurements.",
+        "Nothing; measured heat is read from heat_measured_w.",
     )
     ROWS_SORTED = (
         "rows_sorted",
         "Rows of the table were out of order and have been sorted by time.",
-        "Find out why the logger wrote them so: a clock that was set, or joined files.",
+        "Find out why the logger wrote them in this order: a clock that was set, or joined files.",
     )
     GAP_BRIDGED = (
         "gap_bridged",
         "Samples are missing; the gap is short compared with the machine's time constants and is interpolated.",
-        "Nothing for one gap; check the logger if there are many.",
+        "Nothing for a single gap; check the logger if there are many.",
     )
     GAP_SPLITS = (
         "gap_splits",
@@ -377,13 +377,13 @@ class DataRemark(Code):
     )
     TEMPERATURE_MISSING = (
         "temperature_missing",
-        "T_Q or AT is missing for too long to interpolate: no model is fitted there, and predictions are less certain.",
+        "T_Q or AT is missing for too long to interpolate: the gap is not fitted, and predictions are less certain.",
         "Check the sensor and the logger.",
     )
     VARIABLES_LEFT_OUT = (
         "variables_left_out",
-        "Variables of a MAT file that have not one value for each row, such as matrices, are not read.",
-        "Nothing, unless they are needed: save each as a vector of the length of the time.",
+        "Variables of a MAT file that do not have one value per row, such as matrices, are not read.",
+        "If they are needed, save each as a vector with one value per row.",
     )
     WILD_READINGS = (
         "wild_readings",
@@ -393,17 +393,17 @@ class DataRemark(Code):
 
 
 class ServiceWarning(Code):
-    """What check, run, probe and router warn of, in the terminal and the log."""
+    """Warnings of check, run, probe and router, in the terminal and the log."""
 
     NUMBERED_PORT = (
         "numbered_port",
-        "The number of a serial port depends on the order of plugging in; after a restart it may be another adapter.",
+        "Serial ports are numbered in the order of connection; after a restart the name may be another adapter's.",
         "Name the port by a link in /dev/serial/by-id, or by a udev rule.",
     )
     OPEN_LISTEN = (
         "open_listen",
-        "Whoever reaches an endpoint of zenoh.listen can publish offsets and send commands in any name.",
-        "Listen on loopback only; for others use a router with TLS and an access list (deploy/zenoh).",
+        "Any program that reaches an endpoint of zenoh.listen can publish offsets and send commands under any name.",
+        "Listen on loopback only; for other computers use a router with TLS and an access list (deploy/zenoh).",
     )
     UNSECURED_CONNECT = (
         "unsecured_connect",
@@ -413,77 +413,77 @@ class ServiceWarning(Code):
     UNPROVEN_COMMANDS = (
         "unproven_commands",
         "The service accepts commands whose sender is not authenticated.",
-        "Leave zenoh.unproven_commands out, and give operators certificates (deploy/zenoh).",
+        "Remove zenoh.unproven_commands, and give operators certificates (deploy/zenoh).",
     )
     NO_ACCESS_LIST = (
         "no_access_list",
-        "The router has no access list: whoever connects may publish and command everything.",
+        "The router has no access list: every client may publish messages and send commands for every machine.",
         "Add the access list of deploy/zenoh/access_list.py to its configuration.",
     )
     CERTIFICATE_ENDS = (
         "certificate_ends",
-        "A certificate expires within 30 days; after that the router refuses its owner.",
-        "Renew it now (deploy/zenoh/certificates.py --renew), and restart what uses it.",
+        "A certificate expires within 30 days; after that the router refuses connections with it.",
+        "Renew it now (deploy/zenoh/certificates.py --renew), and restart the programs that use it.",
     )
     CERTIFICATES_UNREAD = (
         "certificates_unread",
         "Certificates are not checked, so an expired one is noticed only when the router refuses it.",
-        "Install what reads them: pip install quill-compensator[tls].",
+        "Install the extra that reads them: pip install quill-compensator[tls].",
     )
     SERVICE_RUNS = (
         "service_runs",
         "The service is running and uses the devices; a second program may be refused or disturb its readings.",
-        "Look at its readings with `compensator watch`, or stop it for the probe.",
+        "View its readings with `compensator watch`, or stop the service before probing.",
     )
     ADOPTED_UNUSABLE = (
         "adopted_unusable",
         "The adopted model cannot be used; the service runs the configured one.",
-        "Adopt it again from its file, or stay with the configured one: `compensator back`.",
+        "Adopt it again from its file, or keep the configured one with `compensator back`.",
     )
     NOT_LOCKED = (
         "not_locked",
-        "The recording folder cannot be locked, so a second service of this machine is not noticed here.",
-        "Check space and permissions of the recording folder.",
+        "The recording folder cannot be locked, so a second service for this machine would not be detected here.",
+        "Check the free space and permissions of the recording folder.",
     )
     OTHERS_UNKNOWN = (
         "others_unknown",
-        "No router is reached, so it is unknown whether another service of this machine runs elsewhere.",
-        "Check that the router runs; the service asks at its start only.",
+        "No router is reached, so a second service for this machine on another computer would not be detected.",
+        "Check that the router is running; the service checks for other services at its start only.",
     )
     ROUTER_NOT_REACHED = (
         "router_not_reached",
         "There is no connection to the router yet; compensation and recording continue, and the service retries.",
-        "Check that it runs at that address, and that it accepts this certificate.",
+        "Check that the router is running at that address and accepts this certificate.",
     )
     LINK_LOST = (
         "link_lost",
         "The connection to a router or another participant has ended; the service retries.",
-        "Nothing, if it was ended on purpose or returns; otherwise check the router and the network.",
+        "Nothing if it was closed on purpose or returns; otherwise check the router and the network.",
     )
     NOTE_NOT_KEPT = (
         "note_not_kept",
-        "The last offset cannot be kept in memory while the disk is late; if the service is killed now, it is lost.",
+        "The last offset cannot be kept in memory while the disk is slow; if the service is killed now, it is lost.",
         "Check free space and permissions of /dev/shm.",
     )
     NOTE_NOT_REMOVED = (
         "note_not_removed",
         "The last offset kept in memory cannot be removed although everything is on disk.",
-        "Check the permissions of /dev/shm; the next start ignores it if its number is on disk.",
+        "Check the permissions of /dev/shm; the next start ignores this offset if its sample is on disk.",
     )
     NOTE_REFUSED = (
         "note_refused",
         "The last offset found in /dev/shm was not written by this service; it is ignored.",
-        "If others can log in to this computer, find out who wrote it.",
+        "If other users can log in to this computer, find out who wrote it.",
     )
     DISK_FINISHING = (
         "disk_finishing",
-        "The service is stopping and waits for the disk to accept the rest of the recording.",
+        "The service is stopping and is still writing the rest of the recording to disk.",
         "Wait; if it takes minutes, check the disk.",
     )
 
 
 class BridgeTrouble(Code):
-    """Why a bridge writes nothing."""
+    """Why a bridge does not write."""
 
     PLC_NOT_REACHED = (
         "plc_not_reached",
@@ -492,45 +492,45 @@ class BridgeTrouble(Code):
     )
     PLC_WRITTEN_OVER = (
         "plc_written_over",
-        "The PLC holds another value than the bridge wrote, so something else writes there; the offset is held.",
-        "Find out what writes there; once the value has stayed for resume_after_s the offset continues from it.",
+        "The PLC's value is not the one that the bridge wrote, so another program writes it; the offset is held.",
+        "Find that program; once the value has not changed for resume_after_s, the offset continues from it.",
     )
     PLC_BEYOND_LIMIT = (
         "plc_beyond_limit",
-        "The PLC holds a value that no offset can have; the bridge does not overwrite it.",
-        "Correct it in the PLC, to the value that the axis has now.",
+        "The PLC's value is not a possible offset; the bridge does not overwrite it.",
+        "Correct it in the PLC, to the offset that the axis has now.",
     )
 
 
 class WatchWarning(Code):
-    """What watch shows and no service reports of itself."""
+    """Conditions that watch detects and a service cannot report about itself."""
 
     SILENT = (
         "silent",
-        "Nothing newer has arrived than an offset that has expired; the control holds.",
-        "Check that service, router and network run; do not rely on compensation meanwhile.",
+        "The last offset received has expired; the control holds its offset.",
+        "Check the service, the router and the network; until then, do not rely on compensation.",
     )
     UNKNOWN = (
         "unknown",
-        "Nothing was received that shows the state.",
-        "Wait for one sample; then check that the service runs.",
+        "No message that shows the state has been received.",
+        "Wait for one sample; then check that the service is running.",
     )
     TOKEN_GONE = (
         "token_gone",
-        "The liveliness token of the service is gone: it has ended, or is cut off from the network.",
-        "Check that service, router and network run.",
+        "The liveliness token of the service is gone: the service has ended, or is disconnected from the network.",
+        "Check the service, the router and the network.",
     )
     ALIVE_BUT_SILENT = (
         "alive_but_silent",
-        "The service is connected (its liveliness token is there) but publishes nothing new.",
-        "Check the log of the service, and whether it still polls; restart it if it hangs.",
+        "The service is connected (its liveliness token is present) but publishes nothing new.",
+        "Check the log of the service and whether it still polls; restart it if it hangs.",
     )
-    TWO_SERVICES = "two_services", "Two services publish below one prefix.", "Stop one of them, or correct its prefix."
+    TWO_SERVICES = "two_services", "Two services publish below the same prefix.", "Stop one, or correct its prefix."
     MISFIT = (
         "misfit",
-        "Measured and predicted Y differ by more than the service states: the model lacks something, or a sensor "
-        "is wrong.",
-        "Run `compensator diagnose` on the recordings; [plausibility] makes it an alarm of the service.",
+        "Measured and predicted Y differ by much more than the standard deviation that the service states: the model "
+        "is incomplete, or a sensor is faulty.",
+        "Run `compensator diagnose` on the recordings; with [plausibility] the service itself raises an alarm.",
     )
     CLOCK_AHEAD = (
         "clock_ahead",
@@ -539,17 +539,17 @@ class WatchWarning(Code):
     )
     OLD_MESSAGES = (
         "old_messages",
-        "Messages arrive with an old time: one of the two clocks is wrong, or they are replayed.",
-        "Check the time service (NTP) of both computers, then who publishes below the prefix.",
+        "Messages arrive with old times: one of the two clocks is wrong, or the messages are replayed.",
+        "Check the time service (NTP) of both computers, then which programs publish below the prefix.",
     )
     MALFORMED_MESSAGES = (
         "malformed_messages",
-        "Messages arrived that no service of ours sends.",
-        "Find out who publishes below the prefix.",
+        "Messages arrived that the service cannot have sent.",
+        "Find out which programs publish below the prefix.",
     )
     MISSED_MESSAGES = (
         "missed_messages",
-        "Messages of the service never arrived here.",
+        "Messages of the service did not arrive here.",
         "If it continues, check the network and the router.",
     )
     REPEATED_NUMBERS = (
@@ -560,17 +560,17 @@ class WatchWarning(Code):
 
 
 class AuditRemark(Code):
-    """What an audit remarks on recordings that are in order."""
+    """Remarks of an audit on recordings that are in order."""
 
     NOT_WORKED_OUT = (
         "not_worked_out",
-        "Not every sample could be recomputed from what the recording carries.",
+        "Not every sample could be recomputed from the contents of the recording.",
         "Audit with the version that wrote it; the named part was not checked.",
     )
     SAMPLES_MISSING = (
         "samples_missing",
         "Samples between others were not recorded.",
-        "Look at the events before and after them: pauses, the disk.",
+        "See the events before and after them: pauses, the disk.",
     )
     PUBLISHED_EARLY = (
         "published_early",
@@ -579,22 +579,22 @@ class AuditRemark(Code):
     )
     UNSIGNED_BEHIND = (
         "unsigned_behind",
-        "Records follow the last signature of the file, which does not cover them.",
-        "Audit it again once the file is finished, or the next one is there.",
+        "The last signature of the file does not cover the records after it.",
+        "Audit it again once the file is finished or the next one exists.",
     )
     BEGINS_NEW_CHAIN = (
         "begins_new_chain",
-        "The hash chain starts with this file: there was no recording before it when it was opened.",
+        "The hash chain starts with this file: no earlier recording existed when it was created.",
         "Nothing, if the machine was newly installed; otherwise find the earlier recordings.",
     )
     BEFORE_NOT_GIVEN = (
         "before_not_given",
-        "The recording before the first given file was not given; nothing is proven about it.",
-        "Give it too, if it still exists.",
+        "The recording before the first file was not given, so nothing is proven about it.",
+        "Give it as well, if it still exists.",
     )
     BEGINS_RUNNING = (
         "begins_running",
-        "The comparison starts on a running machine, whose state the other model does not know beyond the zero.",
+        "The comparison starts while the machine is running, and the other model has no state except the zero.",
         "Ignore the first hours, or compare from a recording that starts at rest.",
     )
     SIGNATURE_NOT_CHECKED = (
@@ -604,7 +604,7 @@ class AuditRemark(Code):
     )
     LEFT_BEYOND_STATED = (
         "left_beyond_stated",
-        "With the correction, Y still varies by more than the standard deviation that the service states.",
+        "With the offset applied, Y still varies by more than the standard deviation that the service states.",
         "Check the probe and the thermocouples, then run `compensator diagnose` on these recordings.",
     )
 
@@ -616,37 +616,37 @@ class RecordingEnd(Code):
     RECOVERED = (
         "recovered",
         "The service was killed; the next start kept every complete record and sealed the file.",
-        "Nothing; find out why the machine or the service stopped.",
+        "Find out why the machine or the service stopped.",
     )
     OPEN = (
         "open",
         "The recording has no end: it is still being written, or the service was killed.",
-        "Audit it again once the next recording is there, which names its last value.",
+        "Audit it again with the next recording, which contains the last value of its hash chain.",
     )
     TORN = (
         "torn",
         "The recording ends within a group of records: it is still being written, or the service was killed.",
-        "Audit it again once the next recording is there, which names its last value.",
+        "Audit it again with the next recording, which contains the last value of its hash chain.",
     )
 
 
 class AuditFinding(Code):
-    """What an audit finds wrong."""
+    """Findings of an audit."""
 
     ALTERED = (
         "altered",
-        "Something was changed after it was written.",
+        "Data were changed after they were written.",
         "Find out who had access; use a copy from a backup.",
     )
-    REMOVED = "removed", "Something that was written is gone.", "Find out who had access; use a copy from a backup."
+    REMOVED = "removed", "Data that were written are missing.", "Find out who had access; use a copy from a backup."
     INSERTED = (
         "inserted",
-        "There is something that the service did not write there.",
+        "There are data that the service did not write.",
         "Find out who had access to the file.",
     )
     REORDERED = (
         "reordered",
-        "Something is in another place than where it was written.",
+        "Data are not in the place where they were written.",
         "Check names and copies of the files.",
     )
     TRUNCATED = (
@@ -661,19 +661,19 @@ class AuditFinding(Code):
     )
     DAMAGED = (
         "damaged",
-        "From some byte on the file is no recording, or a checksum is wrong.",
+        "The file is not a valid recording from some byte on, or a checksum is wrong.",
         "Check disk and copy; use a copy from a backup.",
     )
-    MISSING_FILE = "missing_file", "A recording between two others is missing.", "Add it and audit again."
+    MISSING_FILE = "missing_file", "A recording between two others is missing.", "Add it, and audit again."
     UNSIGNED = "unsigned", "A required signature is missing.", "Check [recording] signing_key of the machine."
     FALSE_SIGNATURE = (
         "false_signature",
         "A signature was not made with the given key.",
-        "Check that the key is this machine's; if it is, trust nothing in the file.",
+        "Check that the key is this machine's; if it is, do not trust the file.",
     )
     STATE = (
         "state",
-        "A recording starts with another state than the previous one ended with.",
+        "A recording does not start with the state at the end of the previous one.",
         "Treat the offsets from there on as not proven, and report it.",
     )
     UNREADABLE = (
@@ -688,20 +688,20 @@ class AuditFinding(Code):
     )
 
 
-#: Every domain; no code occurs in two of them.
+#: All domains; each code occurs in only one of them.
 DOMAINS: tuple[type[Code], ...] = (
     *(State, Reason, SampleQuality, ModelWarning, ServiceWarning, BridgeTrouble),
     *(DataRemark, WatchWarning, AuditRemark, RecordingEnd, AuditFinding),
 )
 
-#: code → (what it means, what to do)
+#: code → (meaning, action)
 WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {str(code): (code.meaning, code.action) for domain in DOMAINS for code in domain}
 )
 
 
 def explain(code: str) -> tuple[str, str] | None:
-    """Return what a code means and what to do, or None if it is unknown.
+    """Return the meaning and the action of a code, or None if it is unknown.
 
     Examples
     --------

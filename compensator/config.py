@@ -76,7 +76,7 @@ class Guards(_Table, frozen=True, kw_only=True):
 
 
 class Validity(_Table, frozen=True, kw_only=True):
-    """`[limits.validity]`: temperatures on which the machine was calibrated, °C."""
+    """`[limits.validity]`: ranges of the temperatures in the calibration, °C."""
 
     t_q_degc: tuple[float, float]
     at_degc: tuple[float, float]
@@ -116,9 +116,9 @@ class Restart(_Table, frozen=True, kw_only=True):
 
 
 class Rest(_Table, frozen=True, kw_only=True):
-    """`[plausibility.rest]`: when nothing heats the machine, and how far T_Q and AT may then be apart.
+    """`[plausibility.rest]`: when the machine counts as at rest, and the largest change of T_Q − AT then.
 
-    `channel`: such as `heat_w` or `spindle_rpm`; at or below `at_most` for `after_min` the machine is at rest.
+    `channel`: such as `heat_w` or `spindle_rpm`; at or below `at_most` for `after_min`, the machine is at rest.
     `t_q_at_max_k`: largest change of T_Q − AT since the zero after such a rest.
     """
 
@@ -129,7 +129,7 @@ class Rest(_Table, frozen=True, kw_only=True):
 
 
 class Plausibility(_Table, frozen=True, kw_only=True):
-    """`[plausibility]`: T_Q, AT and measured Y against each other; a check without its limit is off.
+    """`[plausibility]`: checks between T_Q, AT and measured Y; a check without its limit is off.
 
     `t_q_below_at_after_min`: T_Q below AT by more than `guards.t_q_below_at_max_k` for this long means
     exchanged sensors.
@@ -165,7 +165,7 @@ class Zenoh(_Table, frozen=True, kw_only=True):
     unproven_commands: bool | None = None
 
     def secured(self) -> bool:
-        """Return whether both sides of every link are authenticated."""
+        """Return whether both sides of every connection are authenticated."""
         return self.tls_key is not None
 
     def on_loopback(self) -> bool:
@@ -199,7 +199,7 @@ class Recording(_Table, frozen=True, kw_only=True):
 
 
 class Config(_Table, frozen=True, kw_only=True):
-    """A whole configuration file."""
+    """A complete configuration file."""
 
     machine: Machine
     model: ModelChoice
@@ -244,7 +244,7 @@ class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
         return self.resolve(store) if store is not None else self.resolve(self.config.recording.folder) / "models"
 
     def model_name(self) -> str | Path:
-        """Return the model's name if it is built in, else its path."""
+        """Return the model's name if it is built in, otherwise its path."""
         name = self.config.model.file
         return self.resolve(name) if name.endswith(".toml") or "/" in name else name
 
@@ -255,7 +255,7 @@ def load_config(path: str | Path) -> LoadedConfig:
     Raises
     ------
     ConfigError
-        One line that names file, table, key, value and what was expected.
+        If the file is invalid; the message names file, table, key, value and what was expected.
     """
     path = Path(path)
     try:
@@ -302,7 +302,7 @@ def _keys_at(where: str) -> list[str]:
 
 
 def _in_words(message: str, table: object) -> str:
-    """Turn "…- at `$.limits.offset_max_um`" into "limits.offset_max_um = …: …"."""
+    """Convert "…- at `$.limits.offset_max_um`" to "limits.offset_max_um = …: …"."""
     match = re.search(r" - at `\$\.?([^`]*)`$", message)
     where, text = (match.group(1), message[: match.start()]) if match is not None else ("", message)
     key = re.fullmatch(r"Object (missing required|contains unknown) field `([^`]*)`", text)
@@ -363,8 +363,8 @@ def _check_zenoh(zenoh: Zenoh) -> None:
             raise ConfigError(f"zenoh.{key}: missing, expected with {given[0]}")
     if zenoh.listen or zenoh.mode == "router" or not zenoh.connect:
         raise ConfigError(
-            "zenoh: with tls_key, expected connect alone, no listen and no mode router: whoever "
-            "connected to the service would use its certificate"
+            "zenoh: with tls_key, expected only connect, without listen and mode router: a client "
+            "of the service could otherwise use its certificate"
         )
 
 

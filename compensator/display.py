@@ -1,4 +1,4 @@
-"""Results for people: tables and lists of sentences that terminal, notebook and page render alike."""
+"""Content of results: tables and lists of sentences, rendered by terminal, notebook and page."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ Cell = str | CodeLink | Link | tuple[str | CodeLink | Link, ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """A table; on a page it scrolls in its own box where it is too wide.
+    """A table; on a page it scrolls in its own box if it is too wide.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Table:
         return max(map(len, [self.head, *self.rows]))
 
     def text(self) -> str:
-        """Return it as aligned text.
+        """Return the table as aligned text.
 
         Examples
         --------
@@ -93,7 +93,7 @@ class Table:
         return "\n".join([self.title, *lines] if self.title else lines)
 
     def html(self) -> str:
-        """Return it as HTML without style, for a notebook.
+        """Return the table as HTML without style, for a notebook.
 
         Examples
         --------
@@ -118,30 +118,30 @@ class Words:
     kind: Literal["warning", "plain"] = "plain"
 
     def text(self) -> str:
-        """Return it as lines of text."""
+        """Return the list as lines of text."""
         return "\n".join([f"{self.title}:", *(f"- {text_of(line)}" for line in self.lines)])
 
     def html(self) -> str:
-        """Return it as HTML without style, for a notebook."""
+        """Return the table as HTML without style, for a notebook."""
         lines = "".join(f"<li>{html.escape(text_of(line))}</li>" for line in self.lines)
         return f"<p>{html.escape(self.title)}</p><ul>{lines}</ul>"
 
 
 class Shown:
-    """A result that shows itself: as text by `summary()` and `repr`, as HTML in a notebook."""
+    """A result with a display: text by `summary()` and `repr`, HTML in a notebook."""
 
     __slots__ = ()
 
     def contents(self) -> Sequence[str | Table | Words]:
-        """Return what it shows: sentences, tables, and lists of sentences, in order."""
+        """Return the content: sentences, tables, and lists of sentences, in order."""
         raise NotImplementedError
 
     def tables(self) -> list[Table]:
-        """Return its tables, as terminal, notebook and page show them."""
+        """Return the tables of the content."""
         return [part for part in self.contents() if isinstance(part, Table)]
 
     def summary(self) -> str:
-        """Return it as text, as the command of its name prints it."""
+        """Return the content as text, as printed by the command of the same name."""
         return text_of_all(self.contents())
 
     def __repr__(self) -> str:
@@ -166,7 +166,7 @@ def text_of(cell: Cell) -> str:
 
 
 def warnings_of(warnings: Iterable[Remark], title: str = "Warnings") -> list[Words]:
-    """Return warnings or remarks as a list with their codes; nothing where there are none."""
+    """Return warnings or remarks as a list with their codes; empty if there are none."""
     lines = [sentence_of(warning) for warning in warnings]
     return [Words(title=title, lines=lines, kind="warning")] if lines else []
 
@@ -181,7 +181,7 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 
 
 def is_determined(value: float, std: float) -> bool:
-    """Whether a standard error means anything: it is a number, and at most ten times the value."""
+    """Whether a standard error is meaningful: a number, and at most ten times the value."""
     return math.isfinite(std) and std <= 10.0 * abs(value)
 
 

@@ -1,7 +1,7 @@
 """Errors of the compensator.
 
 ```
-CompensatorError            one line: file, row or key, value, what was expected
+CompensatorError            one line: file, row or key, value, and what was expected
 ├── UsageError              the command was called wrongly                   exit code 2
 ├── ConfigError             the configuration cannot be used                 exit code 2
 ├── ModelError              a model file or its dynamics cannot be used      exit code 2

@@ -1,7 +1,7 @@
 """Events: their kinds, the data of each, and how programs read them.
 
-`Event.text` is one line for people, whose words may change. Programs read `kind` and `data` alone. Version
-0.1.0 recorded some events with a text only; what is needed to read those is at the end of this module.
+`Event.text` is one line for people, and its wording may change. Programs read only `kind` and `data`. Version
+0.1.0 recorded some events with a text only; the functions to read those are at the end of this module.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class EventKind(StrEnum):
 
     START = "start"
     STOP = "stop"
-    #: What the service found on disk at its start, and the pause since then (`PauseData`).
+    #: The state found on disk at the start of the service, and the pause since then (`PauseData`).
     RESTART = "restart"
     #: A new state, or new reasons.
     STATE = "state"
@@ -29,13 +29,13 @@ class EventKind(StrEnum):
     #: A command that acts with the sample of the same number, see `command_of`.
     COMMAND = "command"
     COMMAND_REFUSED = "command_refused"
-    #: Another model was taken over or refused.
+    #: Another model was adopted or refused.
     ADOPT = "adopt"
     #: A device stopped answering, or answers again.
     DEVICE = "device"
     #: The wall clock was set.
     CLOCK = "clock"
-    #: What happened to the recording (`RecordingData`).
+    #: A fault or action of the recording (`RecordingData`).
     RECORDING = "recording"
     #: Sensors that contradict each other or the model, see `Implausibility`.
     PLAUSIBILITY = "plausibility"
@@ -63,7 +63,7 @@ class Note(NamedTuple):
     text : str
         One line for people.
     data : mapping of str to Any
-        What programs read.
+        Data for programs.
     """
 
     kind: EventKind
@@ -75,7 +75,7 @@ class _Data(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Data of one kind of event."""
 
     def table(self) -> dict[str, Any]:
-        """Return it as in `Event.data`."""
+        """Return the data as stored in `Event.data`."""
         table: dict[str, Any] = msgspec.to_builtins(self)
         return table
 
@@ -95,7 +95,7 @@ class PauseData(_Data, frozen=True, kw_only=True):
     Parameters
     ----------
     missing : int or None
-        Number of samples that were not measured; None where it is unknown.
+        Number of samples that were not measured; None if unknown.
     minutes : float or None
         The same, min.
     bridged : bool
@@ -111,7 +111,7 @@ class PauseData(_Data, frozen=True, kw_only=True):
 
 
 class RecordingCode(StrEnum):
-    """What happened to the recording."""
+    """Faults and actions of the recording."""
 
     DISK_FAILED = "disk_failed"
     DISK_LATE = "disk_late"
@@ -124,12 +124,12 @@ class RecordingCode(StrEnum):
 
 
 class RecordingData(_Data, frozen=True, kw_only=True):
-    """What happened to the recording.
+    """Data of a fault or action of the recording.
 
     Parameters
     ----------
     code : RecordingCode, optional
-        What it is; version 0.1.0 did not record it.
+        Code of the event; version 0.1.0 did not record it.
     published_early : int, optional
         Number of a sample whose offset was published while it was being written.
     reason : str, optional
@@ -139,7 +139,7 @@ class RecordingData(_Data, frozen=True, kw_only=True):
     file : str, optional
         The recording.
     removed : list of str
-        Recordings that were removed by the limit of what is kept.
+        Recordings that were removed by the retention limit.
     bytes : int, optional
         Their size.
     """
@@ -154,14 +154,14 @@ class RecordingData(_Data, frozen=True, kw_only=True):
 
     @property
     def is_resolved(self) -> bool:
-        """Whether nothing has to be done about it."""
+        """Whether no action is needed."""
         if self.code is None:
             return self.lost is not None or bool(self.removed)
         return self.code in (RecordingCode.DISK_BACK, RecordingCode.RECOVERED, RecordingCode.REMOVED)
 
 
 class Implausibility(StrEnum):
-    """What the plausibility checks found, `code` in the data of such an event."""
+    """Findings of the plausibility checks, `code` in the data of such an event."""
 
     EXCHANGED = "exchanged"
     APART = "apart"
@@ -174,7 +174,7 @@ _AnyData = TypeVar("_AnyData", bound=_Data)
 
 
 def data_of(event: Event, kind: type[_AnyData]) -> _AnyData | None:
-    """Return the data of an event, None where they are not of this kind.
+    """Return the data of an event; None if they are of another kind.
 
     Examples
     --------
@@ -198,10 +198,10 @@ def command_of(event: Event) -> str:
 
 
 def is_recorded(note: Note, event: Event) -> bool:
-    """Return whether a recorded event carries what a note carries.
+    """Return whether a recorded event agrees with a note.
 
-    Version 0.1.0 recorded zeros and implausibilities without data: there the texts are compared, so these two kinds
-    of note keep the wording of that version.
+    Version 0.1.0 recorded zeros and implausibilities without data: for those the texts are compared, so these two
+    kinds of note keep the wording of that version.
     """
     if event.kind != note.kind:
         return False

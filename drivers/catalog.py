@@ -1,4 +1,4 @@
-"""From configuration tables to devices: every model that can be configured, and the fleet they make."""
+"""Builds the devices of a configuration: the catalogue of all models, `build`, and `Fleet`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Fleet:
 
 
 def build(lines: Sequence[Mapping[str, object]], devices: Sequence[Mapping[str, object]], *, source: str) -> Fleet:
-    """Make the devices of a configuration, without opening anything.
+    """Make the devices of a configuration without opening them.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def build(lines: Sequence[Mapping[str, object]], devices: Sequence[Mapping[str, 
     Raises
     ------
     DriverConfigError
-        One line that names table, key, value and what was expected.
+        If a table is wrong; the message names table, key, value and what was expected.
     """
     known = _lines(lines, source)
     made: dict[str, Line] = {}
@@ -70,7 +70,7 @@ def build(lines: Sequence[Mapping[str, object]], devices: Sequence[Mapping[str, 
         if config.name in fleet:
             raise where.wrong("name", config.name, "a name that no other device has")
         line_config = _line_of(config, family, known, where)
-        # A controller with a line of its own has no address: a second one on that line collides, too.
+        # A controller with its own line has no address: a second one on that line collides, too.
         address = getattr(config, "address", None)
         other = taken.setdefault((config.line, address), config.name)
         if other != config.name:
@@ -100,7 +100,7 @@ def _lines(tables: Sequence[Mapping[str, object]], source: str) -> dict[str, Lin
 
 
 def _where(table: object, index: int, tables: str, source: str) -> Where:
-    """Name a table by its place and, where it has one, its name."""
+    """Identify a table by its position and its name, if it has one."""
     name = table.get("name") if isinstance(table, Mapping) else None
     return Where(
         source=source, table=f"{tables}[{index}]" + (f' "{_in_one_line(name)}"' if isinstance(name, str) else "")
@@ -113,7 +113,7 @@ def _in_one_line(text: str) -> str:
 
 
 def _table(table: object, where: Where) -> Mapping[str, object]:
-    """Return a table, or raise where it is none."""
+    """Return a table; raise an error if it is not one."""
     if not isinstance(table, Mapping):
         raise where.error(f"is {table!r}, expected a table")
     return table
@@ -131,9 +131,9 @@ def _family(given: object, where: Where) -> Family:
 
 
 def _line_of(config: DeviceSettings, family: Family, known: Mapping[str, LineSettings], where: Where) -> LineSettings:
-    """Find the line of a device, with a protocol that its model speaks."""
+    """Find the line of a device, and check that its model supports the protocol."""
     if config.line not in known:
-        names = _in_one_line(", ".join(known)) or "there is none"
+        names = _in_one_line(", ".join(known)) or "none configured"
         raise where.wrong("line", config.line, f"the name of a line ({names})")
     line = known[config.line]
     if line.protocol not in family.protocols:

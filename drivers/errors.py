@@ -1,15 +1,15 @@
 """Errors of the drivers.
 
 ```
-DriverError                 names the device (or line) and what happened
+DriverError                 names the device (or line) and the fault
 ├── DriverConfigError       a table of the configuration is wrong: key, value, what was expected
-├── DeviceTimeout           nothing came back in time
-├── DeviceDisconnected      the port, adapter or socket is gone
+├── DeviceTimeout           no reply in time
+├── DeviceDisconnected      the port, adapter or socket is lost
 ├── DeviceRefused           the device answered with an exception or error reply
-└── DeviceGarbled           what came back is not a valid frame: checksum, length, text
+└── DeviceGarbled           the reply is not a valid frame: checksum, length, text
 ```
 
-A bad sensor behind a healthy device is not an error: it is a `Reading` with a quality.
+A faulty sensor of a working device is not an error: it gives a `Reading` with a quality.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class DriverError(Exception):
     device : str
         Name of the device or line, as in the configuration.
     message : str
-        What happened, with value, limit and unit where there are any.
+        The fault, with value, limit and unit if applicable.
     """
 
     code = "device_error"
@@ -41,13 +41,13 @@ class DriverConfigError(DriverError):
 
 
 class DeviceTimeout(DriverError):
-    """Nothing came back in time."""
+    """No reply in time."""
 
     code = "device_timeout"
 
 
 class DeviceDisconnected(DriverError):
-    """The port, adapter or socket is gone."""
+    """The port, adapter or socket is lost."""
 
     code = "device_disconnected"
 
@@ -59,6 +59,6 @@ class DeviceRefused(DriverError):
 
 
 class DeviceGarbled(DriverError):
-    """What came back is not a valid frame."""
+    """The reply is not a valid frame."""
 
     code = "device_garbled"

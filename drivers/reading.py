@@ -9,7 +9,7 @@ from typing import Protocol
 
 
 class Quality(enum.StrEnum):
-    """How far a single reading can be trusted."""
+    """Quality of a single reading."""
 
     GOOD = "good"
     OPEN = "open_circuit"
@@ -28,13 +28,13 @@ class Reading:
     value : float
         In the input's unit; NaN unless the quality is good.
     quality : Quality
-        Of the value.
+        Quality of the value.
     minimum, maximum : float
-        Extremes of the readings that `value` is the mean of (a streaming device returns many at once).
+        Extremes of the readings averaged in `value` (a streaming device returns many at once).
     count : int
-        Number of readings that `value` is the mean of; 0 where there is none.
+        Number of readings averaged in `value`; 0 if there are none.
     detail : str
-        A few words for an engineer where the quality is not good.
+        Short explanation if the quality is not good.
     """
 
     value: float
@@ -57,7 +57,7 @@ class Reading:
 
 
 class Device(Protocol):
-    """A device, as the service sees it."""
+    """Interface of a device for the service."""
 
     @property
     def name(self) -> str:
@@ -75,7 +75,7 @@ class Device(Protocol):
         Raises
         ------
         DriverError
-            Naming the device, where no input could be read.
+            If no input could be read; the error names the device.
         """
 
     async def close(self) -> None:

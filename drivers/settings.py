@@ -1,4 +1,4 @@
-"""Turn configuration tables into settings, with one clear line for each mistake."""
+"""Converts configuration tables to settings, with a one-line error for each mistake."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Where:
     source : str
         Name of the file that holds the tables.
     table : str
-        The table in words, as in `devices[1] "spindle-thermocouples"`.
+        The table as text, such as `devices[1] "spindle-thermocouples"`.
     """
 
     source: str
@@ -52,7 +52,7 @@ def settings(table: object, kind: type[SettingsT], where: Where) -> SettingsT:
     Parameters
     ----------
     table : object
-        From the configuration; a mapping where it is right.
+        Table of the configuration; anything but a mapping is an error.
     kind : type
         Class of the settings. Nested tables are converted by a second call, so that messages name their
         place.
@@ -80,7 +80,7 @@ def settings(table: object, kind: type[SettingsT], where: Where) -> SettingsT:
 
 
 def _in_words(error: msgspec.ValidationError, table: Mapping[str, Any], where: Where) -> DriverConfigError:
-    """Turn an error of msgspec into one with key, value and expectation."""
+    """Convert an error of msgspec to one with key, value and expected value."""
     found = _AT.match(str(error))
     if found is None or not found["path"]:
         return where.error(str(error))
@@ -93,5 +93,5 @@ def _in_words(error: msgspec.ValidationError, table: Mapping[str, Any], where: W
 
 
 def one_of(choices: Mapping[str, object] | tuple[str, ...]) -> str:
-    """Return choices in words: `one of K, J, T`."""
+    """Return choices as text: `one of K, J, T`."""
     return f"one of {', '.join(choices)}"

@@ -1,1 +1,1 @@
-"""Simulated machine and devices: an independent witness for tests and the demo."""
+"""Simulated machine and devices: an independent reference for tests and the demo."""

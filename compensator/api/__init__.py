@@ -1,1 +1,1 @@
-"""The verbs for notebooks, scripts and commands, and the results that own what was found."""
+"""The functions for notebooks, scripts and commands, and their results."""

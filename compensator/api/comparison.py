@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from compensator.api.plotting import Plot
     from compensator.report.page import Page
 
-#: What every model is compared with.
+#: References with which every model is compared.
 NOTHING, PERSISTENCE = "no compensation", "persistence"
 
 
@@ -34,13 +34,13 @@ class ComparisonResult(Paged):
     Parameters
     ----------
     scores : dict of str to Scores
-        Of each model by its name, of no compensation, and of persistence: the last Y measured before the samples.
+        Scores of each model by name, of no compensation, and of persistence (the last Y measured before the samples).
     residuals : dict of str to numpy.ndarray, shape (n,)
         Measured − predicted of each, µm; NaN outside the samples.
     t_h : numpy.ndarray, shape (n,)
         Time, h; files follow each other.
     from_h : float
-        Samples from this hour on were compared.
+        Hour from which samples were compared.
     in_frame : bool
         Whether tables are DataFrames.
     """
@@ -58,7 +58,7 @@ class ComparisonResult(Paged):
 
     @property
     def table(self) -> Any:
-        """The scores as columns by name; a DataFrame where a DataFrame came in."""
+        """The scores as columns by name; a DataFrame if the data were a DataFrame."""
         rows = list(self.scores.values())
         columns = {field.name: [getattr(row, field.name) for row in rows] for field in dataclasses.fields(Scores)}
         if self.in_frame:
@@ -71,7 +71,7 @@ class ComparisonResult(Paged):
         return {"from_h": self.from_h, "samples": self.samples, "scores": found}
 
     def contents(self) -> list[str | Table]:
-        """Return what it shows: the samples compared, and the errors of each model."""
+        """Return the content: the number of samples, and the errors of each model."""
         table = Table(
             title="Errors on the same samples",
             head=["", *SCORE_HEAD],
@@ -91,7 +91,7 @@ class ComparisonResult(Paged):
         return Page(title="Comparison of models", verdict=words, blocks=[figure, *self.tables()], tone="good")
 
     def plot(self) -> Plot:
-        """Draw the error of each over time."""
+        """Plot the error of each model over time."""
         from compensator.api.plotting import stacked
 
         curves = [(name, self.t_h, values) for name, values in self.residuals.items()]
@@ -107,9 +107,9 @@ def compare(
     Parameters
     ----------
     models : mapping of str to (ThermalModel, path or name)
-        What to compare, by names of your own.
+        Models to compare, by arbitrary names.
     data : DataLike
-        With T_Q, AT and measured Y.
+        Data with T_Q, AT and measured Y.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
     from_h : float
@@ -165,7 +165,7 @@ def compare(
 
 
 def _last_before(y: Vector, known: Mask, scored: Mask) -> float:
-    """Return the last value measured before the samples scored, the first of all where there is none."""
+    """Return the last value measured before the scored samples; the first of all if there is none."""
     before = y[known & (np.arange(y.size) < (int(np.argmax(scored)) if scored.any() else y.size))]
     first = y[known][:1]
     return float(before[-1] if before.size else first[0] if first.size else np.nan)

@@ -1,4 +1,4 @@
-"""`tc.diagnose`: what a model lacks, and the model with that added."""
+"""`tc.diagnose`: what a model lacks, and the extended model."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ if TYPE_CHECKING:
     from compensator.api.plotting import Plot
     from compensator.report.page import Page
 
-#: What `save` writes into a folder.
+#: Files that `save` writes into a folder.
 FILES = ("model.toml", "diagnosis.json", "report.html")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class DiagnosisResult(Paged):
-    """What a model lacks.
+    """Result of a diagnosis: what a model lacks.
 
     Parameters
     ----------
     model : ThermalModel
-        The base model with every deployable effect, as its file gives it back.
+        The base model with every deployable effect, as read back from its file.
     diagnosis : Diagnosis
         Effects with their signals, residuals, errors before and after.
     remarks : tuple of Remark
-        What had to be corrected in the data.
+        Remarks on the data.
     """
 
     model: ThermalModel
@@ -62,15 +62,15 @@ class DiagnosisResult(Paged):
 
     @property
     def effects(self) -> tuple[FoundEffect, ...]:
-        """What the model lacks, in order of the error removed."""
+        """The effects that the model lacks, in order of the error removed."""
         return self.diagnosis.effects
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `diagnosis.json` holds."""
+        """Return the content of `diagnosis.json`."""
         return figures(self.diagnosis)
 
     def contents(self) -> list[str | Table | Words]:
-        """Return what it shows: the verdict, errors, effects with their parameters, warnings."""
+        """Return the content: verdict, errors, effects with their parameters, warnings."""
         return list(contents(self.diagnosis, self.remarks))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -79,13 +79,13 @@ class DiagnosisResult(Paged):
         Parameters
         ----------
         path : path
-            A name that ends in .toml: the model file. Any other: a folder for `model.toml`, `diagnosis.json` and
-            `report.html`, which is made if it does not exist.
+            A name that ends in .toml: the model file. Any other name: a folder for `model.toml`, `diagnosis.json` and
+            `report.html`, which is created if it does not exist.
 
         Raises
         ------
         UsageError
-            If the folder around it does not exist.
+            If the parent folder does not exist.
         """
         target = Path(path)
         if target.suffix.lower() == ".toml":
@@ -96,7 +96,7 @@ class DiagnosisResult(Paged):
         return target
 
     def save_all(self, folder: Path, *, also: Path | None = None) -> None:
-        """Write model, `diagnosis.json` and page into a folder; the page in the format of another file too."""
+        """Write model, `diagnosis.json` and page into a folder, and the page also to another file."""
         folder.mkdir(parents=True, exist_ok=True)
         model, found, page = (folder / name for name in FILES)
         write_model(model, self.model)
@@ -110,7 +110,7 @@ class DiagnosisResult(Paged):
         return page_of(self.diagnosis, self.model, self.remarks)
 
     def plot(self) -> Plot:
-        """Draw the residual before and after on data that took no part, one run after another."""
+        """Plot the residual before and after on held-out data, one run after another."""
         from compensator.api.plotting import stacked
 
         found = self.diagnosis
@@ -141,7 +141,7 @@ def diagnose(
     progress : callable
         Called with the steps done and their number.
     executor : concurrent.futures.Executor, optional
-        Searches the held-out blocks, such as a pool of processes; this process where none is given.
+        Executor for the held-out blocks, such as a pool of processes; by default this process.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def diagnose(
 
 
 def _provenance(base: ThermalModel, measured: Sequence[Measurement], found: Diagnosis) -> dict[str, Any]:
-    """Return what an extended model says of its diagnosis."""
+    """Return the provenance of an extended model."""
     return {
         "diagnosis": {
             "source": f"compensator {__version__} diagnose",

@@ -1,4 +1,4 @@
-"""Models as their files hold them, and pages of every format."""
+"""Models as stored in their files, and pages in every format."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ ModelLike = ThermalModel | str | os.PathLike[str]
 
 
 def model_of(model: ModelLike) -> ThermalModel:
-    """Return a model: as it is, of a result that owns one, from a file, or the published one by its name.
+    """Return a model: a model itself, the model of a result, from a file, or the published one by its name.
 
     Raises
     ------
     ModelError
         If the file cannot be read.
     UsageError
-        If it is something else.
+        If the argument has another type.
     """
     own = getattr(model, "model", model)
     if isinstance(own, ThermalModel):
@@ -39,12 +39,12 @@ def model_of(model: ModelLike) -> ThermalModel:
 
 
 def as_in_file(model: ThermalModel, provenance: Mapping[str, Any]) -> ThermalModel:
-    """Return a model with more of where it comes from, as its file gives it back: with the file's hash.
+    """Return a model with its provenance as read back from its file, with the file's hash.
 
     Raises
     ------
     ModelError
-        If it holds what a file cannot.
+        If it cannot be stored in a file.
     """
     whole = dataclasses.replace(model, provenance=dict(model.provenance) | dict(provenance))
     return parse_model(dump_model(whole).encode("utf-8"), source=model.name)
@@ -60,7 +60,7 @@ class Paged(Shown):
         raise NotImplementedError
 
     def page(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page: .html, .pdf, or .png for its first picture.
+        """Write the page: .html, .pdf, or .png for its first figure.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class Paged(Shown):
         return self.write_page(checked(Path(path), option="page"))
 
     def write_page(self, path: Path, also: Path | None = None) -> Path:
-        """Write the page, and once more in the format of another file."""
+        """Write the page, and also to another file in the format of its suffix."""
         from compensator.report.formats import write
 
         page = self.as_page()

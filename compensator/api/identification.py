@@ -50,17 +50,17 @@ def identify(
     Parameters
     ----------
     data : DataLike
-        Runs that the model is fitted to.
+        Runs to which the model is fitted.
     validate, etve : DataLike, optional
-        Runs that only validate the model; a test without heat source (methods II and III).
+        Runs used only for validation; runs with the heat source off (methods II and III).
     columns : mapping of str to str, optional
         Column name for each role that has another name.
     name : str
         Name of the model.
     kind : {"auto", "heat", "direct"}
-        With a TTF, or from T_Q − AT to the deformation; `auto`: with a TTF where `heat_w` is known.
+        `heat`: with a TTF; `direct`: from T_Q − AT to the deformation; `auto`: `heat` if `heat_w` is known.
     method : {"I", "II", "III", "IV"}
-        TDTF given, from a whole ETVE, from its end, or fitted together with the DTF.
+        TDTF given (I), fitted to a whole ETVE (II) or its end (III), or fitted together with the DTF (IV).
     tdtf : (float, float), optional
         Gain, µm/K, and time constant, min, of method I.
     etve_end_h : float
@@ -68,15 +68,15 @@ def identify(
     ttf : (int, int, int)
         nb, nf, nk of the TTF.
     order : (int, int, int), optional
-        nf, nb of the DTF, nb of the TDTF; chosen on held-out blocks where it is not given.
+        nf, nb of the DTF, nb of the TDTF; by default chosen on held-out blocks.
     drive : {"ttf", "known"}
-        Heat that the DTF is fitted with: from T_Q as in the service, or the known one.
+        Heat for fitting the DTF: estimated from T_Q as in the service, or known.
     folds : int
         Number of held-out blocks.
     fit_until_h : float, optional
         Fit up to this hour; the rest is held out.
     reference : model, optional
-        Another model to compare the coefficients with.
+        Another model for a comparison of the coefficients.
     progress : callable
         Called with the steps done and their number.
 
@@ -88,7 +88,7 @@ def identify(
     Raises
     ------
     CompensatorError
-        If the data or the options allow no model.
+        If no model can be fitted to the data with these options.
     """
     settings = Settings(
         kind=kind,
@@ -153,13 +153,13 @@ def _gain_and_time(tdtf: Sequence[float]) -> tuple[float, float]:
 
 
 def _check_validation(sources: Mapping[str, Sequence[Measurement]]) -> None:
-    """Refuse to validate a model on the data it was fitted to, wherever that was copied to."""
+    """Refuse to validate a model on fitted data, or a copy of them."""
     fitted = {origin.sha256 for role in ("fit", "etve") for measured in sources[role] for origin in measured.origins}
     for measured in sources["validation"]:
         for origin in measured.origins:
             if origin.sha256 in fitted:
                 named = origin.path or origin.name
-                raise UsageError(f"--validate {named}: takes part in the fit, expected a run that does not")
+                raise UsageError(f"--validate {named}: is used for the fit, expected another run")
 
 
 def _provenance(
@@ -168,7 +168,7 @@ def _provenance(
     columns: Mapping[str, str],
     fit_until_h: float | None,
 ) -> dict[str, Any]:
-    """Return where a model comes from: every source with its hash, and what was asked for."""
+    """Return the provenance of a model: every source with its hash, and the options."""
     asked = {name: value for name, value in dataclasses.asdict(settings).items() if value is not None}
     if fit_until_h is not None:
         asked["fit_until_h"] = float(fit_until_h)

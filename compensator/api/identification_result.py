@@ -1,4 +1,4 @@
-"""The result of `tc.identify`: it owns the model and everything that was found about it."""
+"""The result of `tc.identify`: the model and all results of the identification."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class IdentificationResult(Paged):
-    """An identified model with everything that was found about it.
+    """An identified model with all results of the identification.
 
     Parameters
     ----------
     model : ThermalModel
-        The model, as its file gives it back.
+        The model, as read back from its file.
     calibration : Calibration
         Runs, fits, residuals.
     criticism : Criticism
@@ -75,7 +75,7 @@ class IdentificationResult(Paged):
         return frame_of(columns) if self.in_frame else columns
 
     def contents(self) -> list[str | Table | Words]:
-        """Return what it shows: the verdict, parameters, errors in free run, warnings."""
+        """Return the content: verdict, parameters, errors in free run, warnings."""
         return list(contents(self.calibration, self.criticism, self.comparison))
 
     def to_dict(self) -> dict[str, Any]:
@@ -91,9 +91,9 @@ class IdentificationResult(Paged):
         Raises
         ------
         UsageError
-            If there is no such folder.
+            If the folder does not exist.
         OSError
-            If it cannot be written there.
+            If the file cannot be written.
         """
         write_model(Path(path), self.model)
         return Path(path)
@@ -105,7 +105,7 @@ class IdentificationResult(Paged):
         return page_of(self.calibration, self.criticism, self.model, self.comparison)
 
     def plot(self) -> Plot:
-        """Draw measured and predicted deformation, and the residual; what was held out is shaded."""
+        """Plot measured and predicted deformation, and the residual; held-out parts are shaded."""
         from compensator.api.plotting import stacked
 
         hours, y, predicted, held_out = joined(self.calibration.parts)

@@ -1,4 +1,4 @@
-"""Figures of results: matplotlib's, shown by a notebook without any set-up."""
+"""Figures of results with matplotlib, displayed by a notebook without set-up."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Curve = tuple[str, Vector, Vector]
 
 
 class Plot(Figure):
-    """A matplotlib figure that a notebook shows; it belongs to no window and needs no closing."""
+    """A matplotlib figure that a notebook displays; it has no window and need not be closed."""
 
     def _repr_png_(self) -> bytes:
         data = io.BytesIO()

@@ -27,22 +27,22 @@ if TYPE_CHECKING:
 def simulate(
     model: ModelLike, data: DataLike, *, columns: Mapping[str, str] | None = None
 ) -> SimulationResult | SimulationFrame:
-    """Run a model over measured data; Y, where it is measured, is never fed back.
+    """Run a model over measured data; measured Y is never fed back.
 
     Parameters
     ----------
     model : ThermalModel, path or name
-        What to run.
+        Model to run.
     data : DataLike
-        With T_Q and AT.
+        Data with T_Q and AT.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
 
     Returns
     -------
     SimulationResult or SimulationFrame
-        One row for each sample of the model. Where a DataFrame came in, a DataFrame of the same columns comes out: its
-        `result` is the SimulationResult, and `plot` and `to_dict` are pandas's.
+        One row for each sample of the model. For a DataFrame the result is a DataFrame with the same columns: its
+        `result` is the SimulationResult, and `plot` and `to_dict` are those of pandas.
 
     Raises
     ------
@@ -86,16 +86,16 @@ def _scores(parts: list[dict[str, Vector]]) -> Scores | None:
 
 
 def doubts(source: str, model: ThermalModel, record: SampledRecord) -> list[Remark]:
-    """Return what makes a prediction from these temperatures doubtful.
+    """Return reasons why a prediction from these temperatures is doubtful.
 
     Parameters
     ----------
     source : str
         Name of the data.
     model : ThermalModel
-        What is run.
+        The model.
     record : SampledRecord
-        What it is run over.
+        The data.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The columns of a free run as a DataFrame; loaded only where a DataFrame came in."""
+"""The columns of a free run as a DataFrame; imported only if the data are a DataFrame."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from compensator.model.simulation import Scores
 
 
 class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
-    """A DataFrame of the columns, by time where the data had one; what is cut out of it is a plain DataFrame.
+    """A DataFrame of the columns, indexed by time if the data were; slices of it are plain DataFrames.
 
     Parameters
     ----------
     result : SimulationResult
-        The same columns as arrays, with `plot()` and `to_dict()`, which on a DataFrame are pandas's.
+        The same columns as arrays, with its own `plot()` and `to_dict()` instead of those of pandas.
     """
 
     _metadata: ClassVar[list[str]] = ["result"]
@@ -39,12 +39,12 @@ class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
 
     @property
     def scores(self) -> Scores | None:
-        """Fit, rms and peak to peak of the residual, where Y was measured."""
+        """Fit, rms and peak to peak of the residual, if Y was measured."""
         return self.result.scores
 
     @property
     def remarks(self) -> tuple[Remark, ...]:
-        """What had to be corrected in the data, and what makes the prediction doubtful."""
+        """Remarks on the data, and on doubtful predictions."""
         return self.result.remarks
 
     def summary(self) -> str:

@@ -26,13 +26,13 @@ class SimulationResult(Shown, Mapping[str, Vector]):
     Parameters
     ----------
     table : dict of str to numpy.ndarray, shape (n,)
-        `t_s`, `heat_w`, `y_pred_um`, `y_std_um`, the share of each path; `y_um`, `residual_um` where Y was measured.
+        `t_s`, `heat_w`, `y_pred_um`, `y_std_um`, the share of each path; `y_um`, `residual_um` if Y was measured.
     records : int
-        Number of stretches without a long gap.
+        Number of intervals without a long gap.
     remarks : tuple of Remark
-        What had to be corrected in the data, and what makes the prediction doubtful.
+        Remarks on the data, and on doubtful predictions.
     scores : Scores or None
-        Fit, rms and peak to peak of the residual, where Y was measured.
+        Fit, rms and peak to peak of the residual, if Y was measured.
     """
 
     table: dict[str, Vector]
@@ -57,7 +57,7 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         return found
 
     def contents(self) -> list[str | Table | Words]:
-        """Return what it shows: its size and columns, the errors where Y was measured, remarks."""
+        """Return the content: size and columns, errors if Y was measured, remarks."""
         size = f"{self['t_s'].size} samples in {self.records} record(s), columns {', '.join(self)}"
         parts: list[str | Table | Words] = [size]
         if self.scores is not None:
@@ -65,7 +65,7 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         return [*parts, *warnings_of(self.remarks, "Remarks")]
 
     def summary(self) -> str:
-        """Return it as text without the remarks, which `compensator simulate` writes to stderr."""
+        """Return the content as text without the remarks, which `compensator simulate` writes to stderr."""
         return text_of_all(part for part in self.contents() if not isinstance(part, Words))
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -74,14 +74,14 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         Raises
         ------
         OSError
-            If it cannot be written there.
+            If the file cannot be written.
         """
         with atomic_write(Path(path)) as file:
             csv.writer(file, lineterminator="\n").writerows(csv_rows(self.table))
         return Path(path)
 
     def plot(self) -> Plot:
-        """Draw measured and predicted deformation, and the residual."""
+        """Plot measured and predicted deformation, and the residual."""
         from compensator.api.plotting import stacked
 
         hours = self["t_s"] / 3600.0

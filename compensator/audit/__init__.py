@@ -1,1 +1,1 @@
-"""Audits recordings: complete, unchanged, and reproduced to the bit by the engine from the raw samples."""
+"""Audits recordings: complete, unchanged, and reproduced bit for bit from the raw samples."""

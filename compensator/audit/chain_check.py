@@ -1,9 +1,9 @@
-"""Follows the hash chain of one file and names what breaks it.
+"""Follows the hash chain of one file and reports what breaks it.
 
-The rule is short (`recording/chain.py`): compute the values, make the `/chain` message that must follow, compare its
-bytes. Only where they differ the cause is looked for: a record that no longer matches the value before it was altered,
-one that the chain lists and the file lacks was removed, one that the file has and the chain does not list was inserted,
-one in another place was moved.
+The check (`recording/chain.py`): compute the values and the expected `/chain` message, and compare its bytes. Only if
+they differ is the cause determined: a record that does not match its value was altered, one that the chain lists and
+the file lacks was removed, one that the file has and the chain does not list was inserted, and one in another place
+was moved.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, ValueError)
 
 
 class _Prefixes(dict[str, bytes]):
-    """What precedes the body of a record of each topic; an unknown one comes from a channel that was altered."""
+    """The prefix of the hashed bytes of each topic; an unknown topic comes from a channel that was altered."""
 
     def __missing__(self, topic: str) -> bytes:
         self[topic] = topic.encode() + b"\0"
@@ -44,9 +44,9 @@ class ChainCheck:
     Parameters
     ----------
     contents : Contents
-        What the file opens with.
+        Configuration, model, state and metadata at the start of the file.
     result : RecordingAudit
-        Where records, seals and findings are entered.
+        Result to which records, seals and findings are added.
     verifier : Verifier, optional
         Public key of the machine.
     """
@@ -56,7 +56,7 @@ class ChainCheck:
         #: Value at the last record, and before a seal of a torn end that was finished afterwards.
         self.head = b""
         self._before_last = b""
-        #: Value that the chain of this file claims to continue from.
+        #: Value from which the chain of this file states that it continues.
         self.previous = chain.NOTHING
         self._next = 0
         self._run = contents.run
@@ -115,7 +115,7 @@ class ChainCheck:
         result.unsigned_behind += len(records)
 
     def finish(self) -> None:
-        """Enter what is known only at the end."""
+        """Add the results that are known only at the end."""
         result = self._result
         for first, (last, time_ns) in sorted(self._gaps.items()):
             numbers = _numbers(first, last)
@@ -129,7 +129,7 @@ class ChainCheck:
     # ------------------------------------------------------------------ opening
 
     def _open(self, message: RawRecord) -> None:
-        """Check what the file opens with; name the part that is not what it was."""
+        """Check the start of the file; report the part that was changed."""
         result, sequence = self._result, message.sequence
         parts = chain.parts_of(self._contents)
         try:
@@ -173,10 +173,10 @@ class ChainCheck:
         if list(stated) != list(found) and stated == found:
             self._result.find(Fault.PARTS_REORDERED, topic="chain", sequence=0)
 
-    # ------------------------------------------------------------------ what happened
+    # ------------------------------------------------------------------ causes
 
     def _explain(self, records: list[RawRecord], computed: bytes, message: RawRecord) -> None:
-        """Name what makes a group differ from its `/chain` message, and continue after it."""
+        """Report why a group differs from its `/chain` message, and continue after it."""
         result, sequence = self._result, message.sequence
         try:
             stated = _DECODER.decode(message.data)
@@ -197,7 +197,7 @@ class ChainCheck:
             self.head, self._next = (values[-1] if values else before), sequence + 1
 
     def _clear_suspect(self, before: bytes) -> bool:
-        """Return whether the last record of the group before is intact and its value in the chain was altered."""
+        """Return whether the last record of the previous group is intact and its value in the chain was altered."""
         suspect, self._suspect = self._suspect, None
         findings = self._result.findings
         if suspect is None or suspect[1] != before or suspect[0] >= len(findings):
@@ -231,7 +231,7 @@ class ChainCheck:
         return True
 
     def _find_unlisted(self, records: list[RawRecord], listed: list[ChainLink], before: bytes) -> None:
-        """Name records that the chain does not list."""
+        """Report records that the chain does not list."""
         numbers = {entry.sequence for entry in listed}
         unlisted = [record for record in records if record.sequence not in numbers]
         value = self.head
@@ -254,7 +254,7 @@ class ChainCheck:
             seen.add(record.sequence)
 
     def _find_missing(self, records: list[RawRecord], listed: list[ChainLink], message: RawRecord) -> None:
-        """Name records that are listed and missing, or are in another order."""
+        """Report records that are listed but missing, or in another order."""
         present = [record.sequence for record in records]
         for entry in listed:
             if entry.sequence not in present:
@@ -275,7 +275,7 @@ class ChainCheck:
     def _find_changed(
         self, records: list[RawRecord], listed: list[ChainLink], values: list[bytes], message: RawRecord
     ) -> None:
-        """Name records whose value is not the one stated; `values` begins with the one before the first of them."""
+        """Report records whose value differs from the stated one; `values` begins with the value before the first."""
         there = {record.sequence: record for record in reversed(records)}
         last = len(listed) - 1
         for i, entry in enumerate(listed):

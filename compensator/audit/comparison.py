@@ -1,4 +1,4 @@
-"""What another model would have done on history: the recorded samples through the service with that model."""
+"""What another model would have done: the recorded samples through the service's compensation with that model."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Comparison:
     residual_before, residual_after : Spread
         Measured − predicted deformation.
     left_before, left_after : Spread
-        What is left of the measured deformation with the offset.
+        Remaining error: measured deformation + offset.
     offsets : Spread
         The other offset − the recorded one.
     samples : int
         Number of samples.
     remarks : list of Remark
-        What the figures depend on.
+        Remarks on the validity of the figures.
     """
 
     recorded: str
@@ -67,7 +67,7 @@ class Comparison:
     remarks: list[Remark]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as in the result of `--json`."""
+        """Return the result for `--json`."""
         return {
             "recorded_model": self.recorded,
             "other_model": self.other,
@@ -84,8 +84,8 @@ class Comparison:
         return {
             f"residual, {self.recorded} (recorded)": self.residual_before,
             f"residual, {self.other}": self.residual_after,
-            f"left with the offset, {self.recorded} (recorded)": self.left_before,
-            f"left with the offset, {self.other}": self.left_after,
+            f"remaining error, {self.recorded} (recorded)": self.left_before,
+            f"remaining error, {self.other}": self.left_after,
             f"offset of {self.other} − recorded offset": self.offsets,
         }
 
@@ -112,7 +112,7 @@ def compare(
     row: Callable[[Iterable[Any]], Any] | None = None,
     point: Callable[..., None] | None = None,
 ) -> Comparison:
-    """Run another model over recordings, in the order in which they were begun.
+    """Run another model over recordings, in the order of their start.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def compare(
     model : ThermalModel
         The other model.
     progress : callable, optional
-        Called with the number of bytes worked off, and of all.
+        Called with the number of bytes processed and their total.
     row : callable, optional
         Called with the rows of the table of both offsets, see `COLUMNS`.
     point : callable, optional
@@ -130,7 +130,7 @@ def compare(
     Raises
     ------
     DataError
-        If one of them is no recording, they belong to several machines, or the model needs a channel that is not there.
+        If a file is not a recording, the files belong to several machines, or the model needs a missing channel.
     """
     ordered = in_order(paths)
     total = sum(path.stat().st_size for path in ordered)
@@ -186,14 +186,14 @@ class _Run:
         return self._free
 
     def _begin(self, compensation: Compensation, step: RecordedStep, estimate: EstimateMessage) -> None:
-        """Begin with the recorded zero where the first sample sets none."""
+        """Start with the recorded zero if the first sample does not set one."""
         zero = any(event.kind == EventKind.ZERO for event in step.events)
         if estimate.t_q_ref_degc is None or estimate.at_ref_degc is None or zero:
             return
         y_ref_um = math.nan if estimate.y_base_um != 0.0 else number(estimate.y_ref_um)
         compensation.begin(replace(Zero.of_estimate(estimate), y_ref_um=y_ref_um, y_base_um=0.0))
         figures = (
-            f"{step.file}: begins on a running machine, of which the other model knows no more than the zero; "
+            f"{step.file}: starts while the machine is running, and the other model has no state except the zero; "
             f"its first {3 * slowest_min(compensation.model) / 60.0:.0f} h are uncertain."
         )
         self._result.remarks.append(Remark(AuditRemark.BEGINS_RUNNING, figures))
@@ -220,16 +220,16 @@ class _Run:
             self._row([utc(sample.time_utc_ns), sample.seq, *cells, outcome.offset.state])
 
     def result(self, paths: Sequence[Path]) -> Comparison:
-        """Return the figures; the files are named where there are none."""
+        """Return the figures; raise an error that names the files if there are none."""
         if not self._result.samples:
             names = ", ".join(path.name for path in paths[:3])
-            raise DataError(f"{names}: no samples in it, expected recordings of a machine's service")
+            raise DataError(f"{names}: no samples, expected recordings of a machine's service")
         self._result.recorded = ", ".join(self._names)
         return self._result
 
 
 def worst_utc(spread: Spread) -> str:
-    """Return when the largest amount of something was, as ISO 8601."""
+    """Return the time of the largest magnitude, as ISO 8601."""
     return utc(round(spread.at_s * NS))
 
 

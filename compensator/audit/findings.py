@@ -1,4 +1,4 @@
-"""What an audit can find: every fault with its code and sentence; findings as text and as JSON."""
+"""Findings of an audit: every fault with its code and sentence; findings as text and as JSON."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ KEPT = 50
 
 
 class Fault(Enum):
-    """Everything that can be wrong, with its kind and its sentence; names in braces are figures."""
+    """All faults, each with its code and its sentence; names in braces are replaced by figures."""
 
     # The chain of one file.
     NO_CHAIN = (
         AuditFinding.REMOVED,
-        "the recorder writes it, but it is missing: nothing shows that the file is as it was written",
+        "missing, although the recorder writes it: nothing proves that the file is unchanged",
     )
     OPENING_UNREADABLE = AuditFinding.ALTERED, "the first message of the chain cannot be read"
     OPENING_MISSING = AuditFinding.REMOVED, "the first message of the chain is missing"
@@ -27,9 +27,9 @@ class Fault(Enum):
     PART_ADDED = AuditFinding.INSERTED, "the recording did not begin with it"
     PART_CHANGED = AuditFinding.ALTERED, "not what the recording began with"
     PARTS_REORDERED = AuditFinding.REORDERED, "attachments or metadata are in another order"
-    NO_HASH = AuditFinding.ALTERED, "a hash that is not one"
+    NO_HASH = AuditFinding.ALTERED, "not a valid hash"
     OPENING_CHANGED = AuditFinding.ALTERED, "differs from what follows from the file"
-    OTHER_PREVIOUS = AuditFinding.ALTERED, "names another last value of the previous file than the metadata"
+    OTHER_PREVIOUS = AuditFinding.ALTERED, "states another last value of the previous file than the metadata"
     PART_LATE = AuditFinding.INSERTED, "{what}"
     PART_CRC = AuditFinding.ALTERED, "{what}"
     UNREADABLE_MESSAGE = AuditFinding.ALTERED, "cannot be read"
@@ -38,7 +38,7 @@ class Fault(Enum):
     VALUE_CHANGED = AuditFinding.ALTERED, "its value of {name} is not that of the record"
     VALUES_BROKEN = (
         AuditFinding.BROKEN,
-        "the values before and after this message do not belong together: one side was rewritten",
+        "the values before and after this message do not match: one side was rewritten",
     )
     RECORDS_MISSING = AuditFinding.REMOVED, "{numbers} missing before it"
     RECORDS_MOVED = AuditFinding.REORDERED, "{numbers} after later ones"
@@ -49,29 +49,29 @@ class Fault(Enum):
     MOVED = AuditFinding.REORDERED, "is in another place than before"
     RECORD_CHANGED = AuditFinding.ALTERED, "does not match its value in the chain"
     BEHIND_CHAIN = AuditFinding.INSERTED, "{count} record(s) after the last message of the chain"
-    NO_SEAL = AuditFinding.REMOVED, "the file has its end, but not the seal before it"
+    NO_SEAL = AuditFinding.REMOVED, "the file has its end, but the seal before it is missing"
     SEAL_CHANGED = AuditFinding.ALTERED, "does not seal the records before it"
-    FALSE_SIGNATURE = AuditFinding.FALSE_SIGNATURE, "not signed by the key given"
-    # The file as such.
+    FALSE_SIGNATURE = AuditFinding.FALSE_SIGNATURE, "not signed with the given key"
+    # The file as a whole.
     UNREADABLE = AuditFinding.UNREADABLE, "{what}"
     NOT_REPLAYED = AuditFinding.UNREADABLE, "its samples cannot be replayed: {what}"
     DAMAGED = AuditFinding.DAMAGED, "byte {offset}: {what}"
     LENGTH_CHANGED = (
         AuditFinding.DAMAGED,
-        "byte {offset}: a record whose length leads beyond the end, but its content is complete",
+        "byte {offset}: the length of a record exceeds the file, but its content is complete",
     )
     CUT_OFF = AuditFinding.TRUNCATED, "a finished file that ends at byte {offset}; its end is missing"
     INDEX = AuditFinding.INDEX, "{what}"
     # Several files.
-    RENAMED = AuditFinding.REORDERED, "it has the name of another file: it was begun as {original}"
+    RENAMED = AuditFinding.REORDERED, "it has the name of another file: it was created as {original}"
     END_UNSIGNED = AuditFinding.UNSIGNED, "its end is not signed"
     NOTHING_SIGNED = AuditFinding.UNSIGNED, "has no hash chain, so nothing is signed"
-    MORE_WAS_THERE = AuditFinding.TRUNCATED, "{next} continues from records that are missing here: its end was cut off"
-    FILE_MISSING = AuditFinding.MISSING_FILE, "{previous}, from which it continues, is {lost}; it followed {before}"
+    MORE_WAS_THERE = AuditFinding.TRUNCATED, "{next} continues from records that are missing here: the end was cut off"
+    FILE_MISSING = AuditFinding.MISSING_FILE, "the previous file, {previous}, is {lost}; it followed {before}"
     FILES_REORDERED = AuditFinding.REORDERED, "continues from {previous}, but {before} is between them"
     FILES_BROKEN = AuditFinding.BROKEN, "does not continue from the last value of {previous}: one of them was rewritten"
-    NUMBERS_AGAIN = AuditFinding.BROKEN, "sample numbers from {seq} on are also in {previous}"
-    OTHER_STATE = AuditFinding.STATE, "opens with another state than {previous} ends with"
+    NUMBERS_AGAIN = AuditFinding.BROKEN, "sample numbers from {seq} on also occur in {previous}"
+    OTHER_STATE = AuditFinding.STATE, "does not start with the state at the end of {previous}"
 
     def __init__(self, kind: AuditFinding, sentence: str) -> None:
         self.kind, self.sentence = kind, sentence
@@ -79,7 +79,7 @@ class Fault(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One thing that is wrong with a recording.
+    """A finding of an audit.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class Finding:
     text : str
         What is wrong.
     topic : str
-        Channel without the slash, or the attachment or metadata; empty where it is the file.
+        Channel without the slash, or attachment or metadata; empty for the file as a whole.
     sequence : int, optional
         Number of the record.
     time_utc_ns : int, optional
@@ -106,7 +106,7 @@ class Finding:
 
     @property
     def place(self) -> str:
-        """Where in the file it is."""
+        """Place of the finding in the file."""
         where = [f"/{self.topic}" if self.topic and " " not in self.topic else self.topic]
         where.append("" if self.sequence is None else f"record {self.sequence}")
         where.append("" if self.time_utc_ns is None else utc(self.time_utc_ns))
@@ -117,7 +117,7 @@ class Finding:
         return ": ".join(filter(None, (self.file, self.kind, self.place, self.text)))
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as in the result of `--json`."""
+        """Return the finding or difference for `--json`."""
         return {
             "kind": self.kind,
             "file": self.file,
@@ -152,7 +152,7 @@ class Difference:
     time_utc_ns : int
         Its time, ns since 1970 UTC.
     fields : tuple of Field
-        What differs.
+        Fields that differ.
     """
 
     file: str
@@ -162,13 +162,13 @@ class Difference:
     fields: tuple[Field, ...]
 
     def lines(self) -> list[str]:
-        """Return it for people, field by field."""
+        """Return the difference as text, field by field."""
         head = f"{self.file}: /{self.topic} of sample {self.seq}, {utc(self.time_utc_ns)}, differs:"
         rows = [f"  {f.name}: recorded {f.recorded!r}, recomputed {f.recomputed!r}" for f in self.fields]
         return [head, *rows]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as in the result of `--json`."""
+        """Return the finding or difference for `--json`."""
         fields = [{"field": f.name, "recorded": f.recorded, "recomputed": f.recomputed} for f in self.fields]
         return {
             "file": self.file,

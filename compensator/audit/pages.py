@@ -1,4 +1,4 @@
-"""The pages of `replay`: what an audit proved and what not, and what another model would have done."""
+"""The pages of `replay`: what an audit proved and did not prove, and what another model would have done."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TIME = "time, UTC"
 _ROWS = 20
 #: Remarks that are shown; a year of files may have one each.
 _REMARKS = 40
-#: Values that are brought to a curve together.
+#: Number of values that are added to a curve at once.
 _TOGETHER = 5000
 _ENDS_WHOLE = (RecordingEnd.FINISHED, RecordingEnd.RECOVERED)
 #: Kinds of findings that are about several files.
@@ -54,7 +54,7 @@ def audit_page(found: Audit) -> Page:
     Parameters
     ----------
     found : Audit
-        What it gave.
+        Result of the audit.
     """
     blocks: list[Block] = [*_timeline(found), _proven(found)]
     if found.difference is not None:
@@ -65,7 +65,7 @@ def audit_page(found: Audit) -> Page:
     if found.remarks:
         lines = [sentence_of(remark) for remark in found.remarks[:_REMARKS]]
         if len(found.remarks) > _REMARKS:
-            lines.append(f"And {len(found.remarks) - _REMARKS} more; replay --json has all.")
+            lines.append(f"And {len(found.remarks) - _REMARKS} more; replay --json lists all.")
         blocks.append(Words(title="Remarks", lines=lines))
     blocks.append(_hashes(found))
     title = f"Audit: {found.machines}{_span(found)}"
@@ -73,7 +73,7 @@ def audit_page(found: Audit) -> Page:
 
 
 def verdict(found: Audit) -> str:
-    """Return one sentence: proven or not, and of how much."""
+    """Return the verdict in one sentence, with the number of samples and files."""
     files = f"{len(found.files)} recording(s)"
     if not found.clean:
         wrong = []
@@ -84,14 +84,12 @@ def verdict(found: Audit) -> str:
         return f"Not proven: {' and '.join(wrong)} in {files} with {found.samples} samples."
     if _partly(found):
         return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
-    words = (
-        f"Proven: {found.samples} samples in {files} are as they were written, and the replay reproduces every offset"
-    )
-    return words + (", signed by the key given." if found.signed else "; no signature was checked.")
+    words = f"Proven: {found.samples} samples in {files} are unchanged, and the replay reproduces every offset"
+    return words + (", signed with the given key." if found.signed else "; no signature was checked.")
 
 
 def _partly(found: Audit) -> bool:
-    """Return whether there was something that could not be checked."""
+    """Return whether a part could not be checked."""
     return not found.samples or any(not file.last or file.not_replayed for file in found.files)
 
 
@@ -107,7 +105,7 @@ def _span(found: Audit) -> str:
 
 
 def _timeline(found: Audit) -> list[Block]:
-    """Show which times are proven; nothing where there is no sample."""
+    """Show the proven intervals; intervals without samples are omitted."""
     files = [file for file in found.files if file.first_ns]
     if not files:
         return []
@@ -117,15 +115,15 @@ def _timeline(found: Audit) -> list[Block]:
     ]
     spans = {
         words: [(file.first_ns * 1e-9, file.last_ns * 1e-9) for file in files if (file.file in wrong) == is_wrong]
-        for words, is_wrong in (("file: nothing found", False), ("file: something found", True))
+        for words, is_wrong in (("file without findings", False), ("file with findings", True))
     }
     spans["findings"] = [(t * 1e-9, t * 1e-9) for t in times]
     strips = [Strip(words, tuple(spans[words]), line) for words, line in zip(spans, (1, 0, 3), strict=True)]
     first, last = min(file.first_ns for file in files), max(file.last_ns for file in files)
-    note = f"{len(spans['file: nothing found'])} of {len(files)} file(s) with samples: nothing found."
+    note = f"{len(spans['file without findings'])} of {len(files)} file(s) with samples have no findings."
     return [
         Figure(
-            title="What was found, over time",
+            title="Findings over time",
             x_label=_TIME,
             y_label="outcome",
             clock=True,
@@ -151,7 +149,7 @@ def _proven(found: Audit) -> Table:
     inside = found.findings_count - of_files - not_signed - cut - index
     rows = [
         [
-            "Every estimate and every offset is what this program makes of the samples",
+            "Every estimate and every offset is the one that this program computes from the samples",
             no if found.differing else yes if worked_out else open_,
             f"{found.samples} samples replayed, bit for bit; {found.differing} differ",
         ],
@@ -163,27 +161,27 @@ def _proven(found: Audit) -> Table:
         [
             "No file is missing between the first and the last",
             no if of_files else yes if whole else open_,
-            "each chain begins with the last value of the file before",
+            "each chain starts with the last value of the previous file",
         ],
         [
-            "Readers that seek find every record, and nothing else",
+            "Readers that seek find exactly the records of the file",
             no if index else yes if whole and not ends else open_,
-            "index and summary of each file compared with what is in it",
+            "index and summary of each file compared with its records",
         ],
         [
-            "It was not all rewritten from some point on",
+            "The recordings were not completely rewritten from some point on",
             (no if not_signed else yes) if found.signed else open_,
-            "signatures checked against the key given"
+            "signatures checked with the given key"
             if found.signed
-            else "only a signature can exclude that: --public-key, and [recording] signing_key on the machine",
+            else "only a signature can exclude this: --public-key, and [recording] signing_key on the machine",
         ],
         [
             "Nothing was cut off after the last record",
             no if cut or ends else yes if whole else open_,
             f"no end: {', '.join(ends[:3])}{' …' if len(ends) > 3 else ''}" if ends else "every file has its end",
         ],
-        ["What was before the first file", open_, "it was not given"],
-        ["The sensors measured what was there", open_, "no recording can show that"],
+        ["The recordings before the first file are intact", open_, "they were not given"],
+        ["The sensors measured correctly", open_, "a recording cannot show this"],
     ]
     return Table(title="What was proven, and what was not", head=["statement", "outcome", "how"], rows=rows)
 
@@ -203,7 +201,7 @@ def _shown(value: object) -> str:
 
 def _findings(found: Audit) -> Block:
     more = found.findings_count - len(found.findings)
-    note = f"And {more} more: of each file the first are named." if more else ""
+    note = f"And {more} more: only the first findings of each file are listed." if more else ""
     head = ["file", "kind", "what", "where"]
     rows: list[list[Cell]] = [[one.file, CodeLink(one.kind), one.text, one.place] for one in found.findings]
     return _folded("Findings", head, rows, note)
@@ -223,14 +221,14 @@ def _files(files: Sequence[RecordingAudit]) -> Block:
         for file in files
     ]
     head = ["file", "end", "samples", "records", "findings", "differ", "signed"]
-    return _folded("File by file", head, rows, "The values of the hash chain are below, folded.")
+    return _folded("File by file", head, rows, "The values of the hash chain are in the folded table below.")
 
 
 def _hashes(found: Audit) -> Details:
     rows: list[list[Cell]] = [
         [
             file.file,
-            "begins it" if file.previous == NOTHING.hex() else file.previous or "–",
+            "starts here" if file.previous == NOTHING.hex() else file.previous or "–",
             file.last or "–",
             file.model or "–",
         ]
@@ -256,7 +254,7 @@ def _folded(title: str, head: Sequence[str], rows: Sequence[Sequence[Cell]], not
 
 
 class Curves:
-    """Both models' offsets and what is left with each, over any length of time in little memory."""
+    """Both models' offsets and remaining errors, over any length of time in bounded memory."""
 
     def __init__(self) -> None:
         self.curves = {name: Envelope() for name in ("recorded", "other", "left recorded", "left other")}
@@ -310,7 +308,7 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
         left = (curves.line(recorded, "left recorded"), curves.line(other, "left other"))
         blocks.append(
             Figure(
-                title="What is left: measured deformation + offset",
+                title="Remaining error: measured deformation + offset",
                 x_label=_TIME,
                 y_label="Y, µm",
                 clock=True,
@@ -321,7 +319,7 @@ def comparison_page(found: Comparison, curves: Curves) -> Page:
         )
     blocks.append(_before_and_after(found))
     if found.remarks:
-        blocks.append(Words(title="What the figures depend on", lines=[sentence_of(one) for one in found.remarks]))
+        blocks.append(Words(title="Remarks", lines=[sentence_of(one) for one in found.remarks]))
     words, tone = _better(found)
     return Page(
         title=f"Model “{found.other}” on what “{found.recorded}” recorded", verdict=words, blocks=blocks, tone=tone
@@ -332,13 +330,13 @@ def _better(found: Comparison) -> tuple[str, Tone]:
     before, after = found.left_before.rms, found.left_after.rms
     if not found.left_before.samples:
         return (
-            f"Y was not measured, so neither is known to be better: the offset of “{found.other}” differs by "
+            f"Y was not measured, so it is unknown which model is better: the offset of “{found.other}” differs by "
             f"{_um(found.offsets.rms)} µm rms, at most {_um(abs(found.offsets.peak))} µm.",
             "warn",
         )
     words = (
-        f"With “{found.other}”, {_um(after)} µm rms would have been left in Y instead of {_um(before)} with "
-        f"“{found.recorded}”, which was recorded."
+        f"With “{found.other}”, the remaining error in Y would have been {_um(after)} µm rms instead of "
+        f"{_um(before)} with “{found.recorded}”, the recorded model."
     )
     return words, "good" if after < before else "bad" if after > before else "warn"
 
@@ -352,8 +350,8 @@ def _before_and_after(found: Comparison) -> Table:
         title="Before and after",
         head=["", "rms µm", "largest µm", "samples", "largest at"],
         rows=[row(name, spread) for name, spread in found.rows().items()],
-        note="Residual: measured − predicted. Every recorded sample was run through the service's own compensation "
-        "with the other model, limits and losses included.",
+        note="Residual: measured − predicted. Every recorded sample was run through the service's compensation "
+        "with the other model, including limits and lost samples.",
     )
 
 

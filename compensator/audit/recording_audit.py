@@ -37,12 +37,12 @@ def audit_recording(
     verifier : Verifier, optional
         Public key of the machine.
     progress : callable, optional
-        Called now and then with the number of bytes worked off since the last call.
+        Called at intervals with the number of bytes processed since the last call.
 
     Raises
     ------
     DataError
-        If it is no recording; one line that says where and why.
+        If the file is not a recording.
     """
     with Container(path) as container:
         return _Audit(path, container, verifier, progress).run()
@@ -68,7 +68,7 @@ class _Audit:
         except Damaged as damage:
             error = damage
         if not self._contents.channels and not isinstance(error, Torn):
-            raise error or DataError(f"{self._result.file}: no channels in it, expected a recording")
+            raise error or DataError(f"{self._result.file}: no channels, expected a recording")
         self._refuse_others()
         chain, replay = self._begin(), self._replay
         if chain.head:
@@ -89,7 +89,7 @@ class _Audit:
     # ------------------------------------------------------------------ reading
 
     def _read(self) -> None:
-        """Check group by group; what follows the last complete group stays in `_rest`."""
+        """Check group by group; the records after the last complete group stay in `_rest`."""
         for number, (records, message, whole) in enumerate(groups_of(self._container)):
             if not whole:
                 self._rest = records
@@ -104,7 +104,7 @@ class _Audit:
                 self._position = position
 
     def _begin(self) -> ChainCheck:
-        """Start the checks once it is known what the file opens with."""
+        """Start the checks once the start of the file has been read."""
         if self._chain is None:
             contents, result = self._contents, self._result
             run = contents.run
@@ -131,27 +131,29 @@ class _Audit:
             self._replay.check(records)
         except DataError as error:
             self._result.find(Fault.UNREADABLE, what=self._without_name(error))
-            # Without this message all that follows would differ.
+            # Without this message, all following messages would differ.
             self._result.not_replayed = f"not replayed from here on: {error}"
 
     def _without_name(self, error: DataError | str) -> str:
         return str(error).removeprefix(f"{self._result.file}: ")
 
     def _refuse_others(self) -> None:
-        """Refuse a file that no machine's service wrote: whether it was changed cannot be known."""
+        """Refuse a file not written by a machine's service: changes to it cannot be detected."""
         contents, file = self._contents, self._result.file
         topics = {channel.topic for channel in contents.channels.values()}
         if contents.metadata or contents.attachments or not topics or topics & {"/sample", "/offset", "/chain"}:
             return
         if any("/thermal/" in topic for topic in topics):
-            raise DataError(f"{file}: a shop's recording, which has no hash chain; expected the machines' own")
+            raise DataError(
+                f"{file}: a shop's recording, which has no hash chain; expected recordings of the machines' services"
+            )
         there = ", ".join(sorted(topics))[:80]
-        raise DataError(f"{file}: no recording of this service: expected /sample, /offset and /chain, got {there}")
+        raise DataError(f"{file}: not a recording of the service: expected /sample, /offset and /chain, got {there}")
 
     # ------------------------------------------------------------------ the end
 
     def _classify(self, error: Damaged | None, chain: ChainCheck) -> None:
-        """Enter how the file ends; what a kill leaves is no finding."""
+        """Set how the file ends; an end left by a kill is not a finding."""
         result, rest = self._result, self._rest
         if not chain.head and self._contents.messages:
             result.find(Fault.NO_CHAIN, topic="channel /chain")
@@ -187,7 +189,7 @@ class _Audit:
 
 
 def _covers_others(rest: bytes) -> bool:
-    """Distinguish a changed length from a torn end: there, the one message after it is not complete."""
+    """Distinguish a changed length from a torn end, after which no complete message follows."""
     if rest.count(b'{"schema":') > 1 or len(rest) >= 2**20:
         return True
     try:

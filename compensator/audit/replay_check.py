@@ -1,4 +1,4 @@
-"""Replays one file from the state that it opens with, and compares byte by byte."""
+"""Replays one file from the state at its start, and compares byte by byte."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ class ReplayCheck:
     Parameters
     ----------
     contents : Contents
-        Configuration, model and state that travel in the file.
+        Configuration, model and state in the file.
     result : RecordingAudit
-        Where samples and differences are entered.
+        Result to which samples and differences are added.
 
     Raises
     ------
     CompensatorError
-        If they cannot be used.
+        If the contents cannot be used.
     """
 
     def __init__(self, contents: Contents, result: RecordingAudit) -> None:
@@ -64,7 +64,7 @@ class ReplayCheck:
         Raises
         ------
         DataError
-            If a message is not what its schema says.
+            If a message does not follow its schema.
         """
         if self._incomplete is not None:
             if not (records[0].topic == "seal" and b'"reason":"recovered"' in records[0].body):
@@ -81,7 +81,7 @@ class ReplayCheck:
             self._matches("offset", expected, step.records["offset"])
 
     def finish(self) -> None:
-        """Enter what is known only at the end."""
+        """Add the results that are known only at the end."""
         if self._incomplete is not None:
             self._count(self._incomplete)
 
@@ -95,7 +95,7 @@ class ReplayCheck:
             result.removed += data.removed[:_REMOVED]
 
     def _compare(self, step: RecordedStep, outcome: Outcome) -> None:
-        """Compare the messages of a sample; what differs first is enough."""
+        """Compare the messages of a sample, up to the first difference."""
         result, sample, records = self._result, outcome.sample, step.records
         if result.samples:
             result.skipped += max(0, sample.seq - result.last_seq - 1)
@@ -119,7 +119,7 @@ class ReplayCheck:
                 self._count(self._difference("event", sample, (_missing_note(note, step.events),)))
 
     def _as_published(self, expected: Offset, recorded: bytes) -> Offset:
-        """Return an offset with the reason of the disk where it was published with one."""
+        """Return an offset with the disk's reason if it was published with one."""
         for reason, quoted in _DISK_REASONS:
             if quoted in recorded:
                 self._result.early_seqs.add(expected.seq)
@@ -146,7 +146,7 @@ class ReplayCheck:
 
 
 def _missing_note(note: Note, events: list[Event]) -> Field:
-    """Return how a note differs from the event of its kind: by its data, or by its text where that has none."""
+    """Return how a note differs from the event of its kind: in its data, or in its text if it has no data."""
     event = next((event for event in events if event.kind == note.kind), None)
     if event is None or not event.data:
         return Field(name=note.kind, recorded=event.text if event else None, recomputed=note.text)

@@ -1,4 +1,4 @@
-"""What the audit of one file gives; its checks fill it in."""
+"""Result of the audit of one file, filled in by the checks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from compensator.recording.reading import RawRecord
 
 @dataclass(slots=True, kw_only=True)
 class RecordingAudit:
-    """What the audit of one file gave.
+    """Result of the audit of one file.
 
     Parameters
     ----------
@@ -21,13 +21,13 @@ class RecordingAudit:
     size : int
         Bytes.
     original, machine, began, previous_file : str
-        From its metadata: the name that it was begun with, the machine, why it began, the previous file.
+        From its metadata: the name at its creation, the machine, why it was created, the previous file.
     previous, last : str
-        Value of the hash chain that it continues from, and its last one; empty where it has no chain.
+        Value of the hash chain from which it continues, and its last value; empty if it has no chain.
     end : RecordingEnd or AuditFinding
-        How it ends: with or without an end of its own, or as what cut it off or damaged it.
+        How it ends: with or without an end, or truncated or damaged.
     findings, findings_count : list of Finding, int
-        What is wrong with the file, the first of it, and how much there is.
+        The first findings, and the number of all findings.
     records : int
         Records in the chain.
     signed, unsigned_behind : int
@@ -35,7 +35,7 @@ class RecordingAudit:
     keys : set of str
         Public keys in the seals.
     seal, sealed_signed : str, bool
-        Reason of the seal that is the last record, empty where there is none, and whether it is signed.
+        Reason of the seal that is the last record, empty if there is none, and whether it is signed.
     samples, skipped : int
         Samples that were replayed, and samples between them that were not recorded.
     first_seq, last_seq, first_ns, last_ns : int
@@ -47,13 +47,13 @@ class RecordingAudit:
     early_seqs : set of int
         Samples whose offset was published before it was on disk.
     removed : list of str
-        Recordings that its events name as removed by the limit of what is kept.
+        Recordings that, by its events, the retention limit removed.
     not_replayed : str
-        Why its samples could not be replayed; empty where they were.
+        Why its samples could not be replayed; empty if they were.
     identity, model : str
-        Hash over configuration and model, and that of the model.
+        Hash of configuration and model together, and hash of the model.
     state_before, state_after : str
-        Hash of the state that it opens with, empty where there is none, and of the state after its last sample.
+        Hash of the state at its start, empty if there is none, and of the state after its last sample.
     """
 
     file: str
@@ -105,18 +105,18 @@ class RecordingAudit:
         time_utc_ns: int | None = None,
         **figures: Any,
     ) -> None:
-        """Keep a finding, or count it where there are many.
+        """Add a finding; beyond a maximum, findings are only counted.
 
         Parameters
         ----------
         fault : Fault
-            What is wrong.
+            The fault.
         at : RawRecord, optional
-            Where.
+            The record with the fault.
         topic, sequence, time_utc_ns
-            Where it is in no single record.
+            Place of the fault if it is not in a single record.
         **figures
-            What the sentence of the fault names.
+            Figures for the sentence of the fault.
         """
         if at is not None:
             topic, sequence, time_utc_ns = at.topic, at.sequence, at.log_time_ns
@@ -134,7 +134,7 @@ class RecordingAudit:
             )
 
     def pair_moved(self) -> None:
-        """Turn a record that is missing in one place and too many in another into one that was moved."""
+        """Combine a record missing in one place and inserted in another into one that was moved."""
         missing = {(f.topic, f.sequence) for f in self.findings if f.kind == AuditFinding.REMOVED and f.topic}
         moved = set()
         for i, finding in enumerate(self.findings):

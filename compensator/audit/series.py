@@ -1,4 +1,4 @@
-"""Audits the recordings of a machine together: none is missing or exchanged, each continues the one before."""
+"""Audits the recordings of a machine together: none is missing or exchanged, and each continues the previous one."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Audit:
-    """Verdict on recordings.
+    """Result of an audit of several recordings.
 
     Parameters
     ----------
     files : tuple of RecordingAudit
-        In the order in which they were begun.
+        In the order of their start.
     findings : tuple of Finding
-        What is wrong, file by file, the first of each file.
+        The first findings of each file, file by file.
     findings_count : int
-        How many there are.
+        Number of all findings.
     difference : Difference, optional
         The first sample that the replay does not reproduce.
     remarks : tuple of Remark
-        What is worth knowing and not wrong.
+        Observations that are not findings.
     signed : bool
         Whether signatures were checked against a key.
     """
@@ -58,7 +58,7 @@ class Audit:
 
     @property
     def machines(self) -> str:
-        """Names of the machines, for people."""
+        """Names of the machines, as text."""
         return ", ".join(dict.fromkeys(file.machine or "unnamed machine" for file in self.files))
 
     @property
@@ -74,11 +74,11 @@ class Audit:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there are no findings and no differences."""
         return not self.findings_count and not self.differing
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as in the result of `--json`."""
+        """Return the result for `--json`."""
         files = [
             {
                 "file": f.file,
@@ -125,16 +125,16 @@ def audit(
     paths : sequence of pathlib.Path
         Recordings, in any order.
     public_key : pathlib.Path, optional
-        Key that they must be signed with.
+        Key with which they must be signed.
     progress : callable, optional
-        Called with the number of bytes worked off, and of all.
+        Called with the number of bytes processed and their total.
     executor : Executor, optional
-        Audits the files side by side; without one, this process audits one after the other.
+        Audits the files in parallel; without one, this process audits them one after the other.
 
     Raises
     ------
     DataError
-        If one of them is no recording.
+        If a file is not a recording.
     UsageError
         If the key cannot be used.
     """
@@ -160,7 +160,7 @@ def audit(
 def _side_by_side(
     executor: Executor, paths: Sequence[Path], public_key: Path | None, done: Callable[[Path], None]
 ) -> list[RecordingAudit]:
-    """Audit files side by side: each carries the state that it begins with, so none waits for another."""
+    """Audit files in parallel: each contains the state at its start, so they are independent."""
     jobs = {executor.submit(_audit_one, path, public_key): path for path in paths}
     for job in as_completed(jobs):
         job.result()
@@ -182,7 +182,7 @@ def combine(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
     signed : bool
         Whether seals were checked against a key.
     """
-    # By the names that they were begun with: these show the order, also where the clock was set back.
+    # By the names at their creation, which show the order even if the clock was set back.
     files = sorted(map(_named, audits), key=lambda f: (f.machine, f.original.removesuffix(".mcap")))
     series = _Series(files, signed)
     for before, after in zip([None, *files[:-1]], files, strict=True):
@@ -200,13 +200,13 @@ def combine(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
 
 
 def _named(file: RecordingAudit) -> RecordingAudit:
-    """Return the file with the machine of its name where its metadata are lost."""
+    """Return the file with the machine of its file name if its metadata are lost."""
     name = _NAME.match(file.file)
     return file if name is None or file.machine else replace(file, machine=name["machine"])
 
 
 class _Series:
-    """Checks files one after the other, and what links them."""
+    """Checks files one after the other, and the links between them."""
 
     def __init__(self, files: Sequence[RecordingAudit], signed: bool) -> None:
         self._names = {file.original: file for file in files}
@@ -228,14 +228,14 @@ class _Series:
         if file.not_replayed:
             remark(Remark(AuditRemark.NOT_WORKED_OUT, f"{name}: not all samples were replayed: {file.not_replayed}."))
         if not file.last and file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
-            remark(Remark(RecordingEnd.TORN, f"{name}: torn before anything was recorded."))
+            remark(Remark(RecordingEnd.TORN, f"{name}: ends before the first record."))
             return
         if file.end == RecordingEnd.RECOVERED:
             remark(Remark(RecordingEnd.RECOVERED, f"{name}: the service was killed; every complete record was kept."))
         elif file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
-            figures = f"{name}: has no end, still being written, or the service was killed"
+            figures = f"{name}: no end; it is still being written, or the service was killed"
             if self._newest[file.machine] == name:
-                figures += "; whether more was there shows the next file, which names the last value of this one"
+                figures += "; the next file shows whether records are missing, as it contains this file's last value"
             if file.end == RecordingEnd.TORN:
                 remark(Remark(RecordingEnd.TORN, f"{figures}. It ends within a group of records."))
             else:
@@ -247,7 +247,9 @@ class _Series:
                 )
             )
         if file.early:
-            figures = f"{file.early} offset(s) were published before they were on disk, which was slow or failed"
+            figures = (
+                f"{file.early} offset(s) were published before they were on disk, because the disk was slow or failed"
+            )
             remark(Remark(AuditRemark.PUBLISHED_EARLY, f"{name}: {figures}."))
         self._check_signatures(file)
 
@@ -268,7 +270,7 @@ class _Series:
             )
 
     def check_link(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
-        """Check what links a file to the one before it."""
+        """Check the link of a file to the previous one."""
         if not after.last:
             return
         if before is None:
@@ -280,7 +282,7 @@ class _Series:
         elif after.previous == before.last:
             self._check_state(before, after)
         elif not after.previous_file:
-            figures = f"{after.file}: begins a new chain; it states that no recording was there before it."
+            figures = f"{after.file}: starts a new chain; it states that there was no earlier recording."
             self.remarks.append(Remark(AuditRemark.BEGINS_NEW_CHAIN, figures))
         else:
             self._explain_break(before, after)
@@ -288,7 +290,7 @@ class _Series:
     def _explain_break(self, before: RecordingAudit, after: RecordingAudit) -> None:
         named = self._names.get(after.previous_file)
         if named is None:
-            lost = "removed by the limit of what is kept" if after.previous_file in self._removed else "missing"
+            lost = "removed by the retention limit" if after.previous_file in self._removed else "missing"
             self._find(Fault.FILE_MISSING, after, previous=after.previous_file, lost=lost, before=before.file)
         elif named.original != before.original:
             self._find(Fault.FILES_REORDERED, after, previous=named.file, before=before.file)
@@ -300,13 +302,13 @@ class _Series:
     def _check_first(self, file: RecordingAudit) -> None:
         if file.previous != NOTHING.hex() or file.previous_file:
             removed = file.previous_file in self._removed
-            lost = "which the limit of what is kept removed" if removed else "not given here"
+            lost = "which the retention limit removed" if removed else "which was not given"
             self.remarks.append(
-                Remark(AuditRemark.BEFORE_NOT_GIVEN, f"{file.file}: begins after {file.previous_file}, {lost}.")
+                Remark(AuditRemark.BEFORE_NOT_GIVEN, f"{file.file}: continues {file.previous_file}, {lost}.")
             )
 
     def _check_state(self, before: RecordingAudit, after: RecordingAudit) -> None:
-        """Check that in one run a file opens with the state in which the one before ended."""
+        """Check that within one run a file starts with the state at the end of the previous one."""
         if after.first_seq >= 0 and 0 <= after.first_seq <= before.last_seq:
             self._find(Fault.NUMBERS_AGAIN, after, seq=after.first_seq, previous=before.file)
         whole = not (before.not_replayed or after.not_replayed or before.findings_count or before.differing)
@@ -317,7 +319,7 @@ class _Series:
 
 
 def summary(found: Audit) -> str:
-    """Return the verdict in a few lines for people."""
+    """Return the verdict in a few lines of text."""
     files, samples = len(found.files), found.samples
     span = ", " + " to ".join(map(utc, found.span_ns)) if found.span_ns else ""
     lines = [f"{samples} samples of {found.machines} in {files} file(s){span}"]
@@ -333,8 +335,8 @@ def summary(found: Audit) -> str:
         lines.append(f"The hash chain holds over {records} records; nothing was changed, removed, inserted or moved.")
         if not found.signed:
             lines.append(
-                "Whoever can write all of these files can compute a new chain; only a signature, checked "
-                "with --public-key, excludes that."
+                "Anyone who can write all of these files can compute a new chain; only a signature, checked "
+                "with --public-key, excludes this."
             )
     if found.findings_count:
         lines.append(f"{found.findings_count} finding(s):")
@@ -347,5 +349,5 @@ def _shortened(remarks: Sequence[str], most: int = 20) -> list[str]:
     """Return the first remarks; a year of files may have one each."""
     kept = list(remarks[:most])
     if len(remarks) > most:
-        kept.append(f"and {len(remarks) - most} more (--json has all)")
+        kept.append(f"and {len(remarks) - most} more (--json lists all)")
     return kept

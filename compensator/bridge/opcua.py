@@ -1,4 +1,4 @@
-"""From the offset to a PLC's data block over OPC UA: the thin layer of asyncua around `Register` and `Receiver`."""
+"""Writes the offset to a PLC's data block over OPC UA: the asyncua client around `Register` and `Receiver`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from compensator.receiver.subscriber import monotonic_s
 
 log = logging.getLogger("compensator")
 
-#: Values of `state_node`: the follower's states, and 4 where nothing may be written.
+#: Values of `state_node`: the follower's states, and 4 if nothing may be written.
 STATES = ("starting", "following", "holding", "fading", "trouble")
 #: The counter of `heartbeat_node` fits into every integer of a PLC.
 HEARTBEAT_MODULUS = 2**15
@@ -36,7 +36,7 @@ _INTEGERS = (
     ua.VariantType.Int64,
     ua.VariantType.UInt64,
 )
-#: Raised by a connection that is lost, refused or silent.
+#: Raised if a connection is lost, refused or does not answer.
 _GONE = (OSError, ua.UaError, asyncio.TimeoutError, ConnectionError)
 
 
@@ -48,7 +48,7 @@ class Bridge:
     settings : OpcUa
         Server, node, unit and sign.
     receiver : Receiver
-        Entered by the caller; its `step_max_s` should be two cycles.
+        Context manager entered by the caller; its `step_max_s` should be two cycles.
     report : callable, optional
         Called with a line whenever state or reasons change; the log by default.
     """
@@ -91,7 +91,7 @@ class Bridge:
             client.set_user(settings.user)
             client.set_password(Path(settings.password_file).read_text(encoding="utf-8").strip())
         if settings.security_policy:
-            # A server compares the application's URI in the certificate with the one that the application sends.
+            # A server compares the application URI in the certificate with the one that the application sends.
             client.application_uri = _application_uri(Path(settings.certificate)) or client.application_uri
             await client.set_security(
                 getattr(security_policies, f"SecurityPolicy{settings.security_policy}"),
@@ -152,7 +152,7 @@ class Bridge:
         self._report_change(applied)
 
     async def _wait_disconnected(self, stop: asyncio.Event) -> None:
-        """Follow what is published without the PLC, until the next attempt."""
+        """Follow the published offset without the PLC, until the next attempt."""
         self._receiver.follower.hold()
         end_s = monotonic_s() + self._settings.retry_s
         while not stop.is_set() and monotonic_s() < end_s:
@@ -178,7 +178,7 @@ def _application_uri(path: Path) -> str:
 
 
 async def _write(node: Any, value: float, kind: ua.VariantType) -> None:
-    # Without time and status: PLCs refuse to have those written.
+    # Without time and status, which PLCs refuse.
     await node.write_value(ua.DataValue(ua.Variant(value, kind)))
 
 

@@ -1,7 +1,7 @@
-"""A value in the PLC's memory that follows the offset: what may be written to it, and when.
+"""A value in the PLC's memory that follows the offset: decides what may be written to it, and when.
 
-Knows no protocol and no clock. Only a value that was read back is trusted: after a start, a lost connection, a write of
-unknown outcome or another writer the offset continues from the PLC's value.
+No protocol, no clock. Only a value that was read back is trusted: after a start, a lost connection, a write with
+unknown outcome, or a write by another program, the offset continues from the PLC's value.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ class Register:
     Parameters
     ----------
     follower : Follower
-        Has the offset to apply; is rebased to the PLC's value.
+        Provides the offset to apply; is rebased to the PLC's value.
     sign : int
         1 or −1.
     unit_um : float
         µm for each unit of the value.
     tolerance_um : float
-        Largest difference of the value read back from the value written, µm.
+        Largest difference between the value read back and the value written, µm.
     resume_after_s : float
-        How long the value of another writer must not change, s.
+        Time for which a value written by another program must not change, s.
     single : bool
         Whether it holds 32 bits.
 
     Attributes
     ----------
     trouble : str
-        Why nothing is written, in words; empty while the offset is written.
+        Why nothing is written, as text; empty while the offset is written.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Register:
         self._known = False
 
     def lost(self, why: str) -> None:
-        """Forget the PLC's value: it is no longer known."""
+        """Mark the PLC's value as unknown."""
         self.trouble = why
         self._known, self._written, self._found = False, None, None
 
@@ -79,7 +79,7 @@ class Register:
         if self._found is None or not self._same(value, self._found[0]):
             self._found = (value, now_s)
         found_um, left_um = value / self._per_um, self._written / self._per_um
-        figures = f"the PLC holds {found_um:+.3f} µm, written was {left_um:+.3f} µm: it has another writer."
+        figures = f"the PLC holds {found_um:+.3f} µm instead of the written {left_um:+.3f} µm."
         self.trouble = Remark(BridgeTrouble.PLC_WRITTEN_OVER, figures).marked
         if now_s - self._found[1] < self._resume_after_s:
             return False
@@ -101,7 +101,7 @@ class Register:
         return True
 
     def value(self, offset_um: float) -> float | None:
-        """Return the value to write for an offset; None where the PLC holds it already.
+        """Return the value to write for an offset; None if the PLC already has it.
 
         Parameters
         ----------
@@ -114,5 +114,5 @@ class Register:
         return None if value == self._written else value
 
     def wrote(self, value: float) -> None:
-        """Note a confirmed write."""
+        """Store a confirmed write."""
         self._written = value

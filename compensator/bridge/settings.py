@@ -32,21 +32,22 @@ class OpcUa:
     sign : int
         1 or −1: whether the control adds or subtracts it. There is no default: it is determined on the machine.
     sign_checked : str
-        Who determined it, when and how, in words.
+        Who determined it, when and how, as text.
     cycle_s : float
-        How often it is read and written, s.
+        Interval of reading and writing, s.
     readback_tolerance_um : float
-        Largest difference of the value read back from the value written, µm.
+        Largest difference between the value read back and the value written, µm.
     resume_after_s : float
-        After a difference, how long the PLC's value must not change before the offset continues from it, s.
+        Time for which the PLC's value must not change after a difference before the offset continues from it, s.
     retry_s, timeout_s : float
-        Pause before the next attempt to connect, and how long an answer may take, s.
+        Pause before the next attempt to connect, and time limit of a reply, s.
     heartbeat_node, state_node, enable_node : str
         Optional: an integer that counts up each cycle; one for the state; a BOOL of the PLC, false holds the offset.
     user, password_file : str
-        Login; the file holds the password alone.
+        Login; the file contains only the password.
     security_policy, certificate, private_key, server_certificate : str
-        Signed and encrypted: one of the policies and its files. Without them the connection is open.
+        For a signed and encrypted connection: one of the policies, and its files. Without them the connection is not
+        protected.
     """
 
     endpoint: str
@@ -93,8 +94,8 @@ def load_bridge(path: str | Path) -> tuple[Settings, OpcUa]:
         for key in ("sign", "sign_checked"):
             if key not in table:
                 raise ReceiverError(
-                    f"{path}: opcua.{key}: missing; the sign is found on this machine with a dial gauge, and who found "
-                    f'it when and how is written down (sign = 1 or -1, sign_checked = "…")'
+                    f"{path}: opcua.{key}: missing; determine the sign on this machine with a dial gauge, and enter "
+                    f'who determined it, when and how (sign = 1 or -1, sign_checked = "…")'
                 )
         opcua = read_table(OpcUa, table, source=str(path), name="opcua")
         _check(opcua, str(path))
@@ -114,9 +115,9 @@ def _check(opcua: OpcUa, path: str) -> None:
         return ReceiverError(f"{path}: opcua.{key} = {getattr(opcua, key)!r}: expected {expected}")
 
     if opcua.sign not in (1, -1):
-        raise wrong("sign", "1 or -1, found on this machine with a dial gauge")
+        raise wrong("sign", "1 or -1, determined on this machine with a dial gauge")
     if not opcua.sign_checked.strip():
-        raise wrong("sign_checked", "who found the sign, when and how")
+        raise wrong("sign_checked", "who determined the sign, when and how")
     if opcua.unit not in UNITS_UM:
         raise wrong("unit", f"one of {', '.join(UNITS_UM)}")
     if not opcua.endpoint.startswith("opc.tcp://"):

@@ -1,4 +1,4 @@
-"""The commands: one file each, named in `compensator.cli` and loaded when they are called."""
+"""The commands: one module each, listed in `compensator.cli` and imported when called."""
 
 from __future__ import annotations
 
@@ -36,5 +36,5 @@ def log_warnings(source: object, warnings: Iterable[Remark]) -> None:
 
 
 def warnings_as_json(warnings: Sequence[Remark]) -> dict[str, Any]:
-    """Return warnings and their codes as the results of commands hold them."""
+    """Return warnings and their codes for the JSON result of a command."""
     return {"warnings": list(warnings), "warning_codes": [warning.code for warning in warnings]}

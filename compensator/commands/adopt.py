@@ -1,4 +1,4 @@
-"""`compensator adopt` and `back`: another model for the service, running or not."""
+"""`compensator adopt` and `back`: change the model of the service, whether it is running or not."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from compensator.service.command_client import NotReached, ask
 from compensator.service.loading import Setup, load
 from compensator.service.transfer.model_store import check_model
 
-NOT_REACHED = "The service was not reached; it will use the model from its next start on."
+NOT_REACHED = "The service could not be reached; it will use the model from its next start."
 
 
 def adopt(arguments: argparse.Namespace) -> Answer:
-    """Check a model and have the running service adopt it, or keep it for the next start.
+    """Check a model; the running service adopts it, or it is stored for the next start.
 
     Raises
     ------
@@ -34,13 +34,15 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     reply = _ask(CommandName.ADOPT, wanted, setup, arguments)
     if reply is None:
         if model.sha256 == setup.model.sha256:
-            raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is the service's model already")
+            raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is already the service's model")
         setup.store.adopt(data, name=model.name, time_utc_ns=SystemClock().utc_ns())
-    return _answered(reply, f"model {model.name} ({model.sha256[:12]}) is kept in {setup.store.folder}.", model.sha256)
+    return _answered(
+        reply, f"model {model.name} ({model.sha256[:12]}) is stored in {setup.store.folder}.", model.sha256
+    )
 
 
 def back(arguments: argparse.Namespace) -> Answer:
-    """Have the running service return to the previous model, or keep that for the next start.
+    """Return to the previous model, now if the service is running, otherwise at its next start.
 
     Raises
     ------
@@ -53,8 +55,8 @@ def back(arguments: argparse.Namespace) -> Answer:
         return _answered(reply, "", "")
     before = setup.store.before()
     if before is None:
-        raise ServiceError("back: the configured model is in use, there is none before it")
-    model = check_model(setup.config, before, source="model before")
+        raise ServiceError("back: the configured model is in use; there is no previous model")
+    model = check_model(setup.config, before, source="previous model")
     setup.store.back(name=model.name, time_utc_ns=SystemClock().utc_ns())
     return _answered(None, f"back to model {model.name} ({model.sha256[:12]}).", model.sha256)
 

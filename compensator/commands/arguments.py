@@ -1,4 +1,4 @@
-"""Arguments of the commands, in a module of their own so that `--help` loads no numerics."""
+"""Arguments of the commands, in a separate module so that `--help` imports no numerical packages."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import argparse
 from pathlib import Path
 
 _OPERATOR = "Zenoh configuration with the operator's certificate, such as operator.json5; needed over TLS"
-_SCHEDULER = "Dask scheduler that does the work, such as tcp://host:8786 (default: all cores of this machine)"
+_SCHEDULER = "run on this Dask scheduler, such as tcp://host:8786 (default: all cores of this computer)"
 
 
 def _column(parser: argparse.ArgumentParser) -> None:
-    words = "role (t_s or time_utc too) of a column of another name"
+    words = "use the column NAME as ROLE, such as t_q_degc, t_s or time_utc; may be repeated"
     parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME", help=words)
 
 
@@ -19,7 +19,7 @@ def _page(parser: argparse.ArgumentParser) -> None:
         "--page",
         type=Path,
         metavar="FILE",
-        help="also write the page here: .html; .pdf or .png by an installed browser",
+        help="also write the page to this file: .html, or .pdf or .png (printed by an installed browser)",
     )
 
 
@@ -32,9 +32,9 @@ def demo(parser: argparse.ArgumentParser) -> None:
     add(
         "--live",
         action="store_true",
-        help="one machine that runs on in real time after these hours, to experiment with",
+        help="one machine that continues in real time after these hours, for experiments",
     )
-    add("--port", type=int, default=7447, help="its port on loopback, with --live (default 7447)")
+    add("--port", type=int, default=7447, help="with --live: port on loopback (default 7447)")
     _page(parser)
 
 
@@ -49,7 +49,7 @@ check = probe = run
 def simulate(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `simulate`."""
     add = parser.add_argument
-    add("data", type=Path, metavar="DATA", help="CSV, MAT, or a recording")
+    add("data", type=Path, metavar="DATA", help="CSV or MAT file, or recording")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="CSV")
     _column(parser)
@@ -68,52 +68,52 @@ def bridge(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `bridge`."""
     parser.add_argument("protocol", choices=("opcua",), help="protocol of the control")
     parser.add_argument("--config", required=True, metavar="FILE", help="TOML with [receiver] and [opcua]")
-    parser.add_argument("--check", action="store_true", help="check the file, open nothing")
+    parser.add_argument("--check", action="store_true", help="check the file without opening a connection")
 
 
 def explain(parser: argparse.ArgumentParser) -> None:
     """Describe the argument of `explain`."""
     parser.add_argument(
-        "code", metavar="CODE", nargs="?", help="such as degraded, or t_q_missing; without it, all codes"
+        "code", metavar="CODE", nargs="?", help="such as degraded or t_q_missing (default: list all codes)"
     )
 
 
 def identify(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `identify`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, MAT, or recordings; one or several")
+    add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
     add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html is written next to it")
     _page(parser)
     _column(parser)
-    add("--name", help="name of the model (default: that of the file)")
+    add("--name", help="name of the model (default: the file name)")
     add = parser.add_argument_group("structure of the model").add_argument
-    words = "with a TTF, or from T_Q - AT straight to y (default: with one where heat_w is known)"
+    words = "heat: with a TTF; direct: from T_Q - AT to y; auto (the default): heat if heat_w is known"
     add("--kind", choices=("auto", "heat", "direct"), default="auto", help=words)
     add("--ttf", type=int, nargs=3, default=(2, 2, 0), metavar=("NB", "NF", "NK"), help="structure of the TTF (2 2 0)")
-    words = "structure of DTF and TDTF (default: chosen on held-out folds)"
+    words = "structure of DTF and TDTF (default: chosen on held-out blocks)"
     add("--order", type=int, nargs=3, metavar=("NF", "NB_DTF", "NB_TDTF"), help=words)
-    words = "heat that the DTF is fitted with: from T_Q as in the service (default), or the known one"
+    words = "heat for fitting the DTF: estimated from T_Q as in the service (ttf, the default), or known"
     add("--drive", choices=("ttf", "known"), default="ttf", help=words)
-    add = parser.add_argument_group("the effect of the ambient").add_argument
-    words = "TDTF given (I), from a whole ETVE (II), from its end (III), jointly with the DTF (IV, the default)"
+    add = parser.add_argument_group("effect of the ambient temperature").add_argument
+    words = "TDTF given (I), fitted to a whole ETVE (II) or its end (III), or jointly with the DTF (IV, the default)"
     add("--method", choices=("I", "II", "III", "IV"), default="IV", help=words)
     words = "method I: gain and time constant of the first-order TDTF"
     add("--tdtf", type=float, nargs=2, metavar=("UM_PER_K", "MIN"), help=words)
-    words = "methods II and III: a run without heat source; may be repeated"
+    words = "methods II and III: a run with the heat source off; may be repeated"
     add("--etve", type=Path, action="append", default=[], metavar="DATA", help=words)
-    add("--etve-end-h", type=float, default=6.0, metavar="H", help="method III: length of the end, h (6)")
+    add("--etve-end-h", type=float, default=6.0, metavar="H", help="method III: length of the final part, h (6)")
     add = parser.add_argument_group("validation").add_argument
-    words = "a run for validation only; may be repeated"
+    words = "a run used only for validation; may be repeated"
     add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
     add("--fit-until", type=float, metavar="H", help="fit up to this hour, validate on the rest")
     add("--folds", type=int, default=5, help="number of held-out blocks of time (5)")
-    add("--reference", metavar="MODEL", help="another model, whose coefficients are listed for comparison")
+    add("--reference", metavar="MODEL", help="another model, to compare its coefficients")
 
 
 def diagnose(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `diagnose`."""
     add = parser.add_argument
-    add("data", type=Path, nargs="+", metavar="DATA", help="CSV, MAT, or recordings; one or several")
+    add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
     _page(parser)
@@ -125,9 +125,9 @@ def replay(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `replay`."""
     add = parser.add_argument
     add("recording", type=Path, nargs="+", metavar="FILE.mcap", help="recordings, or a folder of them")
-    add("--public-key", type=Path, metavar="FILE", help="Ed25519 public key, PEM, of their signatures")
-    add("--model", metavar="OTHER", help="no audit: what this model would have done; a model file, or quill")
-    add("--out", type=Path, metavar="CSV", help="with --model: both offsets, sample by sample")
+    add("--public-key", type=Path, metavar="FILE", help="Ed25519 public key (PEM) to check the signatures")
+    add("--model", metavar="OTHER", help="show what this model (a file, or quill) would have done, without an audit")
+    add("--out", type=Path, metavar="CSV", help="with --model: table of both offsets for every sample")
     _page(parser)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
@@ -137,7 +137,8 @@ def report(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     words = "recordings, a folder of them, or a folder with results of demo, identify or diagnose"
     add("what", type=Path, nargs="+", metavar="DIR_OR_FILE", help=words)
-    words = "the page: .html; .pdf or .png (its first figure) by an installed browser (default: NAME-report.html here)"
+    words = "the page: .html, or .pdf or .png (first figure only) printed by an installed browser "
+    words += "(default: NAME-report.html in the current folder)"
     add("--out", type=Path, metavar="FILE", help=words)
 
 
@@ -152,7 +153,7 @@ def back(parser: argparse.ArgumentParser) -> None:
     run(parser)
     add = parser.add_argument
     add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
-    words = "adopt it even where the recordings do not determine its state; its standard deviation is then larger"
+    words = "adopt the model even if the recordings do not determine its state; its standard deviation is then larger"
     add("--force", action="store_true", help=words)
     add("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the service's reply, s (60)")
 
@@ -172,35 +173,35 @@ resume = hold
 def zero(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `zero`."""
     hold(parser)
-    words = "rest: the machine is at rest; warm: it is not; auto (the default): the service decides"
+    words = "rest: the machine is at rest; warm: it is not; auto (the default): the service determines which"
     parser.add_argument("--mode", choices=("auto", "rest", "warm"), default="auto", help=words)
 
 
 def router(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `router`."""
     add = parser.add_argument
-    add("--config", required=True, type=Path, metavar="FILE", help="Zenoh's own configuration, as for zenohd")
-    add("--check", action="store_true", help="check the configuration, open nothing")
-    words = "let Zenoh log to stdout; warn shows why a link is refused"
+    add("--config", required=True, type=Path, metavar="FILE", help="Zenoh configuration, as for zenohd")
+    add("--check", action="store_true", help="check the configuration without opening a port")
+    words = "write Zenoh's log to stdout; warn shows why a link is refused"
     add("--log", choices=("error", "warn", "info", "debug"), help=words)
 
 
 def watch(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `watch`."""
     add = parser.add_argument
-    words = "watch the service of this configuration, with its last day from its recordings"
+    words = "watch the service of this configuration, including the last day from its recordings"
     add("--config", metavar="FILE", help=words)
-    words = "listen at this endpoint, such as tcp/127.0.0.1:7447; may be repeated, the first that answers is used"
+    words = "connect to this endpoint, such as tcp/127.0.0.1:7447; may be repeated, the first that answers is used"
     add("--connect", action="append", default=[], metavar="ENDPOINT", help=words)
     words = "Zenoh configuration with a receiver's or operator's certificate, such as receiver.json5; needed over TLS"
     add("--zenoh", type=Path, metavar="FILE", help=words)
-    words = "watch this machine, or all below (default: that of the configuration, else everything)"
+    words = "watch this machine, or all machines below this prefix (default: that of the configuration, or everything)"
     add("--prefix", help=words)
-    add("--once", action="store_true", help="look once and end, as --json does")
+    add("--once", action="store_true", help="show the state once and exit, as --json does")
     add("--wait", type=float, default=0.0, metavar="S", help="with --once: how long to listen, s (0)")
-    add("--page", action="store_true", help="serve a live page on 127.0.0.1 instead of drawing in the terminal")
-    add("--port", type=int, default=8710, help="port of the page (8710; 0: any free one)")
-    words = "record everything that arrives, of all machines, as MCAP in this folder"
+    add("--page", action="store_true", help="serve a live page on 127.0.0.1 instead of the terminal view")
+    add("--port", type=int, default=8710, help="port of the page (8710; 0: any free port)")
+    words = "record all messages of all machines as MCAP in this folder"
     add("--record", type=Path, metavar="FOLDER", help=words)
     add("--foxglove", action="store_true", help="serve Foxglove on 127.0.0.1 (needs the extra foxglove)")
     add("--foxglove-port", type=int, default=8765, metavar="PORT", help="port for Foxglove (8765)")

@@ -1,4 +1,4 @@
-"""`compensator bridge`: the offset to a control that speaks OPC UA, until SIGTERM or SIGINT."""
+"""`compensator bridge`: write the offset to a control over OPC UA, until SIGTERM or SIGINT."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def run(arguments: argparse.Namespace) -> Answer | None:
     settings, opcua = load_bridge(arguments.config)
     if arguments.check:
         text = (
-            f"{arguments.config}: good. {settings.machine} to {opcua.endpoint}, {opcua.offset_node} in {opcua.unit}, "
+            f"{arguments.config}: valid. {settings.machine} to {opcua.endpoint}, {opcua.offset_node} in {opcua.unit}, "
             f"sign {opcua.sign:+d} ({opcua.sign_checked}). Nothing was opened."
         )
         return Answer({"ok": True, "machine": settings.machine, "endpoint": opcua.endpoint, "sign": opcua.sign}, text)

@@ -1,4 +1,4 @@
-"""`compensator check`: validates a configuration and opens nothing."""
+"""`compensator check`: validate a configuration without opening devices or connections."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     log_warnings(arguments.config, warnings)
     machine, devices = config.machine.name, setup.fleet.devices
     text = (
-        f"{arguments.config}: good. Machine {machine}, model {model.name} ({model.kind}), "
+        f"{arguments.config}: valid. Machine {machine}, model {model.name} ({model.kind}), "
         f"{len(devices)} device(s), {len(config.channel)} channel(s). Nothing was opened.\n"
         f"plausibility: {checks}"
     )

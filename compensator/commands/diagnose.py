@@ -1,4 +1,4 @@
-"""`compensator diagnose`: from a model and measured data to what the model lacks."""
+"""`compensator diagnose`: find what a model lacks, from measured data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`compensator explain`: what a state, reason or warning means, and what to do."""
+"""`compensator explain`: the meaning and action of a state, reason or warning."""
 
 from __future__ import annotations
 
@@ -21,6 +21,6 @@ def run(arguments: argparse.Namespace) -> Answer:
     words = known.get(code.partition(":")[0])
     if words is None:
         near = difflib.get_close_matches(code, known, n=3)
-        meant = f"did you mean {', '.join(near)}?" if near else "no code is similar;"
+        meant = f"did you mean {', '.join(near)}?" if near else "no similar code;"
         raise UsageError(f"{arguments.code}: unknown code, {meant} `compensator explain` lists all codes")
     return Answer({"code": code, "means": words[0], "do": words[1]}, f"{words[0]}\n{words[1]}")

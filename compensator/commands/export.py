@@ -1,4 +1,4 @@
-"""`compensator export`: recordings as a table."""
+"""`compensator export`: write recordings as a table."""
 
 from __future__ import annotations
 

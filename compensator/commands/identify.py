@@ -1,4 +1,4 @@
-"""`compensator identify`: from measured runs to a model file and its page."""
+"""`compensator identify`: fit a model to measured runs; write the model file and its page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     given = arguments
     if str(given.out) in BUILT_IN:
-        raise UsageError(f"--out {given.out}: is the name of the published model, expected one that ends in .toml")
+        raise UsageError(f"--out {given.out}: is the name of the published model, expected a name that ends in .toml")
     checked_file(given.out, "--out", read=(*given.data, *given.etve, *given.validate), ending=".toml")
     page = checked_page(given.page)
     with progress_bar("fitting") as progress:

@@ -26,7 +26,7 @@ def hold(arguments: argparse.Namespace) -> Answer:
 
 
 def resume(arguments: argparse.Namespace) -> Answer:
-    """Let the offset follow again."""
+    """Let the offset follow the model again."""
     return _order(CommandName.RESUME, {}, arguments)
 
 
@@ -44,22 +44,24 @@ def _order(name: str, payload: dict[str, Any], arguments: argparse.Namespace) ->
     if arguments.config is not None:
         settings = load_config(arguments.config).config.zenoh
     elif operator is None:
-        raise UsageError("--zenoh: missing with --prefix, expected a Zenoh configuration such as operator.json5")
+        raise UsageError("--zenoh: required with --prefix, expected a Zenoh configuration such as operator.json5")
     else:
         try:
             settings = msgspec.convert({"prefix": arguments.prefix}, Zenoh)
         except msgspec.ValidationError as error:
-            raise UsageError(f"--prefix {arguments.prefix!r}: expected words between single slashes") from error
+            raise UsageError(
+                f"--prefix {arguments.prefix!r}: expected names between single slashes, such as shop/vmc-07"
+            ) from error
     return answered(ask(settings, name, json.dumps(payload).encode(), timeout_s=arguments.timeout, operator=operator))
 
 
 def operator_of(arguments: argparse.Namespace) -> Operator | None:
-    """Return the operator of `--zenoh`, None without it."""
+    """Return the operator of `--zenoh`; None without it."""
     return operator_of_file(arguments.zenoh) if arguments.zenoh is not None else None
 
 
 def answered(reply: dict[str, Any], **more: Any) -> Answer:
-    """Return the service's reply, with more for `--json`; raise what it refuses."""
+    """Return the service's reply, with more for `--json`; raise an error if it refused."""
     if not reply.get("ok"):
-        raise ServiceError(f"the service refuses: {reply.get('text', 'no reason given')}")
+        raise ServiceError(f"the service refused: {reply.get('text', 'no reason given')}")
     return Answer({**reply, **more}, str(reply.get("text", "")))

@@ -1,6 +1,6 @@
-"""Paths of results, checked before any work: minutes of fitting must not end in a mistyped name.
+"""Paths of results, checked before any computation, so that a mistyped name costs no computing time.
 
-Files that are read are never overwritten: a recording is evidence, and a measured table cannot be made again.
+Input files are never overwritten: a recording is evidence, and a measured table cannot be reproduced.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from compensator.errors import UsageError
 
-#: Endings that are probably mistakes.
+#: Suffixes that are probably mistakes.
 _ENDINGS = {".csv", ".html", ".json", ".mcap", ".pdf", ".png", ".toml", ".xlsx"}
 
 
@@ -37,7 +37,9 @@ def checked_file(path: Path, option: str, *, read: Iterable[Path] = (), ending: 
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder, expected the name of a file in it")
     if path.resolve() in {one.resolve() for one in read}:
-        raise UsageError(f"{option} {path}: is read by this command and would be written over, expected another name")
+        raise UsageError(
+            f"{option} {path}: is an input of this command and would be overwritten, expected another name"
+        )
     if path.suffix.lower() in _ENDINGS - {ending}:
         raise UsageError(f"{option} {path}: expected a name that ends in {ending}")
     _check_parent(path, option)
@@ -66,7 +68,7 @@ def checked_folder(path: Path, option: str, *, read: Iterable[Path] = (), names:
     files = [one.resolve() for one in read]
     for name in names:
         if (path / name).resolve() in files:
-            raise UsageError(f"{option} {path}: its {name} is read by this command, expected another folder")
+            raise UsageError(f"{option} {path}: its {name} is an input of this command, expected another folder")
     _check_parent(path / "file", option)
     return path
 

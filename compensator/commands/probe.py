@@ -1,4 +1,4 @@
-"""`compensator probe`: one reading of every device."""
+"""`compensator probe`: read every device once."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def progress_bar(words: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on a terminal; yield what reports its progress: steps done, of how many."""
+    """Show a bar on a terminal; yield a function that takes the number of steps done and their total."""
     from rich.console import Console
     from rich.progress import Progress
 

@@ -1,4 +1,4 @@
-"""`compensator replay`: the audit of recordings, and what another model would have done."""
+"""`compensator replay`: audit recordings, or compute what another model would have done."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     paths, page = recordings_in(arguments.recording), checked_page(arguments.page)
     if arguments.model is not None:
         if arguments.public_key is not None:
-            raise UsageError("--public-key: belongs to the audit, which --model does not make")
+            raise UsageError("--public-key: is for the audit, which is not made with --model")
         if arguments.out is not None:
             checked_file(arguments.out, "--out", read=(*paths, Path(arguments.model)), ending=".csv")
         return _compare(paths, arguments.model, arguments.out, page)
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> Answer:
         raise UsageError("--out: is for --model, which is not given")
     public_key = arguments.public_key
     if arguments.scheduler is not None:
-        # The workers look for the same files, from other folders.
+        # Workers may run in other folders, so paths must be absolute.
         paths, public_key = [path.resolve() for path in paths], public_key and public_key.resolve()
     worth = len(paths) if sum(path.stat().st_size for path in paths if path.exists()) > ALONE else 1
     with progress_bar("auditing") as progress, workers(worth, arguments.scheduler) as executor:

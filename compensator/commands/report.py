@@ -1,4 +1,4 @@
-"""`compensator report`: a page of recordings, or an overview of a folder of results."""
+"""`compensator report`: make a page from recordings, or an overview of a folder of results."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _results(folder: Path, out: Path) -> Answer:
 
     pages = [page for page in pages_in(folder) if page.path.resolve() != out.resolve()]
     if not pages:
-        raise UsageError(f"{folder}: neither recordings (*.mcap) nor pages (report.html)")
+        raise UsageError(f"{folder}: contains neither recordings (*.mcap) nor pages (report.html)")
     write(out, overview(folder, pages, relative_to=out.parent))
     result = {
         "report": str(out),
@@ -51,6 +51,6 @@ def _results(folder: Path, out: Path) -> Answer:
 
 
 def _name(path: Path) -> str:
-    """Return the name for the page: of the file, or of the folder."""
+    """Return the name for the page, from the file or the folder."""
     whole = path.resolve()
     return whole.stem if whole.suffix == ".mcap" else whole.name or "all"

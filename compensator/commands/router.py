@@ -1,4 +1,4 @@
-"""`compensator router`: a Zenoh router in this process, until SIGTERM or SIGINT."""
+"""`compensator router`: run a Zenoh router in this process, until SIGTERM or SIGINT."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> Answer | None:
     endpoints = get(config, "listen/endpoints")
     if arguments.check:
         secured = bool(get(config, "access_control/enabled"))
-        text = f"{path}: good. Listens on {', '.join(endpoints)}, access list {'on' if secured else 'OFF'}."
+        text = f"{path}: valid. Listens on {', '.join(endpoints)}, access list {'on' if secured else 'off'}."
         return Answer({"ok": True, "listen": endpoints, "access_control": secured}, text + " Nothing was opened.")
     if arguments.log is not None:
         zenoh.init_log_from_env_or(arguments.log)
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> Answer | None:
 
 
 def checked(path: Path, file: ConfigFile) -> zenoh.Config:
-    """Refuse what Zenoh would accept silently and ignore; check the TLS files.
+    """Refuse settings that Zenoh would silently ignore; check the TLS files.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def checked(path: Path, file: ConfigFile) -> zenoh.Config:
     if not isinstance(endpoints, list) or not endpoints:
         raise ConfigError(f'{path}: listen/endpoints: missing, expected a list, such as ["tls/0.0.0.0:7447"]')
     if get(config, "plugins"):
-        raise ConfigError(f"{path}: plugins: this router runs none, expected them in a zenohd only")
+        raise ConfigError(f"{path}: plugins: not supported by this router, expected none (zenohd supports them)")
     for name in ("multicast", "gossip"):  # on by default, which opens more than the listed endpoints
         if get(config, f"scouting/{name}/enabled") is None:
             set_key(config, f"scouting/{name}/enabled", False)
@@ -75,14 +75,14 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
     enabled = access.get("enabled")
     if not enabled:
         if access.get("rules") or access.get("policies"):
-            raise ConfigError(f"{path}: access_control/enabled: expected true with rules; without it none applies")
-        figures = "No access list: whoever connects may publish and command everything."
+            raise ConfigError(f"{path}: access_control/enabled: expected true, otherwise the rules have no effect")
+        figures = "No access list: every client may publish messages and send commands for every machine."
         log_warnings(path, [Remark(ServiceWarning.NO_ACCESS_LIST, figures)])
         return
     if access.get("default_permission") != "deny":
         raise ConfigError(
             f"{path}: access_control/default_permission = {access.get('default_permission')!r}, expected "
-            f"deny: a single missing rule would open everything"
+            "deny; with another default, a missing rule would permit access"
         )
     named = any(subject.get("cert_common_names") for subject in access.get("subjects") or [])
     if not named:
@@ -111,8 +111,8 @@ async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None
 
 
 def _log_link(event: Any) -> None:
-    """Log who connects and disconnects."""
+    """Log connections and disconnections."""
     link = event.link
     connected = event.kind == zenoh.SampleKind.PUT
     who = link.auth_identifier or "a participant without a certificate"
-    log.info("router: %s (%s, %s) %s", who, link.dst, link.zid, "is connected" if connected else "is gone")
+    log.info("router: %s (%s, %s) %s", who, link.dst, link.zid, "connected" if connected else "disconnected")

@@ -1,4 +1,4 @@
-"""`compensator run`: the service in the foreground, as a person or a service manager starts it."""
+"""`compensator run`: run the service in the foreground, started by a user or a service manager."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _LEVELS = {State.OK: logging.INFO, State.STARTING: logging.INFO, State.FAULT: lo
 
 
 class Reporter:
-    """Reports what the service does: to its manager in one line, to the log with fields.
+    """Reports the service's activity to the service manager (one line) and to the log (with fields).
 
     Parameters
     ----------
     manager : ServiceManager
-        Started the service.
+        The service manager that started the service.
     """
 
     def __init__(self, manager: ServiceManager) -> None:
@@ -42,10 +42,10 @@ class Reporter:
         self._state: str = State.STARTING
 
     def report_poll(self) -> None:
-        """Report a complete poll, the only thing that counts as a sign of life.
+        """Report a complete poll; only this feeds the watchdog.
 
-        A silent sensor, a late disk, or an internal error with the offset held is no standstill: the published offset
-        shows it, and a restart would not help.
+        A silent sensor, a slow disk, or an internal error with the offset held does not trigger the watchdog: the
+        published offset shows it, and a restart would not help.
         """
         if not self._polled:
             self._polled = True
@@ -93,7 +93,7 @@ def status(offset: Offset) -> str:
     Parameters
     ----------
     offset : Offset
-        What was published.
+        The published offset.
     """
     state = offset.state + (f" ({', '.join(offset.reasons)})" if offset.reasons else "")
     if offset.y_offset_um is None:
@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> None:
     CompensatorError
         If the configuration cannot be used, or the service cannot start.
     """
-    # The watchdog ends the service by SIGABRT; then the log shows the line at which each thread was.
+    # The watchdog ends the service by SIGABRT; the log then shows the current line of each thread.
     faulthandler.enable()
     if systemd.is_connected(os.environ, sys.stderr.fileno()):
         logging.basicConfig(handlers=[systemd.JournalHandler()], level=logging.INFO, format="%(message)s", force=True)
@@ -123,7 +123,7 @@ def run(arguments: argparse.Namespace) -> None:
 async def _serve(path: str, manager: ServiceManager) -> None:
     loop = asyncio.get_running_loop()
     reporter = Reporter(manager)
-    manager.status("starting: reads the last recording")
+    manager.status("starting: reading the last recording")
     setup = load(path)
 
     def ready(daemon: Daemon) -> None:
@@ -134,7 +134,7 @@ async def _serve(path: str, manager: ServiceManager) -> None:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, stop)
         manager.watch(setup.config.sampling.poll_interval_s)
-        manager.status("starting: waits for the first poll")
+        manager.status("starting: waiting for the first poll")
         log.info("compensator: running")
 
     await run_service(setup, on_ready=ready, on_poll=reporter.report_poll, on_publish=reporter.report_message)

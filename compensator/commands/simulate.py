@@ -1,4 +1,4 @@
-"""`compensator simulate`: a model over measured data."""
+"""`compensator simulate`: run a model over measured data."""
 
 from __future__ import annotations
 

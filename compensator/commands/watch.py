@@ -1,4 +1,4 @@
-"""`compensator watch`: live view of machines in the terminal, as a page or in Foxglove, and recorder of a shop."""
+"""`compensator watch`: show machines live in the terminal, on a page or in Foxglove; record a shop."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from compensator.watch.terminal import line, view
 
 log = logging.getLogger("compensator")
 
-#: Time between two updates of the view, s: ages grow also without messages.
+#: Time between two updates of the view, s; ages increase even without messages.
 REFRESH_S = 1.0
 
 
@@ -83,7 +83,7 @@ def _source(arguments: argparse.Namespace, loaded: LoadedConfig | None) -> Sourc
     if prefix is not None and not re.fullmatch(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*", prefix):
         raise UsageError(f"--prefix {prefix!r}: expected names between single slashes, such as shop/vmc-07")
     if arguments.connect and arguments.zenoh:
-        raise UsageError("--connect: not together with --zenoh, whose file has the endpoints")
+        raise UsageError("--connect: cannot be combined with --zenoh, whose file contains the endpoints")
     if prefix is None:
         prefix = loaded.config.zenoh.prefix if loaded is not None else ""
     if arguments.zenoh:
@@ -97,7 +97,7 @@ def _source(arguments: argparse.Namespace, loaded: LoadedConfig | None) -> Sourc
 
 
 def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
-    """Query the latest messages once, and listen for the time of --wait."""
+    """Query the latest messages once, and listen for the duration of --wait."""
     with Listener(source, shop) as listener:
         listener.open()
         listener.query()
@@ -106,7 +106,7 @@ def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
                 stopped.wait(arguments.wait)
         if not shop.overview() and not arguments.json:
             there = listener.elsewhere()
-            known = f"alive there: {', '.join(there)}" if there else "no service is alive there"
+            known = f"services there: {', '.join(there)}" if there else "no service is running there"
             raise ServiceError(f"no messages below {source.prefix or 'any prefix'} at {source.where}; {known}")
         console = Console(file=sys.stdout)
         with console.capture() as captured:
@@ -138,7 +138,7 @@ class _Watch:
         self._connected = False
 
     def connection(self, connected: bool) -> None:
-        """Follow the connection."""
+        """Update the state of the connection."""
         if connected != self._connected:
             log.info("compensator: %s %s", "connected to" if connected else "no connection to", self._source.where)
         self._connected = connected
@@ -171,7 +171,7 @@ class _Watch:
 
     def _draw(self) -> None:
         console = Console()
-        # Log lines would disturb the screen; the view shows the connection itself.
+        # Log lines would disturb the screen; the view shows the state of the connection.
         log.setLevel(logging.WARNING)
         with Live(console=console, screen=True, auto_refresh=False) as live:
             while True:

@@ -1,4 +1,4 @@
-"""Workers of a large command: this process, one process for each core, or a Dask cluster."""
+"""Workers of a long-running command: this process, one process for each core, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ SCHEDULER_S = 10.0
 
 @contextmanager
 def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
-    """Yield an executor, None where this process does the work.
+    """Yield an executor; None if the work is done in this process.
 
     Parameters
     ----------
     jobs : int
-        Number of jobs that can run in parallel; at most 1 where a process is not worth its start.
+        Number of jobs that can run in parallel; 1 or less if starting processes would take longer.
     scheduler : str or None
-        Address of a Dask scheduler, such as `tcp://127.0.0.1:8786`. Workers get the paths of files, not
+        Address of a Dask scheduler, such as `tcp://127.0.0.1:8786`. Workers receive the paths of files, not
         their content.
 
     Raises
@@ -32,7 +32,7 @@ def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
     ServiceError
         If the scheduler does not answer, or its workers are missing or of another version.
     UsageError
-        If Dask is not installed, or the address is none.
+        If Dask is not installed, or the address is invalid.
     """
     if scheduler is not None:
         with _cluster(scheduler) as executor:
@@ -42,7 +42,7 @@ def workers(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
     if count < 2:
         yield None
         return
-    # A fresh interpreter for each: threads of this one are not copied.
+    # Each worker is a new interpreter: threads of this one are not copied.
     with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             yield pool
@@ -62,7 +62,7 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
     except ValueError as error:
         raise UsageError(f"--scheduler {scheduler}: {error}, expected an address such as tcp://host:8786") from error
     except OSError as error:
-        raise ServiceError(f"--scheduler {scheduler}: no scheduler answers there") from error
+        raise ServiceError(f"--scheduler {scheduler}: no scheduler answered") from error
     with client:
         found = client.run(_version)
         if not found:
@@ -79,5 +79,5 @@ def _version() -> str:
     try:
         from compensator import __version__ as version
     except ImportError:
-        return "none of this program"
+        return "no compensator"
     return version

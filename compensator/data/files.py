@@ -59,7 +59,8 @@ def read_csv(path: Path, data: bytes, roles: Mapping[str, str]) -> Table:
     except csv.Error as error:
         raise DataError(f"{path}: not a CSV table: {error}") from error
     if len(lines) < 2:
-        raise DataError(f"{path}: {len(lines)} row(s), expected a header and data")
+        found = "a header without data" if lines else "empty"
+        raise DataError(f"{path}: {found}, expected a header and data")
     header = _header(path, lines[0], roles)
     rows = [(row, cells) for row, cells in enumerate(lines[1:], start=2) if cells]
     for row, cells in rows:

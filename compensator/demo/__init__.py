@@ -1,1 +1,1 @@
-"""The product on simulated hardware: days that take seconds, the closed loop, and a machine in real time."""
+"""The demo: the service on simulated hardware for days that take seconds, the closed loop, a machine in real time."""

@@ -12,12 +12,12 @@ from compensator.clock import NS, Clock, SystemClock
 class LateClock:
     """A clock that starts in the past, jumps until it has caught up with another clock, and then follows that.
 
-    Like `VirtualClock` it serves one sleeping task.
+    Like `VirtualClock`, it supports one sleeping task.
 
     Parameters
     ----------
     behind_s : float
-        How far in the past it starts, s.
+        Time before the present at which it starts, s.
     on_advance : callable
         Awaited with the seconds since the start whenever the time has moved.
     on_time : callable
@@ -35,7 +35,7 @@ class LateClock:
     ) -> None:
         self._wall: Clock = wall or SystemClock()
         self._start_ns = self._now_ns = self._wall.monotonic_ns() - round(behind_s * NS)
-        # Constant, so that time does not advance while work is done.
+        # Constant, so that time does not advance during computations.
         self._utc_ns = self._wall.utc_ns() - self._wall.monotonic_ns()
         self._late = behind_s > 0
         self._on_advance = on_advance
@@ -51,7 +51,7 @@ class LateClock:
         return (self._now_ns if self._late else self._wall.monotonic_ns()) - self._start_ns
 
     def wake(self) -> None:
-        """End the sleep, and every later one at once, to stop."""
+        """End the current sleep and every later one at once, to stop."""
         self._woken.set()
 
     async def sleep(self, seconds: float) -> None:
@@ -74,6 +74,6 @@ class LateClock:
         await self._on_advance(self.monotonic_ns() / NS)
 
     async def settle(self, tasks: Collection[asyncio.Future[Any]], timeout_s: float) -> None:
-        """Wait until the tasks are done, in real time no longer than `timeout_s`."""
+        """Wait until the tasks are done, for at most `timeout_s` of real time."""
         if tasks:
             await asyncio.wait(tasks, timeout=None if self._late else timeout_s)

@@ -48,7 +48,7 @@ def _warnings_only() -> Iterator[None]:
 def _run(arguments: argparse.Namespace) -> Answer:
     if arguments.live:
         recordings = run_live(arguments.out, hours=arguments.hours, seed=arguments.seed, port=arguments.port)
-        text = f"stopped; for the recordings: compensator replay {recordings}, compensator report {recordings}"
+        text = f"stopped; to check the recordings: compensator replay {recordings}, compensator report {recordings}"
         return Answer({"recordings": str(recordings)}, text)
     also = checked_page(arguments.page)
     return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed, also=also))

@@ -39,7 +39,7 @@ from sim_hardware.physics.effects.base import UndeclaredEffect
 
 #: 2026-01-05 06:00 UTC, a Monday's early shift.
 START_NS = 1_767_592_800 * NS
-#: When the service of the second day is sent the extended model, and how long each poll then waits for it, s.
+#: Time at which the service of the second day is sent the extended model, and how long each poll then waits for it, s.
 ADOPT_AFTER_S, ADOPT_PATIENCE_S = 3600.0, 0.02
 
 
@@ -105,7 +105,7 @@ def run_day(
     duty = Duty.working_day(seed, hours=hours + 0.1)
     world = World(MACHINES[machine](effects=effects), duty, usual_sensors(duty.extra_names), seed)
     folder.mkdir(parents=True, exist_ok=True)
-    # Without the recordings of an earlier demo, which the service would continue.
+    # Remove the recordings of an earlier demo, which the service would continue.
     shutil.rmtree(folder / "recordings", ignore_errors=True)
     began = time.perf_counter()
     with hardware(world) as devices:
@@ -122,7 +122,7 @@ def run_day(
                 if not asked:
                     asked.append(asyncio.ensure_future(asyncio.to_thread(_ask_to_adopt, config, adopt)))
                 if not asked[0].done():
-                    # Simulated time waits a little for a command that takes real time.
+                    # Simulated time pauses briefly for a command that takes real time.
                     await asyncio.sleep(ADOPT_PATIENCE_S)
 
         outcomes: list[Outcome] = []
@@ -168,7 +168,7 @@ async def _serve(
     received: list[Offset],
     port: int,
 ) -> None:
-    """Run the service with a subscriber in a Zenoh session of its own."""
+    """Run the service with a subscriber in a separate Zenoh session."""
     subscriber: Any = None
     ready = asyncio.Event()
 

@@ -1,7 +1,7 @@
 """A simulated machine for trials: a recorded day, then the real service in real time.
 
-Devices with their protocols, the service on loopback and growing recordings behave as at a real machine. Typed
-commands break its sensors.
+Devices with their protocols, the service on loopback and the recordings behave as on a real machine. Typed commands
+inject sensor faults.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from sim_hardware.wire import Faults
 Breakable = Mapping[str, tuple[Faults, int]]
 
 MACHINE, PREFIX = "vmc-07", "shop/vmc-07"
-#: Length of the duty cycle after the history, h; then its last inputs remain.
+#: Length of the duty cycle after the history, h; after that its last inputs remain.
 AFTER_H = 7 * 24.0
-#: Plausibility checks, which notice the undeclared effect of this machine.
+#: Plausibility checks, which detect the undeclared effect of this machine.
 CHECKS = """
 [plausibility]
 t_q_below_at_after_min = 15.0
@@ -74,7 +74,7 @@ def run_live(out: Path, *, hours: float, seed: int, port: int, typed: IO[str] | 
     UsageError
         If the length is negative.
     ServiceError
-        If such a machine runs already, or the port is in use.
+        If such a machine is already running, or the port is in use.
     """
     if hours < 0:
         raise UsageError(f"--hours {hours:g}: expected 0 or more")
@@ -137,34 +137,34 @@ async def _serve(
 
 def _explain(out: Path, config: Path, port: int) -> None:
     sys.stderr.write(f"""
-{MACHINE} is running with its past on record, and publishes an offset every minute. In another terminal:
+{MACHINE} is running with a recorded history, and publishes an offset every minute. In another terminal:
   compensator watch --config {config}              with --page: a live page
-  python deploy/examples/subscriber.py tcp/127.0.0.1:{port} {PREFIX}              a line each minute
+  python deploy/examples/subscriber.py tcp/127.0.0.1:{port} {PREFIX}              one line per minute
   compensator hold --config {config}               and: resume, zero
-An effect acts in it that its model lacks. To find it and extend the model:
+The machine has an effect that its model lacks. To find it and extend the model:
   compensator diagnose {config.parent}/recordings/*.mcap --model {out}/conduction/calibration/model.toml --out diagnosis
   compensator adopt diagnosis/model.toml --config {config}              and back
 Type here:  break t_q | at | y    wire broken            freeze …    value frozen
             unplug t_q | at | y   device disconnected    mend        repair all
-Ctrl-C ends it.
+Ctrl-C ends the demo.
 """)
     sys.stderr.flush()
 
 
 def _read_commands(typed: IO[str], faults: Breakable) -> None:
-    """Carry out typed commands until the end of the input."""
+    """Execute typed commands until the end of the input."""
     for line in typed:
         sys.stderr.write(apply_fault(line, faults) + "\n")
         sys.stderr.flush()
 
 
 def apply_fault(line: str, breakable: Breakable) -> str:
-    """Break a sensor or repair all by a typed command; return what was done.
+    """Inject a sensor fault or repair all sensors by a typed command; return what was done.
 
     Parameters
     ----------
     line : str
-        Such as `break t_q`.
+        Command, such as `break t_q`.
     breakable : mapping of str to (Faults, int)
         The sensors, as in `Hardware`.
     """

@@ -24,7 +24,7 @@ EFFECT_UM = 5.0
 def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], dict[str, tuple[Vector, Vector]]]:
     """Run a day with an undeclared effect, diagnose its recordings, and run a second day with the extended model.
 
-    The effect is drawn by the seed and sealed: nothing here knows it until the results are written.
+    The effect is drawn by the seed and not disclosed before the results are written.
 
     Parameters
     ----------

@@ -263,8 +263,7 @@ def _late_error_um(model: ThermalModel, runs: Sequence[Run], signals: Sequence[R
     late = next((effect for effect in model.effects if effect.lateness is not None), None)
     if late is None:
         return 0.0
-    prompt = dataclasses.replace(model, effects=tuple(effect for effect in model.effects if effect is not late))
-    errors = []
+    prompt, errors = model.with_prompt_t_q(), []
     for run, own in zip(runs, signals, strict=True):
         seen = signals_of(prompt, run)
         errors.append(own.y_dtf_um - seen.y_dtf_um - late.columns(seen, ())[:, 0])

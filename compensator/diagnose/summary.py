@@ -1,4 +1,4 @@
-"""A diagnosis in figures, tables and words: for `diagnosis.json`, terminal, notebook and page."""
+"""A diagnosis as figures, tables and text for `diagnosis.json`, terminal, notebook and page."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from compensator.display import Table, Words, warnings_of, with_std
 from compensator.model.simulation import SCORE_HEAD, Scores
 
 _VERDICTS = {
-    "adequate": "The model is adequate: the residual is noise.",
-    "explained": "What the model lacks is found; the residual with it is noise.",
-    "partly_explained": "Part of what the model lacks is found; something is left.",
-    "unexplained": "Something acts that the model lacks and that no channel shows.",
+    "adequate": "The model is adequate: the residual is within the noise and the model's own error.",
+    "explained": "The missing effects were found; what remains is within the noise and the model's own error.",
+    "partly_explained": "Some of the missing effects were found; part of the residual remains unexplained.",
+    "unexplained": "The model lacks an effect that no channel shows.",
 }
-#: The same where what was found makes held-out data worse.
+#: The verdict if the effects found increase the error on held-out data.
 _DOES_NOT_HOLD = (
-    "Something acts that the model lacks; what fits it best here does not hold on held-out data, so the model was left "
-    "as it was."
+    "The model lacks an effect; the best explanation found increases the error on held-out data, so the model was "
+    "left unchanged."
 )
 
 #: Parameters of an effect that are shown unfolded.
@@ -41,12 +41,12 @@ _UNITS = {
     "bar": "bar",
 }
 
-#: What `diagnosis.json` says of an effect, after its place.
+#: Keys of an effect in `diagnosis.json`, after its place.
 _FIGURES = ("parameters", "deployable", "explanation", "rms_before_um", "rms_after_um")
 
 
 def figures(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the diagnosis as `diagnosis.json` holds it."""
+    """Return the content of `diagnosis.json`."""
     return {
         "verdict": diagnosis.verdict,
         "effects": [
@@ -95,7 +95,7 @@ def verdict(found: Mapping[str, Any]) -> str:
     Parameters
     ----------
     found : mapping
-        As :func:`figures`, or read from `diagnosis.json`.
+        Result of :func:`figures`, or content of `diagnosis.json`.
     """
     words = _VERDICTS[found["verdict"]]
     if ModelWarning.MADE_WORSE in found["warning_codes"]:
@@ -104,13 +104,13 @@ def verdict(found: Mapping[str, Any]) -> str:
     if not found["effects"]:
         return f"{words} Residual {before:.2f} µm rms, sensor noise {noise:.2f}."
     return (
-        f"{words} {_names(found['effects'])}. On held-out data the residual goes from {before:.2f} to {after:.2f} µm "
-        f"rms (sensor noise {noise:.2f})."
+        f"{words} {_names(found['effects'])}. On held-out data the residual was {before:.2f} µm rms without and is "
+        f"{after:.2f} µm rms with them (sensor noise {noise:.2f})."
     )
 
 
 def _names(effects: Sequence[Mapping[str, Any]]) -> str:
-    """Return kinds and places of all effects, those of one kind together."""
+    """Return kinds and places of all effects, grouped by kind."""
     places: dict[str, list[str]] = {}
     for effect in effects:
         place = " ".join(filter(None, (effect["path"], effect["channel"])))
@@ -124,7 +124,7 @@ def name(effect: FoundEffect) -> str:
 
 
 def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | Table | Words]:
-    """Yield what terminal and notebook show: the verdict, tables, explanations, warnings and remarks."""
+    """Yield the content for terminal and notebook: verdict, tables, explanations, warnings and remarks."""
     yield verdict(figures(diagnosis))
     yield error_table(diagnosis)
     for i, effect in enumerate(diagnosis.effects, start=1):
@@ -133,13 +133,13 @@ def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | 
         if effect.rivals:
             yield rivals(effect)
     if beyond := beyond_effects(diagnosis):
-        yield Words(title="Beyond the named effects", lines=beyond)
+        yield Words(title="Remainder and ceiling", lines=beyond)
     yield from warnings_of(diagnosis.warnings)
     yield from warnings_of(remarks, "Remarks on the data")
 
 
 def error_table(diagnosis: Diagnosis) -> Table:
-    """Return the errors on held-out data, of the base model and the extended one."""
+    """Return the errors on held-out data of the base model and of the extended model."""
     return Table(
         title="Errors on held-out data",
         head=["", *SCORE_HEAD],
@@ -163,13 +163,13 @@ def parameter_table(effect: FoundEffect, *, title: str = "", count: int | None =
 
 
 def explanation(effect: FoundEffect) -> Words:
-    """Return what an effect means, and whether the model compensates it."""
-    deploy = "Deployed in the extended model." if effect.deployable else "Not deployable: not in the extended model."
+    """Return the explanation of an effect, and whether the model compensates it."""
+    deploy = "Deployed in the extended model." if effect.deployable else "Not deployable, so not in the extended model."
     return Words(title="Explanation", lines=[effect.explanation, deploy])
 
 
 def rivals(effect: FoundEffect) -> Words:
-    """Return the other explanations of an effect, and how to tell them apart."""
+    """Return the rival explanations of an effect, and how to distinguish them."""
     lines = [f"{r.label}: {r.rms_after_um:.2f} µm rms remain. {r.how_to_tell_apart}" for r in effect.rivals]
     return Words(title="Rival explanations", lines=lines)
 
@@ -191,17 +191,18 @@ def in_words(key: str) -> str:
 
 
 def beyond_effects(diagnosis: Diagnosis) -> list[str]:
-    """Return what the channels explain beyond the named effects, one sentence or two for each figure."""
+    """Return remainder and ceiling (what the channels explain beyond the named effects) as sentences."""
     found = []
     if (remainder := diagnosis.remainder) is not None:
         deployed = "deployed in model.toml" if remainder.deployed else "not deployed"
         found.append(
-            f"Remainder: a regularised linear response of {', '.join(remainder.channels)}, {deployed}. It corrects and "
-            f"explains nothing: {remainder.rms_before_um:.2f} to {remainder.rms_after_um:.2f} µm rms on held-out data."
+            f"Remainder: a regularised linear response of {', '.join(remainder.channels)}, {deployed}. It reduces the "
+            f"error on held-out data from {remainder.rms_before_um:.2f} to {remainder.rms_after_um:.2f} µm rms, but "
+            "names no cause."
         )
     if (ceiling := diagnosis.ceiling) is not None:
         found.append(
-            f"The named effects explain {ceiling.explained_pct:.0f} % of what the channels can explain; the best "
-            f"linear use of all channels leaves {ceiling.rms_um:.2f} µm rms on held-out data."
+            f"Ceiling: the best linear use of all channels leaves {ceiling.rms_um:.2f} µm rms on held-out data; the "
+            f"named effects achieve {ceiling.explained_pct:.0f} % of that reduction."
         )
     return found

@@ -1,4 +1,4 @@
-"""ARX by least squares: starting values of the search, and what a usual tool would answer.
+"""ARX by least squares: starting values of the search, and a comparison with common tools.
 
     A(z) y = Σ_j B_j(z) u_j + e
 
@@ -71,7 +71,7 @@ def fit_arx(segments: Sequence[Segment], structure: Structure, *, period_s: floa
 
 
 def free_run_rms(segments: Sequence[Segment], structure: Structure, *, period_s: float) -> float:
-    """Return the rms of an ARX's free-run error without its mean; infinite where the ARX is unstable.
+    """Return the rms of an ARX's free-run error without its mean; infinite if the ARX is unstable.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def free_run_rms(segments: Sequence[Segment], structure: Structure, *, period_s:
 
 
 def starts(segments: Sequence[Segment], structure: Structure, *, period_s: float) -> list[list[float]]:
-    """Return time constants to start a search from, min: ARX's poles, and two spreads over the record's length.
+    """Return starting values of the time constants, min: ARX's poles, and two spreads over the record's length.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def starts(segments: Sequence[Segment], structure: Structure, *, period_s: float
     spread.append(list(np.geomspace(1.5 * period, max(longest / 2.0, 8.0 * period), n)) if n > 1 else [longest / 6.0])
     a = fit_arx(segments, structure, period_s=period_s)[0].a
     poles = np.roots(a) if np.isfinite(a).all() else np.zeros(0)
-    # Inverse of Tustin's rule; a pole that no relaxation has (negative, unstable) is replaced.
+    # Inverse of Tustin's rule; a pole that is not a relaxation (negative, unstable) is replaced.
     inside = [float(p.real) for p in poles if 0.05 < p.real < 0.9995]
     taus = sorted(period / 2.0 * (1.0 + p) / (1.0 - p) for p in inside)
     for tau in spread[0]:

@@ -21,9 +21,9 @@ from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import PATH_UNITS, Estimator, Kind, Path, ThermalModel
 from compensator.progress import Progress, unreported
 
-#: Least noise assumed for a temperature, K: about a converter's step.
+#: Minimum noise assumed for a temperature, K: about a converter's step.
 LEAST_NOISE_K = 0.005
-#: Least change of the ambient per sample that the estimator expects, K: doors are opened.
+#: Minimum change of the ambient temperature per sample assumed by the estimator, K, because doors are opened.
 LEAST_AT_WALK_K = 0.1
 #: Zero of a run that was not fitted: the mean of its first hour.
 ZERO_S = 3600.0
@@ -40,7 +40,7 @@ class Part:
     name : str
         File and part of it.
     role : {"fitted", "held out"}
-        Whether it took part in fitting or choosing.
+        Whether it was used for fitting or selection.
     t_s, y_um, y_pred_um : numpy.ndarray, shape (n,)
         Time, s; measured deformation and the engine's prediction from T_Q and AT (zeroed), µm.
     model, nothing, persistence : Scores
@@ -117,7 +117,7 @@ class Calibration:
 
     @property
     def paths(self) -> tuple[PathFit, ...]:
-        """TTF (where there is one), DTF, TDTF."""
+        """TTF (if there is one), DTF, TDTF."""
         first = (PathFit.of("TTF", self.temperature.fit),) if self.temperature else ()
         return (*first, self.deformation.dtf, self.deformation.tdtf)
 
@@ -177,7 +177,7 @@ def calibrate(
     name : str
         Name of the model.
     fit_until_s : float, optional
-        Only samples before this time take part; the rest is held out.
+        Only samples before this time are fitted; the rest is held out.
     etve, validation : sequence of Run
         Tests without heat source (methods II and III); runs for validation only.
     provenance : mapping, optional
@@ -185,7 +185,7 @@ def calibrate(
     remarks : sequence of str
         Corrections that were made while reading the data.
     progress : callable
-        Called with how many structures of how many are done.
+        Called with the number of structures done and their total.
 
     Returns
     -------
@@ -195,7 +195,7 @@ def calibrate(
     Raises
     ------
     DataError
-        If this data allows no model, with the reason.
+        If no model can be fitted to the data; the message states the reason.
     """
     kind = _kind(runs, settings)
     data = ", ".join(dict.fromkeys(run.name for run in runs)) or name
@@ -203,7 +203,7 @@ def calibrate(
     used = [_mask(run, fit_until_s) for run in runs]
     if sum(int(mask.sum()) for mask in used) * period_s < 7200.0:
         raise DataError(f"{data}: less than 2 h of samples left for the fit")
-    # A run that begins after the hours of the fit is held out as a whole.
+    # A run that starts after the hours of the fit is held out completely.
     later = [run for run, mask in zip(runs, used, strict=True) if not mask.any() and np.isfinite(run.y_um).any()]
     runs, used = [run for run, mask in zip(runs, used, strict=True) if mask.any()], [m for m in used if m.any()]
     temperature = None

@@ -1,8 +1,8 @@
-"""How many modes the data can support: free-run error on folds that took no part in the fit.
+"""Order selection: the number of modes, by the free-run error on held-out blocks.
 
-A fold is a block of time whose measured deformation is held out while the model is fitted to the others; the model
-runs through it, because its inputs are known. Chosen is the simplest structure whose held-out error exceeds the
-smallest by no more than one standard error. A structure whose amplitudes the data does not determine is no candidate.
+A fold is a block of time whose measured deformation is held out while the model is fitted to the other blocks; the
+model runs through it, because its inputs are known. The simplest structure is chosen whose held-out error exceeds the
+smallest by at most one standard error. Structures whose amplitudes the data do not determine are excluded.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def choose(
     folds : int
         Number of blocks.
     progress : callable
-        Called with how many structures of how many are done.
+        Called with the number of structures done and their total.
 
     Returns
     -------

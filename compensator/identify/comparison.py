@@ -23,7 +23,7 @@ class Row:
     path : str
         TTF, DTF or TDTF.
     figure : str
-        Which coefficient, gain or time constant, with its unit.
+        Name of the coefficient, gain or time constant, with its unit.
     found, std, reference : float
         Identified value, its standard error (NaN without a covariance), and the other model's value.
     """
@@ -51,7 +51,7 @@ def compare(found: ThermalModel, reference: ThermalModel) -> list[Row]:
     Returns
     -------
     list of Row
-        Gain at rest and time constants of each path that both have; coefficients where the orders are the same.
+        Gain at rest and time constants of each path that both models have; coefficients if the orders are equal.
     """
     rows: list[Row] = []
     for name in ("TTF", "DTF", "TDTF"):
@@ -70,7 +70,7 @@ class _Figure(NamedTuple):
     order: int = 0
 
     def label(self, unit: str) -> str:
-        """Return it in words, with its unit."""
+        """Return its name, with its unit."""
         if self.quantity == "gain":
             return f"gain at rest, {unit}"
         if self.quantity == "tau":

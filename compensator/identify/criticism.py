@@ -1,4 +1,4 @@
-"""Criticism of an identified model: responses of its paths, correlations of the residual, warnings."""
+"""Model criticism: responses of the paths, correlations of the residual, warnings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from compensator.identify.deformation import PathFit
 
 #: Lags of the correlations, samples.
 LAGS = 60
-#: Two-sided 99 % of a normal.
+#: Two-sided 99 % quantile of a normal distribution.
 NORMAL_99 = 2.576
 #: Points of a frequency response.
 FREQUENCIES = 200
@@ -69,18 +69,18 @@ class PathView:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualView:
-    """Correlations that are left in a residual.
+    """Correlations in a residual.
 
     Parameters
     ----------
     name : str
-        Of which fit.
+        Fit to which the residual belongs.
     autocorrelation : numpy.ndarray, shape (LAGS,)
         Lags 1 … LAGS.
     limit : float
         99 % limit of white noise.
     white_chance : float
-        Probability of as much autocorrelation in white noise (Ljung and Box).
+        Probability of at least this autocorrelation in white noise (Ljung and Box).
     cross : dict of str to (numpy.ndarray, float)
         Correlation with each input at lags −LAGS … LAGS and its 99 % limit, which allows for both autocorrelations.
     """
@@ -145,7 +145,7 @@ def view_residual(name: str, residuals: Sequence[Vector], inputs: dict[str, Sequ
     Parameters
     ----------
     name : str
-        Of which fit.
+        Fit to which the residual belongs.
     residuals : sequence of numpy.ndarray
         One for each run; NaN where y is missing.
     inputs : dict of str to sequence of numpy.ndarray
@@ -183,16 +183,16 @@ def _correlation(first: Sequence[Vector], second: Sequence[Vector]) -> Vector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Criticism:
-    """What an engineer has to know before signing a model.
+    """Diagnostics of a model for the engineer who approves it.
 
     Parameters
     ----------
     paths : tuple of PathView
         TTF (where there is one), DTF, TDTF.
     residuals : tuple of ResidualView
-        Of the TTF's and the DTF's fit.
+        Residuals of the TTF's and the DTF's fit.
     warnings : tuple of Remark
-        The gravest first.
+        The most serious first.
     """
 
     paths: tuple[PathView, ...]
@@ -257,7 +257,7 @@ class _Warnings:
                 return Remark(
                     ModelWarning.WORSE_THAN_NOTHING,
                     f"On {part.name} (held out) the model is worse than no compensation: {part.model.rms_um:.1f} "
-                    f"against {part.nothing.rms_um:.1f} µm rms.",
+                    f"instead of {part.nothing.rms_um:.1f} µm rms.",
                 )
         return None
 
@@ -285,7 +285,7 @@ class _Warnings:
         if longest * 60.0 < 3.0 * slowest:
             return Remark(
                 ModelWarning.SHORT_RECORD,
-                f"The longest record has {longest:.1f} h, the slowest time constant is {slowest / 60.0:.1f} h: the "
+                f"The longest record covers {longest:.1f} h, the slowest time constant is {slowest / 60.0:.1f} h: the "
                 "steady state is extrapolated.",
             )
         return None
@@ -297,7 +297,7 @@ class _Warnings:
         return Remark(
             ModelWarning.DRIFTING_MODE,
             f"The slowest mode is slower than the record ({main.longest_min / 60.0:.0f} h) and was limited to it: "
-            "a drift is left that the inputs do not explain, and free run beyond the record is extrapolation.",
+            "the inputs do not explain a remaining drift, and a free run beyond the record is an extrapolation.",
         )
 
     def common_cause(self) -> Remark | None:
@@ -310,8 +310,8 @@ class _Warnings:
             return None
         return Remark(
             ModelWarning.COMMON_CAUSE,
-            f"Drive and ambient changed together (correlation {together:.2f}): how much of the deformation belongs to "
-            "the DTF and how much to the TDTF is ambiguous.",
+            f"The drive of the DTF and the ambient temperature changed together (correlation {together:.2f}): the "
+            "shares of the DTF and the TDTF in the deformation are ambiguous.",
         )
 
     def undetermined_gain(self) -> list[Remark]:
@@ -362,7 +362,7 @@ class _Warnings:
                     Remark(
                         ModelWarning.TWIN_MODES,
                         f"Two time constants of the {name} coincide at {twins[0]:.3g} min: their standard errors "
-                        "mean nothing, and one mode fewer may be enough.",
+                        "are meaningless, and one mode fewer may be enough.",
                     )
                 )
         return words
@@ -379,7 +379,7 @@ class _Warnings:
             return None
         return Remark(
             ModelWarning.INVERSE_NOISE,
-            f"The noise of the thermocouples makes {watts:.0f} W of noise in a heat of {span:.0f} W.",
+            f"The noise of the thermocouples causes {watts:.0f} W of noise in a heat of {span:.0f} W.",
         )
 
     def coloured(self) -> Remark | None:
@@ -393,8 +393,8 @@ class _Warnings:
         tail = f" and is correlated with {largest}" if known[largest] > 1.0 else ""
         return Remark(
             ModelWarning.COLOURED_RESIDUAL,
-            f"The residual ({main.sigma:.2f} µm rms, sensor noise {noise:.2f}) is not white{tail}: the model lacks "
-            "something. The standard errors allow for it.",
+            f"The residual ({main.sigma:.2f} µm rms, sensor noise {noise:.2f}) is not white{tail}: the model is "
+            "incomplete. The standard errors allow for it.",
         )
 
     def narrow_range(self) -> Remark | None:

@@ -1,4 +1,4 @@
-"""DTF and TDTF by the paper's four methods, the order chosen on held-out folds.
+"""DTF and TDTF by the paper's four methods, with the order chosen on held-out blocks.
 
 Methods I to III first subtract the ambient's share of the deformation (the paper's equation 1),
 
@@ -38,11 +38,11 @@ class PathFit:
     name : {"TTF", "DTF", "TDTF"}
         Which path.
     fit : OutputErrorFit or None
-        None where the path was given.
+        None if the path was given.
     column : int
-        Which input of the fit it is.
+        Number of its input in the fit.
     function : SampledTransferFunction
-        What the engine evaluates.
+        Function that the engine evaluates.
     """
 
     name: str
@@ -105,7 +105,7 @@ def fit_deformation(
     runs : sequence of Run
         Data.
     used : sequence of array of bool
-        Samples of each run that take part.
+        Samples of each run that are fitted.
     drives : sequence of numpy.ndarray
         Input of the DTF in each run: heat, W, or T_Q − AT, K.
     settings : Settings
@@ -115,7 +115,7 @@ def fit_deformation(
     etve : sequence of Run
         Runs without a heat source, for methods II and III.
     progress : callable
-        Called with how many structures of how many are done.
+        Called with the number of structures done and their total.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def _terms(order: int) -> tuple[int, ...]:
 def _chosen(
     data: Sequence[Segment], structures: Sequence[Structure], settings: Settings, period_s: float, progress: Progress
 ) -> tuple[list[Segment], list[Candidate], OutputErrorFit]:
-    """Decide how the runs start, choose a structure on the folds and fit it to all data."""
+    """Determine how the runs start, choose a structure on the held-out blocks and fit it to all data."""
     largest = structures[-1] if len(structures) == 1 else structures[len(structures) // 2]
     segments = settle_starts(data, largest, period_s, settings.folds)
     candidates = choose(segments, structures, period_s=period_s, folds=settings.folds, progress=progress)
@@ -204,7 +204,9 @@ def _from_etve(
     etve: Sequence[Run], settings: Settings, period_s: float, progress: Progress
 ) -> tuple[PathFit, tuple[Candidate, ...]]:
     if not etve:
-        raise DataError(f"method {settings.method} needs an ETVE (a run without any heat source): name it with --etve")
+        raise DataError(
+            f"method {settings.method} needs an ETVE (a run with all heat sources off), expected --etve DATA"
+        )
     data = []
     for run in etve:
         used = np.isfinite(run.y_um)

@@ -32,10 +32,10 @@ from compensator.arrays import Mask, Matrix, Vector
 from compensator.errors import DataError
 from compensator.model.transfer_function import SampledTransferFunction
 
-#: Directions of the amplitudes with less than this share of the largest singular value are left at zero.
+#: Directions of the amplitudes with less than this share of the largest singular value are set to zero.
 RANK_TOLERANCE = 1e-10
 #: Prior of an unknown initial state: no larger than the output's spread, with the weight of one sample whose noise is
-#: this share of that spread. It matters only where the data does not determine the state.
+#: this share of that spread. It matters only if the data do not determine the state.
 STATE_PRIOR = 1e-3
 #: Relative change of the cost at which a search ends; another start must gain more.
 _TOLERANCE = 1e-9
@@ -43,7 +43,7 @@ _TOLERANCE = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Segment:
-    """A stretch of measured data without a gap.
+    """An interval of measured data without a gap.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Segment:
     y : numpy.ndarray, shape (n,)
         Measured output; NaN where missing.
     used : numpy.ndarray of bool, shape (n,)
-        Samples of y that take part in the fit; inputs always do, because the model runs through.
+        Samples of y that are fitted; inputs are always used, because the model runs through.
     rest : bool
         Whether it is known to start at rest; otherwise its initial state is fitted.
     """
@@ -66,7 +66,7 @@ class Segment:
     def of(
         cls, inputs: npt.ArrayLike, y: npt.ArrayLike, used: npt.ArrayLike | None = None, *, rest: bool = False
     ) -> Segment:
-        """Make a segment; every finite sample of y is used unless said otherwise."""
+        """Make a segment; by default every finite sample of y is used."""
         u, values = np.atleast_2d(np.asarray(inputs, dtype=float)), np.asarray(y, dtype=float)
         finite = np.isfinite(values)
         mask = finite if used is None else finite & np.asarray(used, dtype=bool)
@@ -127,11 +127,11 @@ class OutputErrorFit:
     amplitudes : numpy.ndarray, shape (structure.amplitudes,)
         *c_jk*, input by input.
     nuisances : tuple of numpy.ndarray
-        Of each segment: initial state *s* (where fitted), then the offset (where fitted).
+        For each segment: initial state *s* (if fitted), then the offset (if fitted).
     covariance : numpy.ndarray
-        Of (log τ, c), times the variance inflation.
+        Covariance of (log τ, c), times the variance inflation.
     residuals : tuple of numpy.ndarray
-        y − ŷ of each segment, also where y was not used; NaN where it is missing.
+        y − ŷ of each segment, also where y was not fitted; NaN where it is missing.
     sigma : float
         Standard deviation of the residual on the samples used.
     variance_inflation : float
@@ -389,19 +389,19 @@ def fit_output_error(
     Parameters
     ----------
     segments : sequence of Segment
-        One or several stretches of data; time constants and numerators are common, initial state and
-        offset are each stretch's own.
+        One or several intervals of data; time constants and numerators are common, initial state and
+        offset are fitted for each interval.
     structure : Structure
         Orders.
     period_s : float
         Sample period, s.
     starts : sequence of sequence of float
-        Initial time constants, min, each of length `structure.order`; the best result counts.
+        Initial time constants, min, each of length `structure.order`; the best result is returned.
 
     Returns
     -------
     OutputErrorFit
-        With residuals of every sample, also of those that were not used.
+        Result with residuals of every sample, also of those that were not fitted.
 
     Raises
     ------

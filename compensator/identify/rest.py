@@ -1,4 +1,4 @@
-"""Whether a run starts at rest: a known initial state, where it is true, is better than a fitted one."""
+"""Determines whether a run starts at rest: a known initial state, if correct, is better than a fitted one."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from compensator.identify.output_error import Segment, Structure
 
 
 def settle_starts(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> list[Segment]:
-    """Mark the segments whose start from rest the data does not contradict.
+    """Mark the segments whose start from rest the data do not contradict.
 
-    Segment by segment, a start from rest is kept where it increases the free-run error on held-out folds over that
-    of a fitted initial state by no more than one standard error. A test of significance does not serve: at low noise
-    it rejects every start because of what the structure cannot follow elsewhere.
+    Segment by segment, a start from rest is kept if it increases the free-run error on held-out blocks over that of a
+    fitted initial state by at most one standard error. A significance test is not suitable: at low noise it rejects
+    every start because of errors of the structure elsewhere.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def settle_starts(segments: Sequence[Segment], structure: Structure, period_s: f
     Returns
     -------
     list of Segment
-        The same data, `rest` set where it holds.
+        The same data, with `rest` set for these segments.
     """
 
     def errors(trial: Sequence[Segment]) -> list[float]:

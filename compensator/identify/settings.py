@@ -19,16 +19,16 @@ class Settings:
     Parameters
     ----------
     kind : {"auto", "heat", "direct"}
-        With a TTF, or from T_Q − AT to the deformation; `auto`: with a TTF where the heat is known.
+        `heat`: with a TTF; `direct`: from T_Q − AT to the deformation; `auto`: `heat` if the heat is known.
     method : {"I", "II", "III", "IV"}
-        Where the TDTF comes from: given, first order (I); an ETVE (II); the end of an ETVE (III); fitted with
-        the DTF and a common denominator (IV). I to III subtract the ambient's share before the DTF is fitted.
+        Origin of the TDTF: given, first order (I); an ETVE (II); the end of an ETVE (III); fitted with the DTF and a
+        common denominator (IV). I to III subtract the ambient's share before the DTF is fitted.
     ttf : tuple of int
         nb, nf, nk of the TTF.
     order : tuple of int, optional
-        nf, nb of the DTF, nb of the TDTF; chosen on folds where it is not given.
+        nf, nb of the DTF, nb of the TDTF; by default chosen on held-out blocks.
     drive : {"ttf", "known"}
-        Heat that the DTF is fitted with: from T_Q through the TTF, as the service will have it, or the known one.
+        Heat for fitting the DTF: estimated from T_Q through the TTF, as in the service, or known.
     given_tdtf : tuple of float, optional
         Gain, µm/K, and time constant, min, of method I.
     etve_end_h : float
@@ -55,7 +55,9 @@ class Settings:
                 raise DataError(f"{name} {getattr(self, name)!r}, expected one of: {', '.join(choices)}")
         nb, nf, nk = self.ttf
         if nk != 0:
-            raise DataError(f"TTF structure nb {nb}, nf {nf}, nk {nk}: nk must be 0, or its inverse needs the future")
+            raise DataError(
+                f"TTF structure nb {nb}, nf {nf}, nk {nk}: nk must be 0, otherwise its inverse is not causal"
+            )
         if nb < 1 or nf < 1 or nb > nf + 1:
             raise DataError(f"TTF structure nb {nb}, nf {nf}, nk {nk}: expected nf >= 1 and nb from 1 to nf + 1")
         if self.order is not None and (self.order[0] < 1 or min(self.order[1:]) < 1 or max(self.order) > 8):

@@ -1,4 +1,4 @@
-"""Figures, tables and words of an identification: for terminal, notebook, page, JSON and model file."""
+"""Figures, tables and text of an identification for terminal, notebook, page, JSON and model file."""
 
 from __future__ import annotations
 
@@ -64,31 +64,31 @@ def errors_of(calibration: Calibration) -> dict[str, Any]:
 
 
 def verdict(errors: Mapping[str, Any]) -> str:
-    """Return one sentence: the error on data that took no part in the fit.
+    """Return the error on data that were not used for the fit, in one sentence.
 
     Parameters
     ----------
     errors : mapping
-        As :func:`errors_of`; a model file keeps them in its provenance.
+        Result of :func:`errors_of`; a model file contains them in its provenance.
     """
     held_out = [part for part in errors["parts"] if part["role"] == "held out"]
     if held_out:
         worst = max(held_out, key=lambda part: float(part["rms_um"]))
         return (
-            f"On data that took no part in the fit: {worst['rms_um']:.2f} µm rms "
+            f"On data that were not used for the fit: {worst['rms_um']:.2f} µm rms "
             f"({worst['no_compensation_rms_um']:.1f} without compensation), fit {worst['fit_pct']:.1f} %"
             + (f", worst of {len(held_out)}" if len(held_out) > 1 else "")
             + "."
         )
     return (
         f"On held-out blocks of time: {errors['folds_rms_um']:.2f} µm rms in free run "
-        f"({errors['parts'][0]['no_compensation_rms_um']:.1f} without compensation). No separate run validates it; "
-        "give one with --validate."
+        f"({errors['parts'][0]['no_compensation_rms_um']:.1f} without compensation). There is no separate "
+        "validation run; give one with --validate."
     )
 
 
 def share_left(errors: Mapping[str, Any]) -> float:
-    """Return the error on held-out data over that without compensation, the largest of all parts."""
+    """Return the ratio of the held-out error to that without compensation, the largest of all parts."""
     held_out = [part for part in errors["parts"] if part["role"] == "held out"]
     if held_out:
         return max(float(part["rms_um"] / part["no_compensation_rms_um"]) for part in held_out)
@@ -96,7 +96,7 @@ def share_left(errors: Mapping[str, Any]) -> float:
 
 
 class Estimate(NamedTuple):
-    """A parameter: what it is, its value with its standard error (0: given), and its unit."""
+    """A parameter: description, value with standard error (0: given), and unit."""
 
     label: str
     value: float
@@ -119,7 +119,7 @@ def estimates(criticism: Criticism) -> dict[str, Estimate]:
 def contents(
     calibration: Calibration, criticism: Criticism, comparison: Sequence[Row] = ()
 ) -> Iterator[str | Table | Words]:
-    """Yield what terminal and notebook show: sentences, tables, warnings and remarks."""
+    """Yield the content for terminal and notebook: sentences, tables, warnings and remarks."""
     model = calibration.model
     what = (
         "TTF, DTF, TDTF: heat from the temperatures"
@@ -138,19 +138,19 @@ def contents(
 
 
 def parameter_table(calibration: Calibration, criticism: Criticism) -> Table:
-    """Return gains and time constants with their standard errors, by their names in Python too."""
+    """Return gains and time constants with their standard errors and their names in Python."""
     rows = [[one.label, with_std(one.value, one.std), one.unit, name] for name, one in estimates(criticism).items()]
     for path in calibration.paths:
         rows.append([f"{path.name}: structure", str(path.fit.structure) if path.fit else "given", "", ""])
     if calibration.temperature is not None:
         watts = f"{calibration.temperature.noise_gain_w_per_k:.1f}"
-        rows.append(["inverse TTF: noise in the heat for 1 K of noise", watts, "W", ""])
+        rows.append(["inverse TTF: noise in the heat per 1 K of temperature noise", watts, "W", ""])
         rows.append(["TTF: fit in free run with known heat", f"{calibration.ttf_fit_pct:.2f}", "%", ""])
     return Table(
         title="Gains and time constants",
         head=["parameter", "value ± standard error", "unit", "name"],
         rows=rows,
-        note="The standard error includes the low-frequency power of a residual that is not white.",
+        note="The standard errors allow for the low-frequency power of a residual that is not white.",
     )
 
 
@@ -180,7 +180,7 @@ def error_table(calibration: Calibration) -> Table:
         head=["data", "part", "h", "fit %", "rms µm", "peak to peak µm", "uncompensated µm", "persistence µm"],
         rows=rows,
         note="Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖). Persistence: the last value before the part is held. "
-        "Runs that were not fitted are zeroed on their first hour.",
+        "Runs that were not fitted are zeroed at the mean of their first hour.",
     )
 
 

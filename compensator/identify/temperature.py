@@ -1,4 +1,4 @@
-"""The TTF: from the known heat to T_Q − AT, with an inverse that can run in a service."""
+"""The TTF: from the known heat to T_Q − AT, with an inverse that the service can use."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class TemperatureFit:
     Parameters
     ----------
     fit : OutputErrorFit
-        Of heat to T_Q − AT.
+        Fit from heat to T_Q − AT.
     segments : tuple of Segment
         Data of the fit.
     held_out_k : float
@@ -61,15 +61,15 @@ def fit_temperature(
 ) -> TemperatureFit:
     """Fit a TTF whose inverse is causal, stable and does not ring.
 
-    Where the inverse of the requested structure cannot run, numerator terms are removed until it can. With a single
-    term it always can; the cost shows in the fit.
+    If the inverse of the requested structure is not usable, numerator terms are removed until it is. With a single
+    term it always is; the loss of accuracy shows in the fit.
 
     Parameters
     ----------
     runs : sequence of Run
-        Those with known heat are used.
+        Runs; those with known heat are used.
     used : sequence of array of bool
-        Samples of each run that take part.
+        Samples of each run that are fitted.
     ttf : tuple of int
         nb, nf, nk.
     period_s : float
@@ -107,7 +107,9 @@ def fit_temperature(
             noise_gain_w_per_k=noise_gain(function),
             remark=remark,
         )
-    raise DataError(f"no usable inverse: {remark}. Is t_q_degc near the heat source, and heat_w its heat?")
+    raise DataError(
+        f"no usable inverse: {remark}. Check that t_q_degc is near the heat source, and that heat_w is its heat."
+    )
 
 
 def noise_gain(function: SampledTransferFunction) -> float:

@@ -8,7 +8,6 @@ the filter (`Observer`).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -162,8 +161,7 @@ def late_variance_um2(model: ThermalModel) -> float:
     """Return by how much the correction of a late T_Q raises the steady variance of y, µm²."""
     if model.late_t_q is None:
         return 0.0
-    prompt = dataclasses.replace(model, effects=tuple(e for e in model.effects if e.lateness is None))
-    late_um2, prompt_um2 = (_steady_variance_um2(observer_of(m)) for m in (model, prompt))
+    late_um2, prompt_um2 = (_steady_variance_um2(observer_of(m)) for m in (model, model.with_prompt_t_q()))
     return max(late_um2 - prompt_um2, 0.0)
 
 

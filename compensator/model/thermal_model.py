@@ -197,6 +197,10 @@ class ThermalModel(Shown):
         """By how much T_Q is late, where an effect says so."""
         return next((effect.lateness for effect in self.effects if effect.lateness is not None), None)
 
+    def with_prompt_t_q(self) -> ThermalModel:
+        """Return the model without the effect of a late T_Q."""
+        return dataclasses.replace(self, effects=tuple(effect for effect in self.effects if effect.lateness is None))
+
     def with_alternative(self, name: str) -> ThermalModel:
         """Return the model with one of its alternative paths in place.
 

@@ -1,8 +1,8 @@
-"""Bring the published offset to a control: check, follow, limit, hold, and give the reasons.
+"""Apply the published offset in a control: check, follow, limit, hold, and report the reasons.
 
-Stands alone: this folder needs Python 3.11 and `eclipse-zenoh` and nothing else of the package, so it may be copied
-into a control's own program. `Follower` is the whole behaviour, without clock, thread or socket; `Receiver` is the thin
-layer of Zenoh around it.
+This folder needs Python 3.11 and `eclipse-zenoh` and nothing else of the package, so it can be copied into a control's
+own program. `Follower` implements the behaviour, without clock, thread or socket; `Receiver` is the Zenoh client around
+it.
 
 ```
 ReceiverError            the receiver cannot be started: one line with file, key, value and what was expected

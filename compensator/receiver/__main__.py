@@ -1,4 +1,4 @@
-"""`python -m compensator.receiver --config receiver.toml`: show what a control would apply; write to none."""
+"""`python -m compensator.receiver --config receiver.toml`: show what a control would apply, without a control."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def main() -> int:
     """Print a line whenever state, reasons or number change, until SIGINT or SIGTERM."""
     parser = argparse.ArgumentParser(
         prog="compensator.receiver",
-        description="Shows what a control would apply; writes to none.",
+        description="Show the offset that a control would apply, without writing to a control.",
         epilog="example: python -m compensator.receiver --config receiver.toml",
     )
     parser.add_argument("--config", required=True, metavar="FILE", help="TOML with a table [receiver]")
@@ -34,7 +34,7 @@ def main() -> int:
     with receiver:
         while not ended.wait(0.1):
             applied = receiver.poll()
-            # A changed figure in a detail (an age, a distance) is not worth a line.
+            # A changed figure in a detail (an age, a distance) does not cause a new line.
             shown = (applied.seq, applied.state, tuple(reason.code for reason in applied.reasons))
             if shown != reported:
                 reported = shown

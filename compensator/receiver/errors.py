@@ -1,4 +1,4 @@
-"""The receiver's one error: it cannot be started. Messages that arrive are data, and never raise."""
+"""The receiver's only error: it cannot be started. Received messages never raise an error."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The receiver's behaviour, without thread, clock or socket.
 
-Only `Follower.advance` moves the applied offset, by at most what `offset_rate_max_um_per_min` allows for the time since
-the previous call (and for at most `step_max_s` of it). So a start, a message, a new service, a reconnection, or a
-program that was stopped for an hour cannot make it jump.
+Only `Follower.advance` moves the applied offset, by at most `offset_rate_max_um_per_min` times the time since the
+previous call, which counts for at most `step_max_s`. Therefore a start, a message, a new service, a reconnection, or an
+interruption of the program for an hour cannot make the offset jump.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FollowerState = Literal["starting", "following", "holding", "fading"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What the applied offset may do.
+    """Limits of the applied offset.
 
     Parameters
     ----------
@@ -35,11 +35,11 @@ class Limits:
     offset_rate_max_um_per_min : float
         Largest rate, µm/min.
     valid_max_s : float
-        Longest time that one message may be used, whatever it says of itself, s.
+        Longest time that a message may be used, regardless of its own validity, s.
     step_max_s : float
-        Longest time between two calls of `advance` that counts for moving, s.
+        Longest time between two calls of `advance` that counts for the movement, s.
     clock_tolerance_s : float
-        How far a message may be ahead of the wall clock, s.
+        Largest time by which a message may be ahead of the wall clock, s.
     """
 
     offset_max_um: float
@@ -66,9 +66,9 @@ class Applied:
     state : str
         `starting`: no usable message yet, the offset stays; `following`; `holding`; `fading`: to zero, on demand.
     reasons : tuple of Reason
-        Why it does not follow, or remarks while it does; in words by `Reason.text`.
+        Why it does not follow, or remarks while it follows; `Reason.text` gives the text.
     arrived : bool
-        Whether the offset is where it should be; false while it holds.
+        Whether the offset has reached its target; false while it holds.
     age_s : float or None
         Age of the newest message of this machine, s.
     seq : int or None
@@ -87,7 +87,7 @@ class Applied:
 
     @property
     def text(self) -> str:
-        """Return offset, state and reasons as one line for people."""
+        """Return offset, state and reasons as one line of text."""
         why = " ".join(reason.marked for reason in self.reasons)
         return f"{self.offset_um:+.2f} µm, {self.state}" + (f": {why}" if why else "")
 
@@ -114,18 +114,18 @@ class Follower:
     Parameters
     ----------
     machine : str
-        Whose offset; messages of others are dropped.
+        Machine whose offset is followed; messages of other machines are dropped.
     limits : Limits
-        What it may do.
+        Limits of the offset.
     applied_um : float
-        Offset at the control at the start, µm; it moves from there.
+        Offset applied by the control at the start, µm; it moves from there.
     last_sequence : int
-        Highest number used before a restart; −1 where none is known.
+        Highest number used before a restart; −1 if unknown.
 
     Raises
     ------
     ReceiverError
-        Where the offset at the control is not a number within the limits: a person has to correct it first.
+        If the offset applied by the control is not a number within the limits: it must be corrected first.
 
     Examples
     --------
@@ -162,11 +162,11 @@ class Follower:
         self._mode = "follow"
 
     def hold(self) -> None:
-        """Freeze the offset where it is."""
+        """Freeze the offset at its present value."""
         self._mode = "hold"
 
     def fade(self, rate_um_per_min: float) -> None:
-        """Move the offset to zero, at this rate and never faster than the limit; nothing else does so.
+        """Move the offset to zero, at this rate but never faster than the limit.
 
         Raises
         ------
@@ -178,7 +178,7 @@ class Follower:
         self._mode, self._fade_rate_um_per_min = "fade", rate_um_per_min
 
     def rebase(self, applied_um: float) -> None:
-        """Continue from the offset that the control holds, where it is not the one applied last.
+        """Continue from the offset that the control applies, if it differs from the last one.
 
         Raises
         ------
@@ -202,12 +202,12 @@ class Follower:
         now_s : float
             Monotonic clock, s.
         payload : bytes
-            As it arrived.
+            Payload as received.
         age_s : float, optional
-            Wall clock minus the message's time, s, where it is to be checked; else the message counts as measured just
-            now. From here on only the monotonic clock counts, so setting the wall clock later changes nothing.
+            Wall clock minus the message's time, s, if it is to be checked; otherwise the message counts as measured
+            now. After this only the monotonic clock is used, so setting the wall clock later has no effect.
         asked : bool
-            Whether it is the answer to a query: a newer message may overtake an answer, which is not a replay.
+            Whether it is the answer to a query, which is not a replay even if a newer message arrived first.
 
         Returns
         -------
@@ -232,8 +232,8 @@ class Follower:
     def _check(self, message: OffsetMessage, age_s: float | None, asked: bool) -> bool:
         if message.machine != self.machine:
             raise Rejected(Reason("other_machine", f"{message.machine[:64]}, expected {self.machine}"))
-        # A query at the start brings the same message twice. After a restart the newest one may be queried again; its
-        # age is checked like any other's.
+        # The query at the start may return a message twice. After a restart the newest one may be queried again; its
+        # age is checked as for any other message.
         again = message.seq == self.last_sequence
         if again and (self._held is not None or not asked):
             if self._held is not None and message == self._held.message:
@@ -259,12 +259,12 @@ class Follower:
     # ------------------------------------------------------------------ the applied offset
 
     def advance(self, now_s: float, payload: bytes | None = None) -> Applied:
-        """Advance in time and return the offset to apply; nothing else moves the offset.
+        """Advance in time and return the offset to apply; only this method moves the offset.
 
         Parameters
         ----------
         now_s : float
-            Monotonic clock, s. One that goes back counts as stopped.
+            Monotonic clock, s. A clock that moves backwards counts as stopped.
         payload : bytes, optional
             A message that has just arrived.
         """
@@ -305,7 +305,7 @@ class Follower:
             self.applied_um = max(-self.limits.offset_max_um, min(self.limits.offset_max_um, moved))
 
     def _wanted(self, now_s: float) -> tuple[FollowerState, float | None, list[Reason]]:
-        """Return the state, the target of the offset (None: it stays), and the reasons so far."""
+        """Return the state, the target of the offset (None: it is held), and the reasons so far."""
         reasons = [] if self._rejected is None else [self._rejected]
         if self.alive is False:
             reasons.append(Reason("service_gone"))

@@ -23,7 +23,7 @@ class Rejected(Exception):
     Parameters
     ----------
     reason : Reason
-        Why.
+        Why the message must not be used.
     """
 
     def __init__(self, reason: Reason) -> None:
@@ -42,9 +42,9 @@ class OffsetMessage:
     seq : int
         Never repeats for a machine.
     time_utc_ns : int
-        When it was measured, ns since 1970 UTC.
+        Time of the measurement, ns since 1970 UTC.
     valid_for_s : float
-        How long it may be used, s.
+        Time for which it may be used, s.
     y_offset_um : float or None
         To be added to the commanded Y, µm; a number whenever the state is `ok` or `degraded`.
     y_offset_rate_um_per_min : float
@@ -128,7 +128,7 @@ def _no_constant(name: str) -> float:
 
 
 def _pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Refuse two values under one key: either could be meant."""
+    """Refuse a key that occurs twice, which is ambiguous."""
     table = dict(pairs)
     if len(table) != len(pairs):
         raise ValueError("a key occurs twice")

@@ -1,28 +1,31 @@
-"""The receiver's reasons, in words."""
+"""The receiver's reasons and their texts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-#: code → (what it means, what to do)
+#: code → (meaning, action)
 WORDS: Mapping[str, tuple[str, str]] = {
     "no_message": (
-        "No usable offset has been received since the start; the offset applied before stays.",
-        "Check that service and router run, and that machine and prefix are the service's.",
+        "No usable offset has been received since the start; the offset applied before is held.",
+        "Check that service and router are running, and that machine and prefix are those of the service.",
     ),
     "expired": (
-        "The newest offset is older than its valid_for_s; the applied offset stays and no longer follows the machine.",
-        "Look for the service, the router and the network.",
+        "The newest offset is older than its valid_for_s; the applied offset is held and does not follow the machine.",
+        "Check the service, the router and the network.",
     ),
-    "service_starting": ("The service has no offset yet; the applied one stays.", "Wait for its first good sample."),
-    "service_hold": ("The service holds its last good offset, and the receiver too.", "Look at the service's reasons."),
+    "service_starting": (
+        "The service has no offset yet; the applied offset is held.",
+        "Wait for its first good sample.",
+    ),
+    "service_hold": ("The service holds its last good offset, so the receiver holds.", "See the service's reasons."),
     "service_fault": (
-        "The service has no reliable offset; the applied one stays.",
-        "Look at the service's reasons.",
+        "The service has no reliable offset; the applied offset is held.",
+        "See the service's reasons.",
     ),
     "service_degraded": (
-        "The service compensates with reduced information; the offset is followed.",
+        "The service compensates with a restriction; the offset is followed.",
         "Look at the service's reasons.",
     ),
     "service_gone": (
@@ -31,42 +34,42 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "malformed": (
         "A message was dropped: it is not a valid offset message.",
-        "Find out who publishes below the prefix.",
+        "Find out which programs publish below the prefix.",
     ),
-    "other_schema": ("A message of another version was dropped.", "Bring service and receiver to the same version."),
+    "other_schema": ("A message of another version was dropped.", "Install the same version of service and receiver."),
     "other_machine": ("A message of another machine was dropped.", "Check machine and prefix on both sides."),
     "replayed": (
         "A message whose number was used before, or an older one, was dropped.",
-        "Find out who publishes below the prefix. Where the machine's service was newly installed and counts "
+        "Find out which programs publish below the prefix. If the machine's service was newly installed and counts "
         "from a lower number, stop the receiver and delete its state file.",
     ),
     "beyond_limit": (
         "An offset beyond the receiver's offset_max_um was dropped.",
         "Check sensors and model, and that the limits of service and receiver match.",
     ),
-    "late": ("An offset was dropped because it was too old when it arrived.", "Look at the network and the service."),
+    "late": ("An offset was dropped because it was too old when it arrived.", "Check the network and the service."),
     "clock_disagrees": (
-        "An offset was dropped because it comes from the future: the clocks of service and receiver disagree.",
-        "Set both clocks (NTP).",
+        "An offset was dropped because its time is in the future: the clocks of service and receiver disagree.",
+        "Synchronise both clocks (NTP).",
     ),
     "catching_up": (
         "The offset is still moving to its value at the permitted rate.",
         "Wait before the next precise cut.",
     ),
     "limit_reached": ("The followed offset has reached offset_max_um.", "Check sensors and model."),
-    "held_here": ("Somebody has frozen the offset here.", "Let it follow again."),
+    "held_here": ("The offset was frozen at this receiver.", "Let it follow again."),
     "fading": (
         "On request the receiver moves the offset to zero.",
-        "Let it follow again when wanted.",
+        "Let it follow again when required.",
     ),
-    "faded": ("On request the receiver applies an offset of zero.", "Let it follow again when wanted."),
+    "faded": ("On request the receiver applies an offset of zero.", "Let it follow again when required."),
     "state_not_saved": (
         "The number of the last message cannot be saved for a restart.",
         "Check the state file's folder: space, permissions, disk.",
     ),
     "state_damaged": (
         "The state file could not be read; replayed messages from before the start are not recognised.",
-        "It is rewritten with the next offset; check the disk.",
+        "Check the disk; the file is rewritten with the next offset.",
     ),
     "not_connected": ("No router or service has been reached yet.", "Check address, certificates and network."),
 }
@@ -89,13 +92,13 @@ class Reason:
 
     @property
     def text(self) -> str:
-        """Return the reason in words, one line."""
+        """Return the reason as one line of text."""
         meaning = WORDS[self.code][0]
         return f"{meaning} ({self.detail})" if self.detail else meaning
 
     @property
     def marked(self) -> str:
-        """Return the reason in words with its code, for `compensator explain`."""
+        """Return the text with the code, for `compensator explain`."""
         return f"{self.text} [{self.code}]"
 
     def __str__(self) -> str:

@@ -34,10 +34,10 @@ class Settings:
     zenoh_config : str
         A Zenoh configuration (JSON5) of mode `client`, with certificates for instance; relative to the file.
     check_clock : bool
-        Compare every message's time with the wall clock here, for hosts with synchronised clocks. Answers to queries,
-        and messages after a standstill, are always compared: nothing else shows their age.
+        Compare every message's time with this computer's clock, if the clocks are synchronised. Answers to queries,
+        and messages after an interruption of the loop, are always compared, because nothing else shows their age.
     clock_tolerance_s : float
-        How far a message may be ahead of the wall clock, s.
+        Largest time by which a message may be ahead of the wall clock, s.
     valid_max_s : float
         Longest time that one message may be used, s.
     state_file : str
@@ -61,7 +61,7 @@ class Settings:
         Parameters
         ----------
         step_max_s : float
-            Longest time between two calls that counts for moving, s.
+            Longest time between two calls that counts for the movement, s.
         """
         return Limits(
             offset_max_um=self.offset_max_um,
@@ -108,7 +108,7 @@ def settings_from(table: Mapping[str, Any], *, source: str, folder: Path | None 
     source : str
         File, for messages.
     folder : pathlib.Path, optional
-        What paths are relative to; the working folder where none is given.
+        Folder to which paths are relative; by default the working folder.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def _check(settings: Settings, source: str) -> None:
 
 
 def read_table(kind: type[T], table: Mapping[str, Any], *, source: str, name: str) -> T:
-    """Make a settings class of a table: every key known, every value of its type, nothing missing.
+    """Make a settings object from a table; unknown keys, wrong types and missing keys are errors.
 
     Raises
     ------

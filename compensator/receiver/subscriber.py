@@ -1,4 +1,4 @@
-"""The thin layer of Zenoh around `Follower`.
+"""The Zenoh client around `Follower`.
 
 `poll` empties Zenoh's buffers on the caller's thread: there are no callbacks, a slow caller blocks nothing, and no
 thread delays the program's exit. Only the first connection is made by a separate thread, because an address that does
@@ -39,7 +39,7 @@ def monotonic_s() -> float:
 
 
 def client_config(settings: Settings) -> Any:
-    """Make the Zenoh configuration: a client that listens and scouts for nothing.
+    """Make the Zenoh configuration: a client without listening endpoints and scouting.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def client_config(settings: Settings) -> Any:
             config = zenoh.Config.from_file(settings.zenoh_config)
         except zenoh.ZError as error:
             raise ReceiverError(f"{settings.zenoh_config}: {error}; expected a Zenoh configuration") from error
-        # A router forwards nothing between two peers, and no message would say so.
+        # A router forwards nothing between two peers, and reports no error.
         if json.loads(config.get_json("mode") or "null") != "client":
             raise ReceiverError(f"{settings.zenoh_config}: mode = {config.get_json('mode')}: expected 'client'")
     else:
@@ -75,10 +75,10 @@ class Receiver:
     settings : Settings
         Machine, addresses and limits.
     applied_um : float
-        Offset at the control at the start, µm.
+        Offset applied by the control at the start, µm.
     step_max_s : float
-        Longest time between two calls of `poll` that counts, s: the offset moves for no more than that, and messages
-        after a longer pause are used only if they are fresh by the wall clock.
+        Longest time between two calls of `poll` that counts for the movement, s. Messages after a longer pause are used
+        only if they are fresh by the wall clock.
     clock, utc_ns : callable, optional
         Monotonic clock, s, and wall clock, ns.
 
@@ -129,7 +129,7 @@ class Receiver:
         self.close()
 
     def close(self) -> None:
-        """Leave Zenoh; may be called twice. The offset at the control stays."""
+        """Close the Zenoh session; may be called twice. The offset at the control is not changed."""
         self._ended.set()
         if self._opener.is_alive():
             self._opener.join(CONNECT_TIMEOUT_MS / 1000.0 + 2.0)
@@ -149,7 +149,7 @@ class Receiver:
     def poll(self) -> Applied:
         """Process new messages, advance in time, and return the offset to apply; never waits."""
         now_s = self._clock()
-        # After a standstill of this program a message may have been waiting for any time.
+        # If this program was blocked, a message may have been waiting for an unknown time.
         paused = self._polled_s is not None and now_s - self._polled_s > self.follower.limits.step_max_s
         self._polled_s = now_s
         if self._session is None and self._opened:
@@ -175,7 +175,7 @@ class Receiver:
                 while (reply := answers.try_recv()) is not None:
                     if reply.ok is not None:
                         self._receive(now_s, reply.ok, check_age=True, asked=True)
-            except zenoh.ZError:  # all answers are in
+            except zenoh.ZError:  # all answers were received
                 self._answers.remove(answers)
 
     def _receive_tokens(self) -> None:
@@ -208,7 +208,7 @@ class Receiver:
 
     def _query_latest(self) -> None:
         if len(self._answers) < _BUFFER:
-            # A ring would lose the answers when the query ends.
+            # A ring channel would lose the answers when the query ends.
             handler: Any = zenoh.handlers.FifoChannel(_BUFFER)
             self._answers.append(self._session.get(self._key("y/offset"), handler, timeout=ANSWER_TIMEOUT_S))
 
@@ -228,7 +228,7 @@ class Receiver:
         if machine != self._settings.machine:
             raise ReceiverError(
                 f"{self._state_file}: machine = {machine!r}: expected {self._settings.machine!r}; "
-                f"each receiver needs a state file of its own"
+                f"each receiver needs its own state file"
             )
         return last
 
@@ -249,7 +249,7 @@ class Receiver:
 
 
 def _time_of(payload: bytes) -> int:
-    """Return the message's own time, ns; 0 (too old) where there is none: the check of the message gives the reason."""
+    """Return the message's own time, ns; 0 (too old) if there is none: the check of the message gives the reason."""
     try:
         value = json.loads(payload)["time_utc_ns"]
     except (ValueError, TypeError, KeyError, RecursionError):

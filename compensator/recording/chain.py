@@ -1,6 +1,6 @@
 r"""The hash chain of a recording.
 
-Every record carries the hash over itself and the value before it,
+Every record has a value, the hash over the previous value and the record,
 
     value = SHA-256(value before ‖ topic ‖ 0x00 ‖ sequence ‖ log time ‖ publish time ‖ payload),
 
@@ -8,10 +8,9 @@ numbers little-endian (4, 8 and 8 bytes). The chain of a file begins with
 
     value = SHA-256("compensator chain 1\n" ‖ last value of the file before ‖ name ‖ 0x00 ‖ SHA-256(part) ‖ …)
 
-over what the file opens with: metadata, attachments, channels with their schemas. A `/chain` message after each group
-of records lists the value of each. It takes part in the numbering of the records, not in the hash: all that it says
-follows from the records. Nothing depends on how the file is laid out, so a file that is rewritten compact keeps its
-chain.
+over the parts at the start of the file: metadata, attachments, channels with their schemas. A `/chain` message after
+each group of records lists the value of each. It is numbered like the records but not hashed, because its content
+follows from the records. Nothing depends on the layout of the file, so a compacted file keeps its chain.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _sha256 = hashlib.sha256
 
 
 def body_of(sequence: int, time_ns: int, payload: bytes) -> bytes:
-    """Return what is hashed of a record in addition to its topic."""
+    """Return the bytes of a record that are hashed in addition to its topic."""
     return _BODY.pack(sequence, time_ns, time_ns) + payload
 
 
@@ -53,7 +52,7 @@ def link(before: bytes, topic: str, body: bytes) -> bytes:
 
 
 def parts_of(contents: Contents) -> list[ChainPart]:
-    """Return what a file opens with, each by name and hash."""
+    """Return the parts at the start of a file, each with name and hash."""
     parts = [(f"metadata {name}", _texts(table)) for name, table in contents.metadata.items()]
     parts += [(f"attachment {name}", _attachment(part)) for name, part in contents.attachments.items()]
     parts += [(f"channel {channel.topic}", _channel(number, channel)) for number, channel in contents.channels.items()]
@@ -61,14 +60,14 @@ def parts_of(contents: Contents) -> list[ChainPart]:
 
 
 def opening(before: bytes, parts: list[ChainPart]) -> bytes:
-    """Return the value that the chain of a file begins with.
+    """Return the first value of the chain of a file.
 
     Parameters
     ----------
     before : bytes
-        Last value of the file before.
+        Last value of the previous file.
     parts : list of ChainPart
-        What the file opens with.
+        Parts at the start of the file.
     """
     whole = b"".join(part.name.encode() + b"\0" + bytes.fromhex(part.sha256) for part in parts)
     return _sha256(_DOMAIN + before + whole).digest()
@@ -93,14 +92,14 @@ def _channel(number: int, channel: McapChannel) -> bytes:
 
 
 class ChainWriter:
-    """Makes the chain of one file as it is written.
+    """Computes the chain of one file while it is written.
 
     Parameters
     ----------
     machine : str
         Name of the machine.
     before : bytes
-        Last value of the file before.
+        Last value of the previous file.
 
     Examples
     --------
@@ -115,7 +114,7 @@ class ChainWriter:
         self.machine = machine
         #: Value at the last record.
         self.head = before
-        #: Records that no message lists yet.
+        #: Records that are not listed by a message yet.
         self.links: list[ChainLink] = []
         self._before = before
 
@@ -147,7 +146,7 @@ class ChainWriter:
         return encode(message)
 
     def listed(self) -> None:
-        """Count the records up to here as listed."""
+        """Mark the records up to here as listed."""
         self.links, self._before = [], self.head
 
 
@@ -166,5 +165,5 @@ def seal(machine: str, time_ns: int, reason: str, sequence: int, head: bytes, pu
 
 
 def signed_bytes(message: Seal) -> bytes:
-    """Return what is signed of a seal."""
+    """Return the signed bytes of a seal."""
     return encode(msgspec.structs.replace(message, signature=""))

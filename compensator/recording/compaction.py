@@ -1,8 +1,8 @@
-"""Compact copies of recordings: chunks, compression, CRCs and an index in the place of a live file.
+"""Compaction: replaces a live file by a copy with chunks, compression, CRCs and an index.
 
-A live file is written so that a kill loses nothing, which costs size and an index. Once it is finished it is copied
-message by message; the copy is read back with the library's own seeking reader, compared, and only then takes the live
-file's place. A kill at any time leaves one complete file under the name.
+A live file is written so that a kill loses nothing; therefore it is larger and has no index. Once it is finished, it is
+copied message by message; the copy is read back with the library's seeking reader and compared, and only then replaces
+the live file. A kill at any time leaves one complete file under the name.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ _PART = ".mcap.part"
 
 
 class Copy:
-    """The copy as it grows, with a hash over everything in it.
+    """The copy while it is written, with a hash over its content.
 
     Parameters
     ----------
     contents : Contents
-        What was met of the recording so far.
+        Content of the recording read so far.
     writer : Writer
-        Of the copy.
+        Writer of the copy.
     """
 
     def __init__(self, contents: Contents, writer: Writer) -> None:
         self.contents, self._writer = contents, writer
         self._opening = Opening(writer)
-        #: Topics by number of the channel, as far as they were met.
+        #: Topics by number of the channel, as far as read.
         self.topics = self._opening.topics
         self._digest = hashlib.sha256()
         #: Messages in the copy, and whether the original ends within a record.
@@ -96,21 +96,21 @@ def rewrite(
     copy_of : callable
         Makes the copy.
     yielding : bool
-        Whether to let other threads go first.
+        Whether to yield to other threads.
     chained : bool
-        Whether to leave files without a hash chain alone.
+        Whether to skip files without a hash chain.
 
     Returns
     -------
     Copy or None
-        The copy; None where the file is compact, is being written or was left alone.
+        The copy; None if the file is already compact, is being written or was skipped.
 
     Raises
     ------
     OSError
-        If the copy cannot be written; the file stays as it is.
+        If the copy cannot be written; the file is not changed.
     DataError
-        If the file is damaged, or the copy does not read back as what was copied; it stays as it is.
+        If the file is damaged, or the copy differs from it when read back; the file is not changed.
     """
     part = path.with_name(path.name.removesuffix(".mcap") + _PART)
     part.unlink(missing_ok=True)
@@ -129,7 +129,7 @@ def rewrite(
                 file.flush()
                 os.fsync(file.fileno())
             if _digest(part, yielding) != copy.digest():
-                raise DataError(f"{part}: does not read back as what was written")
+                raise DataError(f"{part}: the copy differs from the original when read back")
             part.replace(path)
         except McapError as error:
             raise DataError(f"{path}: {error}") from error
@@ -140,7 +140,7 @@ def rewrite(
 
 
 def _is_live(path: Path, chained: bool) -> bool:
-    """Return whether a file is not compact yet; with `chained`, only if it opens with its hash chain."""
+    """Return whether a file is not compact yet; with `chained`, only if it starts with a hash chain."""
     with Container(path) as container:
         try:
             for message in container.messages():
@@ -160,7 +160,7 @@ def _copied(path: Path, writer: Writer, copy_of: Callable[[Contents, Writer], Co
                 if yielding and number % TURN == 0:
                     time.sleep(MOMENT_S)
         except Torn as torn:
-            # Nothing can be read after a torn end; a damaged file is refused, so that an audit finds it as it was.
+            # Nothing can be read after a torn end; a damaged file is refused, so that an audit finds it unchanged.
             copy.torn = torn.offset < path.stat().st_size
         copy.finish()
     return copy
@@ -181,7 +181,7 @@ def _digest(path: Path, yielding: bool) -> str:
 
 
 def _contents_of(path: Path, reader: McapReader) -> Contents:
-    """Return attachments, metadata and channels as the index leads to them."""
+    """Return attachments, metadata and channels by means of the index."""
     summary = reader.get_summary()
     if (
         summary is None

@@ -1,8 +1,8 @@
-"""Reads an MCAP file from front to back: live or finished, chunked or not, complete, torn or damaged.
+"""Reads an MCAP file sequentially: live or finished, chunked or not, complete, torn or damaged.
 
-The `mcap` library writes our files, and checks them when they are finished. An audit of a year reads millions of
-records, trusts none of them and must distinguish a torn end from damage, so it reads the framing itself: one record
-after the other, no index, lengths bounded before anything is allocated.
+The `mcap` library writes the recordings, and checks them when they are finished. An audit of a year reads millions of
+records, must trust none of them and must distinguish a torn end from damage. This module therefore reads the framing
+itself: one record after the other, without the index, with lengths checked before memory is allocated.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Message(NamedTuple):
     sequence : int
         Number of the record.
     log_time_ns : int
-        When it was written.
+        Time of writing.
     body : bytes
         Sequence, log time, publish time (4 + 8 + 8 bytes, little-endian) and payload.
     """
@@ -95,7 +95,7 @@ PAYLOAD = 20
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A file that travels in the recording."""
+    """A file attached to the recording."""
 
     name: str
     media_type: str
@@ -117,7 +117,7 @@ class McapChannel:
 
 
 class Flaw(StrEnum):
-    """What is wrong with an attachment or a metadata table, in words."""
+    """Fault of an attachment or a metadata table, as text."""
 
     WRONG_CRC = "its CRC is wrong"
     TWICE = "occurs twice"
@@ -126,12 +126,12 @@ class Flaw(StrEnum):
 
 @dataclass(slots=True)
 class Contents:
-    """What the file has besides messages, as far as it was read.
+    """Content of the file other than messages, as far as read.
 
     Parameters
     ----------
     library : str
-        Who wrote the file.
+        Program that wrote the file.
     metadata : dict of str to dict
         By name.
     attachments : dict of str to Attachment
@@ -141,7 +141,7 @@ class Contents:
     flaws : list of (str, Flaw)
         Attachments and metadata with a flaw.
     chunked, ended : bool
-        Whether chunks were met, and whether the file has its end.
+        Whether the file has chunks, and whether it has its end.
     messages : int
         Number of messages.
     """
@@ -200,16 +200,16 @@ class Container:
 
     @property
     def position(self) -> int:
-        """How far the file was read, bytes."""
+        """Number of bytes read."""
         return self._base + self._at
 
     def survey(self, *, whole: bool) -> Contents:
-        """Read attachments, metadata and channels, as far as the file goes, and return them.
+        """Read and return attachments, metadata and channels.
 
         Parameters
         ----------
         whole : bool
-            Whether to its end; else no further than the first message.
+            Whether to read to the end; otherwise only to the first message.
 
         Raises
         ------
@@ -225,16 +225,16 @@ class Container:
     # ------------------------------------------------------------------ messages
 
     def messages(self) -> Iterator[Message]:
-        """Yield every message in the order of the file; what else is met goes into `contents`.
+        """Yield every message in the order of the file; other records are added to `contents`.
 
         Raises
         ------
         DataError
             If it is not an MCAP file.
         Torn
-            Where the file ends inside a record; every complete message was yielded before.
+            If the file ends inside a record; every complete message was yielded before.
         Damaged
-            Where a record cannot be one.
+            If a record is not valid.
         """
         self._need(len(MAGIC))
         start = self._buffer[: len(MAGIC)]
@@ -259,7 +259,7 @@ class Container:
                     buffer, at = self._buffer, self._at
                     end = at + 9 + length
                 if channel not in channels:
-                    raise Damaged(self.path, self._base + at, f"a message of channel {channel}, which is not there")
+                    raise Damaged(self.path, self._base + at, f"a message of channel {channel}, which is not defined")
                 contents.messages += 1
                 loose[channel] = loose.get(channel, 0) + 1
                 first_ns = min(first_ns, log_time)
@@ -299,7 +299,7 @@ class Container:
                 place = places.get(channel)
                 if place is None:
                     if channel not in channels:
-                        raise Damaged(self.path, offset, f"a message of channel {channel}, which is not there")
+                        raise Damaged(self.path, offset, f"a message of channel {channel}, which is not defined")
                     place = places[channel] = []
                 place += (log_time, at)
                 contents.messages += 1
@@ -321,10 +321,10 @@ class Container:
             raise Damaged(self.path, offset, f"a chunk of {size} bytes, expected at most {LONGEST}")
         try:
             if compression == "zstd":
-                # The size in the frame is allocated before anything is read, so it is looked at first.
+                # The size in the frame is allocated before decompression, so it is checked first.
                 stated = zstandard.frame_content_size(data)
                 if stated not in (-1, size):
-                    raise Damaged(self.path, offset, f"a chunk of {size} bytes whose data says {stated}")
+                    raise Damaged(self.path, offset, f"a chunk of {size} bytes whose data state {stated}")
                 data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size or 1)
             elif compression:
                 raise Damaged(self.path, offset, f"a chunk compressed by {compression!r}, expected zstd or none")
@@ -388,7 +388,7 @@ class Container:
             kept[name] = value
 
     def _end(self, body: bytes) -> None:
-        """Walk over the summary to the end of the file."""
+        """Read the summary up to the end of the file."""
         offset = self._base + self._at
         crc = zlib.crc32(self._buffer[: self._at], self._crc)
         stated = int.from_bytes(body[:4], "little")
@@ -425,7 +425,7 @@ class Container:
     # ------------------------------------------------------------------ bytes
 
     def _need(self, count: int) -> None:
-        """Have that many bytes from here on in the buffer, or as many as there are."""
+        """Read this number of bytes into the buffer, or as many as there are."""
         have = len(self._buffer) - self._at
         if have >= count:
             return
@@ -435,7 +435,7 @@ class Container:
         self._at = 0
 
     def _frame(self) -> tuple[int, int]:
-        """Return kind and length of the record here, with the whole record in the buffer."""
+        """Return kind and length of the current record, with the whole record in the buffer."""
         self._need(9)
         offset = self._base + self._at
         left = self._size - offset
@@ -458,14 +458,14 @@ class Container:
         return code, length
 
     def _torn(self, offset: int, rest: bytes = b"") -> Damaged:
-        """Return what to raise where the file ends inside a record: one that has its own end is not torn."""
+        """Return the error for a file that ends inside a record: a file with a footer is damaged, not torn."""
         self._file.seek(max(0, self._size - len(MAGIC)))
         if offset > 0 and self._file.read(len(MAGIC)) == MAGIC:
-            return Damaged(self.path, offset, "a record that leads beyond the end of the file")
+            return Damaged(self.path, offset, "a record that exceeds the end of the file")
         return Torn(self.path, offset, rest)
 
     def _only_zeros(self) -> bool:
-        """Return whether nothing but zeros follows: what a power cut leaves of a file that had grown."""
+        """Return whether only zeros follow, which a power cut may leave at the end of a file."""
         while True:
             if self._buffer[self._at :].strip(b"\0"):
                 return False

@@ -1,6 +1,6 @@
-"""Makes finished recordings compact, and removes the oldest ones where a limit is set.
+"""Compacts finished recordings, and removes the oldest ones if a retention limit is set.
 
-All of this runs on a thread of its own that yields to samples.
+All of this runs on a separate thread that yields to samples.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ log = logging.getLogger("compensator")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Retention:
-    """How much is kept.
+    """Retention limits.
 
     Parameters
     ----------
     keep_days : float, optional
-        Finished recordings that began longer ago are removed.
+        Finished recordings older than this are removed.
     keep_mb : float, optional
-        The oldest finished recordings are removed while all of them are larger together, MB (10⁶ bytes).
+        The oldest finished recordings are removed while their total size exceeds this, MB (10⁶ bytes).
     """
 
     keep_days: float | None = None
@@ -48,7 +48,7 @@ class Retention:
 
 
 class Finisher:
-    """Makes finished files compact and removes the oldest ones.
+    """Compacts finished files and removes the oldest ones.
 
     Parameters
     ----------
@@ -57,11 +57,11 @@ class Finisher:
     machine : str
         Name of the machine.
     retention : Retention
-        How much is kept.
+        Retention limits.
     signer : Signer, optional
-        Signs what is recovered.
+        Signs the seal of a recovered end.
     compacted : callable, optional
-        Makes one file compact and returns a remark about it, empty for none; by default a machine's, see `compact`.
+        Compacts one file and returns a remark, or an empty text; by default `compact`.
     """
 
     def __init__(
@@ -77,20 +77,20 @@ class Finisher:
         self._compact = compacted or (lambda path: compact(path, signer, yielding=True))
         self._lock = threading.Lock()
         self._jobs: deque[tuple[Path | None, int]] = deque()
-        #: What the disk did not let be made compact; tried again with the next file.
+        #: Files that could not be compacted because of the disk; retried with the next file.
         self._refused: list[Path] = []
-        #: Why the last removal failed, empty where none did.
+        #: Why the last removal failed; empty if it did not.
         self._unremoved = ""
         self._thread: threading.Thread | None = None
         self._remarks: list[tuple[str, dict[str, Any]]] = []
 
     def enqueue(self, path: Path, now_ns: int) -> None:
-        """Enqueue a file to be made compact in the background.
+        """Queue a file to be compacted in the background.
 
         Parameters
         ----------
         path : pathlib.Path
-            A recording with a hash chain; anything else is left alone.
+            A recording with a hash chain; other files are skipped.
         now_ns : int
             Now, ns since 1970 UTC, for the retention.
         """
@@ -100,7 +100,7 @@ class Finisher:
             self._begin([(job, now_ns) for job in jobs])
 
     def make_room(self, now_ns: int) -> None:
-        """Remove what exceeds the retention, in the background: the disk is full for the recording.
+        """Remove files beyond the retention limit in the background, because the disk is full.
 
         Parameters
         ----------
@@ -118,13 +118,13 @@ class Finisher:
             self._thread.start()
 
     def wait(self) -> None:
-        """Wait until nothing is left to do."""
+        """Wait until all jobs are done."""
         thread = self._thread
         if thread is not None:
             thread.join()
 
     def remarks(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return what happened since the last call: text and data."""
+        """Return the remarks since the last call: text and data."""
         with self._lock:
             remarks, self._remarks = self._remarks, []
         return remarks
@@ -137,19 +137,19 @@ class Finisher:
                     return
                 path, now_ns = self._jobs.popleft()
             error = self._compacted(path) if path is not None else None
-            # Also where the disk is too full for the copy: this is what makes room for it.
+            # Also if the disk is too full for the copy: the removal makes room for it.
             if self._remove_oldest(now_ns) and path is not None and isinstance(error, OSError):
                 error = self._compacted(path)
                 self._remove_oldest(now_ns)
             if error is not None and path is not None and path.exists():
-                text = f"{path.name}: could not be made compact and stays as it is: {error}"
+                text = f"{path.name}: could not be compacted and remains unchanged: {error}"
                 self._remark(text, RecordingData(code=RecordingCode.NOT_COMPACTED, file=path.name))
                 if isinstance(error, OSError):
                     with self._lock:
                         self._refused.append(path)
 
     def _compacted(self, path: Path) -> Exception | None:
-        """Make a file compact; return why it could not be."""
+        """Compact a file; return the error if that failed."""
         try:
             recovered = self._compact(path)
         except (OSError, DataError) as error:
@@ -164,9 +164,9 @@ class Finisher:
             self._remarks = [*self._remarks[-99:], (text, data.table())]
 
     def _remove_oldest(self, now_ns: int) -> bool:
-        """Remove what exceeds the retention; return whether something was removed.
+        """Remove files beyond the retention limit; return whether a file was removed.
 
-        The newest two stay: the one that is being written, and the finished one that the next start needs.
+        The newest two are kept: the one that is being written, and the finished one that the next start needs.
         """
         limits = self._retention
         if limits.keep_days is None and limits.keep_mb is None:
@@ -183,14 +183,14 @@ class Finisher:
                 path.unlink()
                 removed.append((path.name, sizes.pop(path)))
         except OSError as error:
-            if str(error) != self._unremoved:  # a disk that accepts nothing is tried every minute
-                text = f"what is beyond the limit of what is kept could not be removed: {error}"
+            if str(error) != self._unremoved:  # a failing disk is retried every minute
+                text = f"recordings beyond the retention limit could not be removed: {error}"
                 self._remark(text, RecordingData(code=RecordingCode.NOT_REMOVED))
             self._unremoved = str(error)
         if removed:
             size = sum(size for _, size in removed)
             names = [name for name, _ in removed]
-            text = f"{len(names)} recording(s) removed by the limit of what is kept, up to {names[-1]}"
+            text = f"{len(names)} recording(s) removed by the retention limit, up to {names[-1]}"
             self._remark(text, RecordingData(code=RecordingCode.REMOVED, removed=names, bytes=size))
         return bool(removed)
 
@@ -198,26 +198,26 @@ class Finisher:
 def compact(path: Path, signer: Signer | None = None, *, yielding: bool = False) -> str:
     """Replace a machine's live recording by a compact copy.
 
-    A torn end is finished: its complete records get their place in a `/chain` message, and a seal says `recovered`.
+    A torn end is finished: its complete records are listed in a `/chain` message, followed by a seal `recovered`.
 
     Parameters
     ----------
     path : pathlib.Path
-        A recording; one that is compact, has no hash chain or is being written is left alone.
+        A recording; a file that is compact, has no hash chain or is being written is skipped.
     signer : Signer, optional
         Signs the seal of a recovered end.
     yielding : bool
-        Whether to let other threads go first.
+        Whether to yield to other threads.
 
     Returns
     -------
     str
-        What was recovered, in words; empty where the file was complete.
+        What was recovered, as text; empty if the file was complete.
 
     Raises
     ------
     OSError, DataError
-        As from `rewrite`; the file stays as it is.
+        As by `rewrite`; the file is not changed.
     """
     copy = rewrite(path, partial(_ChainedCopy, signer=signer), yielding=yielding, chained=True)
     if not isinstance(copy, _ChainedCopy) or copy.recovered is None:
@@ -235,7 +235,7 @@ class _ChainedCopy(Copy):
         self._chain: chain.ChainWriter | None = None
         self._last: Message | None = None
         self._sealed = False
-        #: Records that had no place in the chain yet; None where the file was complete.
+        #: Records that were not yet in the chain; None if the file was complete.
         self.recovered: int | None = None
 
     def add(self, message: Message) -> None:
@@ -257,7 +257,7 @@ class _ChainedCopy(Copy):
     def finish(self) -> None:
         """Finish a torn end, and write the end of the file."""
         if self._chain is None or self._last is None:
-            raise DataError("nothing complete in it, expected at least one record")
+            raise DataError("no complete record, expected at least one")
         if not self._sealed:
             self.recovered = len(self._chain.links)
             if self.recovered:

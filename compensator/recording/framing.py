@@ -1,4 +1,4 @@
-"""The framing of MCAP: kinds of records, their fields, and the errors where bytes cannot be one."""
+"""The framing of MCAP: kinds of records, their fields, and the errors for invalid bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFS
 
 
 class Damaged(DataError):
-    """A file that is no MCAP file from here on."""
+    """A file that is not valid MCAP from some byte on."""
 
     def __init__(self, path: Path, offset: int, text: str) -> None:
         super().__init__(f"{path}: byte {offset}: {text}")
@@ -25,7 +25,7 @@ class Torn(Damaged):
     Parameters
     ----------
     rest : bytes
-        The beginning of the record that is not complete, at most 1 MiB of it.
+        The start of the incomplete record, at most 1 MiB.
     """
 
     def __init__(self, path: Path, offset: int, rest: bytes = b"") -> None:
@@ -34,7 +34,7 @@ class Torn(Damaged):
 
 
 class Fields:
-    """Fields of one record; a length that leads beyond it is damage."""
+    """Fields of one record; a length that exceeds it is damage."""
 
     def __init__(self, path: Path, offset: int, body: bytes, at: int = 0) -> None:
         self._path, self._offset, self._body, self._at = path, offset, body, at
@@ -90,10 +90,10 @@ class Fields:
         return found
 
     def rest(self) -> bytes:
-        """Read everything that is left."""
+        """Read the remaining bytes."""
         return self._read(len(self._body) - self._at)
 
     def done(self) -> None:
-        """Check that nothing is left."""
+        """Check that no bytes remain."""
         if self._at != len(self._body):
             raise Damaged(self._path, self._offset, f"{len(self._body) - self._at} bytes more than the record has")

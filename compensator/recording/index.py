@@ -1,9 +1,9 @@
-"""Whether the index of an MCAP file leads to every record of it, and to nothing else.
+"""Checks that the index of an MCAP file leads to every record of it, and to nothing else.
 
-The hash chain covers the content of the records. Readers that seek (Foxglove, the JavaScript library) see only what the
-index leads to: an entry that is missing or leads elsewhere hides records that are there. So the data section is noted
-while it is read, and the index is compared with it: the message indexes after each chunk, and in the summary the
-chunks, attachments and metadata, the statistics, the repeated schemas and channels, and the offsets.
+The hash chain covers the content of the records. Readers that seek (Foxglove, the JavaScript library) find only records
+in the index: a missing or wrong entry hides records. The index is therefore compared with the data section while that
+is read: the message indexes after each chunk, and in the summary the chunks, attachments and metadata, the statistics,
+the repeated schemas and channels, and the offsets.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from compensator.recording.framing import (
     Fields,
 )
 
-#: Number of faults that are kept; the rest is counted.
+#: Number of faults that are kept; further faults are counted.
 KEPT = 50
 _NAMES = {
     SCHEMA: "schema",

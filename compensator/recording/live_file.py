@@ -1,4 +1,4 @@
-"""MCAP files that are being written: what is synced survives a kill and a power cut."""
+"""MCAP files that are being written: synced data survives a kill and a power cut."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
 
 @dataclass(slots=True)
 class _Sink:
-    """What the MCAP writer wrote since the last sync; the file gets it in one piece."""
+    """Buffer of the MCAP writer since the last sync, written to the file at once."""
 
     data: bytearray = field(default_factory=bytearray)
     size: int = 0
@@ -64,7 +64,7 @@ class LiveFile:
         self.synced = 0
 
     def sync(self) -> None:
-        """Bring everything to disk."""
+        """Write everything to disk."""
         self.writer.flush()  # type: ignore[no-untyped-call]
         view = memoryview(bytes(self._sink.data))
         while view:
@@ -74,13 +74,13 @@ class LiveFile:
         self.synced = self._sink.size
 
     def finish(self) -> None:
-        """Write the end and close the file; from here on others may use it."""
+        """Write the end, close the file and release its lock."""
         self.writer.finish()  # type: ignore[no-untyped-call]
         self.sync()
         os.close(self._descriptor)
 
     def give_up(self) -> bool:
-        """Cut off what was not synced and close the file; return whether the disk accepted that."""
+        """Truncate the file to its last sync and close it; return whether that succeeded."""
         cut = True
         try:
             os.ftruncate(self._descriptor, self.synced)
@@ -96,12 +96,12 @@ class LiveFile:
 
 
 class Opening:
-    """Writes what a file opens with: channels under their numbers, metadata, attachments.
+    """Writes the start of a file: channels with their numbers, metadata, attachments.
 
     Parameters
     ----------
     writer : Writer
-        Of the file.
+        Writer of the file.
     """
 
     def __init__(self, writer: Writer) -> None:
@@ -112,12 +112,12 @@ class Opening:
         self.topics: dict[int, str] = {}
 
     def write(self, contents: Contents) -> None:
-        """Write what was not written yet; after the first call these are further channels.
+        """Write the parts that were not yet written; after the first call only further channels.
 
         Raises
         ------
         DataError
-            If a channel has not the number that it gets here.
+            If a channel does not have the number that it gets here.
         """
         writer = self._writer
         if not self._begun:
@@ -130,7 +130,7 @@ class Opening:
                 self._schemas[schema] = writer.register_schema(*schema)
             schema_number = self._schemas.get(schema, 0)
             if number != writer.register_channel(channel.topic, channel.encoding, schema_number, channel.metadata):
-                raise DataError(f"channel {number} {channel.topic}: expected the numbers that the recorder gives")
+                raise DataError(f"channel {number} {channel.topic}: expected the channel numbers of the recorder")
             self.topics[number] = channel.topic.lstrip("/")
         if self._begun:
             return
@@ -170,7 +170,7 @@ class RecordingFile(LiveFile):
         return self._chain.head
 
     def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
-        """Write what the file opens with."""
+        """Write the start of the file."""
         contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
         for number, topic in enumerate(TOPICS, 1):
             about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
@@ -208,7 +208,7 @@ def _create(paths: Iterable[Path]) -> tuple[Path, int]:
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except FileExistsError:
             continue
-        # Locked until the file is finished, so that it is not mistaken for one that was left behind.
+        # Locked until the file is finished, so that it is not treated as abandoned.
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return path, descriptor
-    raise OSError(f"{path}: it and every name before it is in use")
+    raise OSError(f"{path}: this name and all names before it are in use")

@@ -1,4 +1,4 @@
-"""Names of recordings: of what they are, and the UTC time at which they were opened, `vmc-07_20260105T060000Z.mcap`."""
+"""Names of recordings: machine (or `shop`) and UTC time of creation, such as `vmc-07_20260105T060000Z.mcap`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _STAMP = "%Y%m%dT%H%M%SZ"
 
 
 def day_of(time_utc_ns: int) -> str:
-    """Return the UTC day of a time; a file holds one day.
+    """Return the UTC day of a time; a file contains one day.
 
     Examples
     --------

@@ -25,13 +25,13 @@ class RawRecord(NamedTuple):
     Parameters
     ----------
     topic : str
-        Of a machine's recording `sample`, `estimate`, `offset`, `event`, `seal` or `chain`.
+        In a machine's recording `sample`, `estimate`, `offset`, `event`, `seal` or `chain`.
     sequence : int
         Number of the record in the file.
     log_time_ns : int
-        When it was written.
+        Time of writing.
     body : bytes
-        What the hash chain runs over, see `Message`.
+        Bytes covered by the hash chain; see `Message`.
     """
 
     topic: str
@@ -46,7 +46,7 @@ class RawRecord(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Records that were brought to disk together.
+    """Records that were written to disk together.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Group(NamedTuple):
     chain : RawRecord or None
         The `/chain` message that lists them; None in a file without a hash chain.
     whole : bool
-        Whether the group has its end; only the last one of a file may lack it.
+        Whether the group is complete; only the last group of a file may be incomplete.
     """
 
     records: list[RawRecord]
@@ -71,7 +71,7 @@ def records_of(container: Container) -> Iterator[RawRecord]:
     DataError
         If it is not an MCAP file.
     Damaged
-        Where it cannot be read any further.
+        If it cannot be read any further.
     """
     topics: dict[int, str] = {}
     channels = container.contents.channels
@@ -93,7 +93,7 @@ def groups_of(container: Container) -> Iterator[Group]:
     DataError
         If it is not an MCAP file.
     Damaged
-        Where it cannot be read any further; everything before that was yielded.
+        If it cannot be read any further; everything before that was yielded.
     """
     records: list[RawRecord] = []
     end = ""
@@ -127,7 +127,8 @@ def read_messages(path: Path, topics: tuple[str, ...] | None = None, *, prefix: 
     topics : tuple of str, optional
         Only these.
     prefix : str
-        Of a shop's recording: the machine's, such as `shop/vmc-07`; its messages come by the topics of its own.
+        Prefix of a machine in a shop's recording, such as `shop/vmc-07`; its messages get the topics of a machine's own
+        recording.
 
     Raises
     ------
@@ -205,16 +206,16 @@ def decode_with(decoder: msgspec.json.Decoder[_T], record: RawRecord, file: str)
     Parameters
     ----------
     decoder : msgspec.json.Decoder
-        What is expected.
+        Decoder of the expected type.
     record : RawRecord
         The message.
     file : str
-        Where it is, for the error.
+        File name, for the error.
 
     Raises
     ------
     DataError
-        If it is something else; the line names file, topic and record.
+        If the message has another type; the error names file, topic and record.
     """
     try:
         return decoder.decode(record.data)
@@ -228,7 +229,7 @@ def recordings(folder: Path, machine: str) -> list[Path]:
 
 
 def recordings_in(given: Iterable[Path]) -> list[Path]:
-    """Return the recordings given; a folder stands for those in it.
+    """Return the given recordings; a folder is replaced by the recordings in it.
 
     Raises
     ------
@@ -245,17 +246,17 @@ def recordings_in(given: Iterable[Path]) -> list[Path]:
 
 
 def _found(folder: Path, pattern: str) -> list[Path]:
-    # By stem: the second file of a second, "…Z-001.mcap", would sort before the first, "…Z.mcap".
+    # Sorted by stem: a second file of the same second, "…Z-001.mcap", would sort before the first, "…Z.mcap".
     return sorted(folder.glob(pattern), key=lambda path: path.stem)
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
-    """Return recordings of one machine in the order in which they were begun, each once.
+    """Return recordings of one machine in the order of their start, each once.
 
     Raises
     ------
     DataError
-        If one is not an MCAP file, or they are of several machines.
+        If a file is not an MCAP file, or the files belong to several machines.
     """
     began: dict[Path, str] = {}
     machines: set[str] = set()
@@ -270,10 +271,10 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
 
 
 def last_value(path: Path) -> bytes:
-    """Return the value with which the chain of the next file begins, empty where a file has no chain.
+    """Return the value with which the chain of the next file starts; empty if a file has no chain.
 
-    It is that of the last complete record, but not of a seal that was added afterwards, when a torn end was finished:
-    the next file was begun without it.
+    It is the value of the last complete record, not of a seal that was added later to finish a torn end, because the
+    next file was started without it.
 
     Raises
     ------
@@ -297,9 +298,9 @@ def last_value(path: Path) -> bytes:
 def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:
     """Return a sequence number that the machine has never published.
 
-    Numbers continue after the last one on disk. A recording may have been removed, or a disk may not have accepted the
-    last ones, so the number is also at least that of the periods since 2020: a service cannot have published
-    more samples than there were periods.
+    Numbers continue after the last one on disk. Because a recording may have been removed, or the disk may not have
+    accepted the last samples, the number is also at least the number of periods since 2020: a service cannot have
+    published more samples than that.
 
     Parameters
     ----------
@@ -317,7 +318,7 @@ def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> 
 
 
 def last_sequence(folder: Path, machine: str) -> int:
-    """Return the highest sequence number that was ever published, −1 where there is none."""
+    """Return the highest recorded sequence number; −1 if there is none."""
     for path in reversed(recordings(folder, machine)):
         highest = max((message.seq for message in messages(path, ("sample", "offset"))), default=-1)
         if highest >= 0:

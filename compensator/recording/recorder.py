@@ -1,9 +1,9 @@
 """Writes every sample to MCAP so that a kill loses nothing.
 
-There is one file a day and one at each start. The live file is not chunked; every sample is synced to disk before its
-offset is published. The configuration, the model and the state of the compensation are attached to each file. A hash
-chain covers everything (`recording/chain.py`) and leads from file to file; where a key is configured it is signed every
-hour and at the end. `recording/finishing.py` rewrites a finished file compactly.
+A new file is started every day and at each start. The live file is not chunked; every sample is synced to disk before
+its offset is published. The configuration, the model and the state of the compensation are attached to each file. A
+hash chain covers everything (`recording/chain.py`) and continues from file to file; if a key is configured, it is
+signed every hour and at the end. `recording/finishing.py` compacts finished files.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class McapRecorder:
     machine : str
         Name of the machine.
     attachments : dict of str to bytes
-        Files that are attached to each recording, by name, as they are when it is opened.
+        Files to attach to each recording, by name.
     retention : Retention, optional
-        How much is kept; everything by default.
+        Retention limits; by default everything is kept.
     signer : Signer, optional
         Signs the chain.
     """
@@ -73,7 +73,7 @@ class McapRecorder:
     def write(
         self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"", sync: bool = True
     ) -> None:
-        """Write records and bring all of them to disk before returning.
+        """Write records and sync them to disk before returning.
 
         Parameters
         ----------
@@ -82,15 +82,14 @@ class McapRecorder:
         time_utc_ns : int
             Time of the records, ns since 1970 UTC.
         state : bytes
-            State of the compensation before these records; attached as `state.json` to a file that opens with them.
+            State of the compensation before these records; attached as `state.json` if they start a new file.
         sync : bool
-            If false they come to disk together with the next ones.
+            If false, they are synced together with the next records.
 
         Raises
         ------
         OSError
-            If the disk refuses them. What was written since the last sync is cut off again, the file is given up, and
-            the next call opens a new one.
+            If writing fails. The file is truncated to the last sync and abandoned, and the next call starts a new file.
         """
         day = day_of(time_utc_ns)
         try:
@@ -110,30 +109,30 @@ class McapRecorder:
             raise
 
     def close(self) -> None:
-        """Finish the file, if there is one, and wait until it is compact."""
+        """Finish the file, if there is one, and wait until it is compacted."""
         try:
             self._finish("stop")
         finally:
             self._finisher.wait()
 
     def start_new(self, attachments: Mapping[str, bytes] | None = None) -> None:
-        """Finish the file, so that the next write opens a new one.
+        """Finish the file, so that the next write starts a new one.
 
         Parameters
         ----------
         attachments : mapping of str to bytes, optional
-            Replace those of the same name from here on.
+            Attachments that replace those of the same name from now on.
 
         Raises
         ------
         OSError
-            If the disk refuses the end of the file; the file is given up, and the next write opens a new one.
+            If the end of the file cannot be written; the file is abandoned, and the next write starts a new one.
         """
         self.attachments = {**self.attachments, **(attachments or {})}
         self._finish("new")
 
     def remarks(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return what happened to finished files since the last call: text and data of events."""
+        """Return text and data of events about finished files since the last call."""
         return self._finisher.remarks()
 
     def _finish(self, reason: str) -> None:
@@ -150,7 +149,7 @@ class McapRecorder:
         self._finisher.enqueue(live.path, live.time_ns)
 
     def _give_up(self) -> None:
-        """Leave the file as it was after the last sync."""
+        """Abandon the file in its state after the last sync."""
         live, self._live = self._live, None
         self._reason = "failure"
         # Read from the file when the next one opens: only the file shows what it contains.
@@ -161,7 +160,7 @@ class McapRecorder:
     def _open(self, time_utc_ns: int, day: str, state: bytes) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         if self._uncut is not None:
-            # What follows is written again.
+            # The records after the last sync are written again.
             path, size = self._uncut
             if path.exists() and path.stat().st_size > size:
                 os.truncate(path, size)

@@ -12,7 +12,7 @@ from compensator.messages import Seal
 from compensator.recording.chain import signed_bytes
 
 _MISSING = "signatures need the package cryptography: pip install quill-compensator[sign]"
-#: Why a file is no key, by the half that was expected.
+#: Why a file is not a valid key, by the expected half.
 _UNREADABLE = {
     "private": "recording.signing_key: no PEM private key without a password",
     "public": "no PEM public key, expected the machine's (openssl pkey -pubout)",
@@ -31,7 +31,7 @@ class Signer:
     Raises
     ------
     ConfigError
-        If it cannot be read or is no such key.
+        If the file cannot be read or is not such a key.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,7 +56,7 @@ class Verifier:
     Raises
     ------
     UsageError
-        If it cannot be read or is no such key.
+        If the file cannot be read or is not such a key.
     """
 
     def __init__(self, path: Path) -> None:

@@ -24,7 +24,7 @@ class MachineDay:
     Parameters
     ----------
     name : str
-        Of the machine.
+        Name of the machine.
     figures : dict
         Errors without compensation, with the offset held, and with its rate followed.
     errors : dict of str to numpy.ndarray
@@ -96,8 +96,8 @@ def closed(loop: Mapping[str, Any]) -> str:
     if loop["adopted"]:
         return f"{left}; with the effects that the diagnosis found in the recordings, {rms['extended']:.2f}."
     return (
-        f"{left}; what the diagnosis found in the recordings ({', '.join(loop['found']) or 'nothing'}) is not "
-        "deployable, or does not hold on held-out blocks, so the model was not changed."
+        f"{left}; the effects that the diagnosis found in the recordings ({', '.join(loop['found']) or 'none'}) are "
+        "not deployable or do not reduce the error on held-out blocks, so the model was not changed."
     )
 
 
@@ -134,7 +134,7 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
         else "The model was not changed: both days are the same."
     )
     return Section(
-        title="Closed loop: an effect absent from the calibration, on a second day with another duty",
+        title="Closed loop: an effect absent from the calibration, on a second day with another duty cycle",
         blocks=[
             Figure(
                 title="Second day, error in Y with each model",
@@ -148,7 +148,7 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
                 head=["conduction machine", "rms µm"],
                 rows=rows,
                 note=f"Found in the recordings of the first day: {', '.join(loop['found']) or 'nothing'} "
-                f"({str(loop['verdict']).replace('_', ' ')}). Drawn by the seed: {loop['drawn']}. {adopted}",
+                f"({str(loop['verdict']).replace('_', ' ')}). Effect drawn by the seed: {loop['drawn']}. {adopted}",
             ),
         ],
     )
@@ -176,6 +176,6 @@ def _comparison(paper: Sequence[Comparison]) -> Table:
     return dataclasses.replace(
         comparison_table(paper),
         title="",
-        note="Identified from a run with 1 % measuring error and one step of 90 W in still air: the TTF is recovered, "
-        "the slow part of DTF and TDTF only within its standard errors.",
+        note="Identified from a run with 1 % measurement error and one step of 90 W in still air: the TTF is "
+        "recovered, the slow part of DTF and TDTF only within its standard errors.",
     )

@@ -44,9 +44,9 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
     diagnosis : Diagnosis
         The diagnosis.
     model : ThermalModel
-        As written, with its hash.
+        The extended model as written, with its hash.
     remarks : sequence of str
-        Corrections made while reading the data.
+        Remarks on the data.
     """
     t = _hours(diagnosis)
     blocks: list[Block] = [_before_and_after(t, diagnosis), error_table(diagnosis)]

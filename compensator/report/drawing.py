@@ -1,4 +1,4 @@
-"""Draws figures with matplotlib as SVG in CSS variables, so that one file serves light and dark screens and paper."""
+"""Draws figures with matplotlib as SVG with CSS variables, so that one file suits light and dark screens and paper."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
     figure : Figure
         What to draw.
     prefix : str
-        Keeps its identifiers apart from those of other figures on the page.
+        Prefix that makes its identifiers unique on the page.
     width : float
         Width, inches; smaller for figures side by side, so that the text stays readable.
     """
@@ -124,7 +124,7 @@ def _axes(axes: Axes, figure: Figure, unit: float) -> None:
 
 
 def _strips(axes: Axes, figure: Figure) -> None:
-    """Draw rows of time, the first on top; each piece has a least width, so that it remains visible."""
+    """Draw rows of time, the first on top; each piece has a minimum width, so that it remains visible."""
     unit = _DAY_S if figure.clock else 1.0
     first, last = figure.x_limits or (
         min((a for s in figure.strips for a, _ in s.spans), default=0.0),

@@ -1,7 +1,7 @@
 """Writes a page as HTML, as PDF or as PNG; PDF and PNG are printed by an installed browser.
 
-The browser sees one file of ours in a temporary folder, with a profile of its own and no network, for at most
-`TIMEOUT_S`; the page's own policy forbids scripts. What it printed replaces the target only when it is complete.
+The browser opens one file in a temporary folder, with a separate profile and no network, for at most `TIMEOUT_S`; the
+page's content security policy forbids scripts. The printed file replaces the target only when it is complete.
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ def checked(path: Path, *, option: str) -> Path:
     Parameters
     ----------
     path : pathlib.Path
-        Where the page goes.
+        File of the page.
     option : str
         The option that named it.
 
     Raises
     ------
     UsageError
-        If its suffix is none of `SUFFIXES`, its folder does not exist, or it needs a browser and none is installed.
+        If its suffix is not in `SUFFIXES`, its folder does not exist, or it needs a browser and none is installed.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"{option} {path}: expected a name that ends in .html, .pdf or .png")
@@ -76,8 +76,8 @@ def checked(path: Path, *, option: str) -> Path:
         raise UsageError(f"{option} {path}: no such folder")
     if path.suffix.lower() != ".html" and _browser() is None:
         raise UsageError(
-            f"{option} {path}: no browser found to print with (Chromium, Chrome, Edge or Brave on PATH); "
-            "expected a name that ends in .html: any browser prints that page"
+            f"{option} {path}: no browser found for printing (Chromium, Chrome, Edge or Brave on PATH); "
+            "expected a name that ends in .html, which any browser can print"
         )
     return path
 
@@ -95,7 +95,7 @@ def write(path: Path, page: Page) -> Path:
     Raises
     ------
     CompensatorError
-        If there is no browser, or it does not print the page in time; an existing file then stays as it is.
+        If there is no browser, or it does not print the page in time; an existing file is then not changed.
     OSError
         If the file cannot be written.
     """
@@ -103,7 +103,7 @@ def write(path: Path, page: Page) -> Path:
     if suffix == ".html":
         return write_page(path, page)
     path = path.resolve()
-    # In the target's folder: browsers in a sandbox of the system (snap) see no /tmp, and the last step is a rename.
+    # In the target's folder: sandboxed browsers (snap) cannot read /tmp, and the last step is a rename.
     with tempfile.TemporaryDirectory(
         dir=path.parent, prefix=f"{path.stem}-printing-", ignore_cleanup_errors=True
     ) as name:
@@ -131,10 +131,10 @@ def _browser() -> str | None:
 
 
 def _print(path: Path, source: Path, printed: Path, options: list[str]) -> None:
-    """Have the browser print a file; end it and all of its processes."""
+    """Print a file with the browser; end all of its processes."""
     browser = _browser()
     if browser is None:
-        raise CompensatorError(f"{path}: no browser found to print with; write .html and print that from any browser")
+        raise CompensatorError(f"{path}: no browser found for printing; write .html and print it from any browser")
     command = [browser, *_OPTIONS, f"--user-data-dir={source.parent / 'profile'}", *options]
     # The browser's sandbox refuses to run as root.
     command += ["--no-sandbox"] if os.geteuid() == 0 else []
@@ -157,7 +157,7 @@ def _print(path: Path, source: Path, printed: Path, options: list[str]) -> None:
             process.wait()
     if not printed.is_file() or not printed.read_bytes().startswith(_SIGNATURES[printed.suffix]):
         lines = log.read_text(encoding="utf-8", errors="replace").strip().split("\n")
-        # A machine without a desktop has no D-Bus, which every browser complains about and none needs.
+        # Without a desktop there is no D-Bus; browsers report that as an error but do not need it.
         last = next((line for line in reversed(lines) if line and "dbus" not in line), "no reason given")
         raise CompensatorError(f"{path}: {browser} could not print the page: {last[:200]}")
 

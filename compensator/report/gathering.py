@@ -25,9 +25,9 @@ from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, 
 
 _NS = 1e-9
 _DAY_S = 86400.0
-#: Values that are added to a curve in one call.
+#: Number of values that are added to a curve in one call.
 _TOGETHER = 5000
-#: Samples farther apart than this number of periods have time without a recording between them.
+#: Samples farther apart than this number of periods are separated by time without a recording.
 _GAP = 1.5
 
 
@@ -44,7 +44,7 @@ def read_history(paths: Sequence[Path], *, progress: Callable[[int, int], None] 
     Raises
     ------
     DataError
-        If one of them is no recording, there are no samples, or they are of several machines.
+        If a file is not a recording, there are no samples, or the files belong to several machines.
     """
     ordered = in_order(paths)
     total = sum(path.stat().st_size for path in ordered)
@@ -109,7 +109,7 @@ class _Reader:
         history = self.history
         if not history.whole.samples or not history.states:
             names = ", ".join(file.name for file in history.files[:3])
-            raise DataError(f"{names}: no samples in it; expected recordings of a machine's service")
+            raise DataError(f"{names}: no samples; expected recordings of a machine's service")
         history.episodes.sort(key=lambda episode: episode.number)
         return history
 

@@ -1,4 +1,4 @@
-"""The history of a machine as its recordings show it: figures, curves and episodes in bounded memory."""
+"""The history of a machine from its recordings: figures, curves and episodes in bounded memory."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class File:
     first_s, last_s : float
         Times of the first and last sample, s since 1970 UTC; NaN without any.
     end : str
-        `RecordingEnd.FINISHED`, `RecordingEnd.OPEN`, or where it is damaged.
+        `RecordingEnd.FINISHED`, `RecordingEnd.OPEN`, or the byte at which it is damaged.
     """
 
     name: str

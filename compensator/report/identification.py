@@ -52,7 +52,7 @@ def page_of(
     criticism : Criticism
         Its diagnostics.
     model : ThermalModel
-        As written, with its hash.
+        The model as written, with its hash.
     comparison : sequence of Comparison
         Coefficients compared with those of another model.
     """
@@ -90,7 +90,7 @@ def _prediction(calibration: Calibration) -> Figure:
         y_label="Y, µm",
         lines=(Line("measured", t, y), Line("predicted", t, predicted)),
         spans=spans,
-        note="Measured Y is not fed back." + (" Shaded: held out from fit and selection." if spans else ""),
+        note="Measured Y is not fed back." + (" Shaded: held out from fitting and selection." if spans else ""),
     )
 
 

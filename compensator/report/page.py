@@ -1,8 +1,8 @@
-"""A self-contained HTML page: the verdict, the figure that supports it, tables, and details to open.
+"""A self-contained HTML page: the verdict, the figure that supports it, tables, and folded details.
 
-A page loads nothing and runs no script; its content security policy enforces both. Figures are SVG whose colours are
-CSS variables, so that one page serves light and dark screens and paper. Each code on a page links to its meaning and
-action at the end of the page.
+A page loads nothing and runs no script; its content security policy enforces both. Figures are SVG with CSS variables
+as colours, so that one page suits light and dark screens and paper. Each code on a page links to its meaning and action
+at the end of the page.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 
 Tone = Literal["good", "warn", "bad"]
-#: Widths of a figure alone and of one in a row, inches: the text of both stays readable.
+#: Widths of a single figure and of one in a row, inches: the text of both stays readable.
 _WIDE_IN, _NARROW_IN = 9.0, 4.8
-#: Longest cell that stays on one line, and longest word (a file name, a hash) that is not broken, letters.
+#: Longest cell on one line, and longest unbroken word (a file name, a hash), characters.
 _LONGEST_CELL, _LONGEST_WORD = 36, 24
 TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "bad": "✗ Failed"}
-#: Inline styles are all that a page needs.
+#: A page needs inline styles only.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
@@ -119,7 +119,7 @@ def write_page(path: Path, page: Page) -> Path:
 
 
 def codes_of(blocks: Iterable[Block]) -> list[str]:
-    """Return all codes in blocks that have an explanation, in order of appearance."""
+    """Return all explained codes in blocks, in order of appearance."""
     words: dict[str, None] = {}
     for block in blocks:
         for cell in _cells(block):
@@ -212,7 +212,7 @@ def _classes(table: Table) -> list[str]:
 
 
 def _cell(cell: Cell, kind: str, scope: str) -> str:
-    """Return a cell; an empty one is no header."""
+    """Return a cell; an empty cell is not a header."""
     style = f' class="{kind}"' if kind else ""
     return f'<th scope="{scope}"{style}>{_inline(cell)}</th>' if scope and cell else f"<td{style}>{_inline(cell)}</td>"
 
@@ -228,7 +228,7 @@ def _inline(cell: Cell) -> str:
     return html.escape(cell)
 
 
-# Pages are made of figures, too.
+# Figures are blocks of a page, too.
 __all__ = [
     "Block",
     "Cell",

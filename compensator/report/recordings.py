@@ -34,7 +34,7 @@ STATES = (State.OK, State.DEGRADED, State.STARTING, State.HOLD, State.FAULT, NO_
 _FOLLOWS = (State.OK, State.DEGRADED)
 #: Share of the time without a following offset (or degraded) above which the verdict is worse.
 _MUCH = 0.1
-#: A remaining error beyond this multiple of the stated standard deviation is not noise: the model or a sensor is wrong.
+#: A remaining error beyond this multiple of the stated standard deviation is attributed to the model or a sensor.
 _BEYOND = 3.0
 #: Longest table of days; more days are summed by months.
 _DAYS = 31
@@ -62,7 +62,7 @@ def page_of(history: History) -> Page:
     Parameters
     ----------
     history : History
-        Read from them.
+        History read from the recordings.
     """
     beyond = _beyond(history.whole)
     blocks: list[Block] = [
@@ -120,11 +120,11 @@ def verdict(history: History) -> str:
     followed = sum(seconds[state] for state in _FOLLOWS)
     # "All" only if nothing is missing.
     share = "all" if followed == total else f"{min(100.0 * followed / total, 99.9):.1f} %"
-    words = f"The correction followed the machine for {share} of {_hours(total)}"
+    words = f"The offset followed the machine for {share} of {_hours(total)}"
     if whole.left.samples:
         words += (
             f"; the measured error in Y was {whole.measured.rms:.1f} µm rms, of which {whole.left.rms:.1f} remain with "
-            f"the correction{_against_stated(whole)}"
+            f"the offset applied{_against_stated(whole)}"
         )
     elif whole.offset.samples:
         words += f"; it reached {signed(whole.offset.peak, 1)} µm"
@@ -136,16 +136,18 @@ def _against_stated(whole: Period) -> str:
     if _beyond(whole) is not None:
         return (
             f": {whole.left.rms / whole.std.rms:.0f} times the standard deviation of {_short(whole.std.rms)} that the "
-            "service states, so the model lacks an effect or a sensor is wrong"
+            "service states, so the model lacks an effect or a sensor is faulty"
         )
     return f" (the service states a standard deviation of {_short(whole.std.rms)})" if whole.std.rms > 0.0 else ""
 
 
 def _beyond(whole: Period) -> Remark | None:
-    """Warn where the remaining error exceeds what the service states."""
+    """Warn if the remaining error exceeds the standard deviation that the service states."""
     if not (whole.left.samples and 0.0 < _BEYOND * whole.std.rms < whole.left.rms):
         return None
-    remains = f"{_short(whole.left.rms)} rms remain with the correction; the service states {_short(whole.std.rms)}."
+    remains = (
+        f"{_short(whole.left.rms)} rms remain with the offset applied; the service states {_short(whole.std.rms)}."
+    )
     return Remark(AuditRemark.LEFT_BEYOND_STATED, remains)
 
 
@@ -421,7 +423,7 @@ def _files(history: History) -> Details:
                 title="Recordings",
                 head=["file", "samples", "first, UTC", "last, UTC", "end"],
                 rows=files,
-                note="Integrity is not checked here; compensator replay does that.",
+                note="Integrity is not checked here; use compensator replay.",
             ),
             Table(title="Models", head=["model", "from, UTC", "SHA-256"], rows=models),
         ],
@@ -457,7 +459,7 @@ def _hours(seconds: float) -> str:
 
 def _share(history: History, state: str) -> str:
     share = history.whole.seconds[state] / sum(history.whole.seconds.values())
-    # Not rounded to nothing or all.
+    # Never rounded to 0 or 100 %.
     shown = share if share in (0.0, 1.0) else min(max(share, 0.0005), 0.9995)
     return f"{100.0 * shown:.1f} %"
 

@@ -21,7 +21,7 @@ from compensator.report.page import Block, Cell, Link, Page, Table, Tone
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PageFile:
-    """A page and its result; without a result next to it, the title is the folder's name and there is no verdict."""
+    """A page and its result; if no result is found, the title is the folder's name and there is no verdict."""
 
     path: Path
     title: str
@@ -30,13 +30,13 @@ class PageFile:
 
 
 def pages_in(folder: Path) -> list[PageFile]:
-    """Return the pages `report.html` of a folder and its subfolders, the uppermost first."""
+    """Return the pages `report.html` of a folder and its subfolders, the topmost first."""
     paths = sorted(folder.rglob("report.html"), key=lambda path: (len(path.parts), path))
     return [_diagnosis(path) or _calibration(path) or PageFile(path=path, title=path.parent.name) for path in paths]
 
 
 def _diagnosis(page: Path) -> PageFile | None:
-    """Return the page of a diagnosis, by its `diagnosis.json`."""
+    """Return the page of a diagnosis, from its `diagnosis.json`."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         found = json.loads(page.with_name("diagnosis.json").read_text(encoding="utf-8"))
         return PageFile(path=page, title="Diagnosis", verdict=diagnosis_verdict(found), tone=TONES[found["verdict"]])
@@ -44,7 +44,7 @@ def _diagnosis(page: Path) -> PageFile | None:
 
 
 def _calibration(page: Path) -> PageFile | None:
-    """Return the page of a calibration, by the model file that keeps its errors."""
+    """Return the page of a calibration, from the model file with its errors."""
     for path in sorted(page.parent.glob("*.toml")):
         with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
             model = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -81,7 +81,7 @@ def overview(folder: Path, pages: Sequence[PageFile], *, relative_to: Path) -> P
                 title="Recordings",
                 head=["folder", "files"],
                 rows=[[str(path.relative_to(folder)), str(len(list(path.glob("*.mcap"))))] for path in folders],
-                note="compensator report FOLDER makes a page of one.",
+                note="`compensator report FOLDER` makes a page from one of them.",
             )
         )
     title = f"{folder.resolve().name}: {first.title}"

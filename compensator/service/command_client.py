@@ -1,4 +1,4 @@
-"""Sends commands to a running service, for an operator's program."""
+"""Sends an operator's commands to a running service."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class NotReached(ServiceError):
 
 
 class Operator(NamedTuple):
-    """How an operator reaches services.
+    """Name and Zenoh configuration of an operator.
 
-    `name` is the common name of the certificate; without TLS the user's name on this computer, which is no proof. It is
-    empty if neither can be part of a key.
+    `name` is the common name of the certificate, or without TLS the user name on this computer, which is not
+    authenticated. It is empty if neither can be part of a key.
     """
 
     config: zenoh.Config
@@ -48,7 +48,7 @@ def operator_of_file(path: Path) -> Operator:
     Raises
     ------
     ConfigError
-        If it, or a file that it names, cannot be used.
+        If the file, or a file named in it, cannot be used.
     """
     config, tls = read_config_file(path)
     if get(config, "mode") not in (None, "client"):
@@ -66,7 +66,9 @@ def operator_of_file(path: Path) -> Operator:
     if wrong is not None:  # the router would refuse it, which looks like a missing service
         raise ConfigError(f"{path}: {wrong}")
     if get(config, "transport/link/tls/enable_mtls") is not True:
-        raise ConfigError(f"{path}: transport/link/tls/enable_mtls: expected true, or no certificate is shown")
+        raise ConfigError(
+            f"{path}: transport/link/tls/enable_mtls: expected true, otherwise the certificate is not presented"
+        )
     name = common_name_of(files.certificate)
     if not SENDER.fullmatch(name):
         raise ConfigError(f"{files.certificate}: common name {name!r}, expected letters, digits, . _ -")
@@ -74,16 +76,16 @@ def operator_of_file(path: Path) -> Operator:
 
 
 def operator_here(settings: Zenoh) -> Operator | None:
-    """Return how the service of a configuration is reached from its own computer; None if it cannot be.
+    """Return the operator for a service on this computer, from its configuration; None if it cannot be reached.
 
     Raises
     ------
     UsageError
-        If that needs an operator's certificate: the machine's own may send no commands.
+        If an operator's certificate is needed: the machine's own must not send commands.
     """
     if settings.secured():
         raise UsageError(
-            "--zenoh: missing; over TLS commands need an operator's certificate, expected a Zenoh "
+            "--zenoh: missing; commands over TLS need an operator's certificate, expected a Zenoh "
             "configuration such as operator.json5"
         )
     endpoints = [*local_endpoints(settings), *settings.connect]
@@ -106,9 +108,9 @@ def ask(
     Parameters
     ----------
     settings : Zenoh
-        Settings of the service; it is reached where it listens, or through the routers that it connects to.
+        Settings of the service; it is reached at its listening endpoints, or through its routers.
     command : str
-        Such as `hold`.
+        Name of the command, such as `hold`.
     payload : bytes
         JSON.
     timeout_s : float
@@ -124,14 +126,14 @@ def ask(
     Raises
     ------
     NotReached
-        If nothing answers at the endpoints, or no service of that prefix is there; it names those that are.
+        If nothing answers at the endpoints, or no service of that prefix is alive; the message names those that are.
     ServiceError
         If the service is alive but does not answer.
     """
     operator = operator or operator_here(settings)
-    unreached = f"{settings.prefix}: the service is not reached"
+    unreached = f"{settings.prefix}: the service cannot be reached"
     if operator is None:
-        raise NotReached(f"{unreached}: zenoh has neither listen nor connect to find it at")
+        raise NotReached(f"{unreached}: [zenoh] has neither listen nor connect endpoints")
     where = ", ".join(get(operator.config, "connect/endpoints") or ())
     key = f"{settings.prefix}/thermal/command/{command}" + (f"/{operator.name}" if operator.name else "")
     try:
@@ -140,15 +142,17 @@ def ask(
                 if answer.ok is not None:
                     reply: dict[str, Any] = json.loads(answer.ok.payload.to_bytes())
                     return reply
-            # An operator who may see this machine only must ask for it alone.
+            # An operator who may see only this machine must query only this machine.
             own = alive_services(session, timeout_s, f"{settings.prefix}/{ALIVE}")
             alive = {*own, *alive_services(session, timeout_s)}
     except (zenoh.ZError, ValueError) as error:
-        raise NotReached(f"{unreached}: nothing answers at {where}; does the service, or its router, run?") from error
+        raise NotReached(
+            f"{unreached}: nothing answers at {where}; check that the service, or its router, is running"
+        ) from error
     if settings.prefix in alive:
         raise ServiceError(
-            f"{key}: the service is alive but does not answer: does the router's access list permit "
-            f"{operator.name or 'this'}?"
+            f"{key}: the service is alive but does not answer; check that the router's access list permits "
+            f"{operator.name or 'this command'}"
         )
-    there = f"alive there: {', '.join(sorted(alive))}" if alive else "none is alive there"
-    raise NotReached(f"{unreached}: none of that prefix at {where}; {there}")
+    there = f"services there: {', '.join(sorted(alive))}" if alive else "no service is running there"
+    raise NotReached(f"{unreached}: no service with that prefix at {where}; {there}")

@@ -1,4 +1,4 @@
-"""Commands from outside: checked on the thread that receives them, applied between two samples."""
+"""Commands of operators: checked on the thread that receives them, applied between two samples."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOTED_REFUSALS = 10
 
 
 class Commands:
-    """Receives commands from other threads; `unproven`: whether those of unauthenticated senders are accepted."""
+    """Receives commands from other threads; `unproven`: whether unauthenticated senders are accepted."""
 
     def __init__(self, events: EventLog, adoption: Adoption, *, unproven: bool) -> None:
         self._events = events
@@ -73,11 +73,11 @@ class Commands:
     def _checked(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
         """Return the arguments of an acceptable command."""
         if len(payload) > (LONGEST_MODEL if name in (CommandName.ADOPT, CommandName.BACK) else LONGEST_COMMAND):
-            raise ServiceError(f"{name}: the payload has {len(payload)} bytes, more than a command may have")
+            raise ServiceError(f"{name}: the payload of {len(payload)} bytes is longer than permitted")
         try:
             arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            raise ServiceError(f"{name}: the payload is no JSON object") from error
+            raise ServiceError(f"{name}: the payload is not a JSON object") from error
         mode = arguments.get("mode", "auto")
         if name not in COMMANDS or (name == CommandName.ZERO and mode not in ("auto", "rest", "warm")):
             raise ServiceError(
@@ -92,7 +92,7 @@ class Commands:
 
     def _enqueue(self, name: str, arguments: dict[str, Any], sender: Sender) -> None:
         if self._waiting.full():
-            self._note_refusal(name, "too many commands wait", sender)
+            self._note_refusal(name, "too many commands are waiting", sender)
         else:
             self._waiting.put_nowait((name, arguments, sender))
 

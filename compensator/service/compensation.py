@@ -1,8 +1,7 @@
 """From a sample to an offset: guards, zero, engine, plausibility, decision.
 
-This is the whole decision of the service. It knows no socket, file or clock, so a recorded sample gives the same
-estimate and the same offset again, bit for bit. The published offset never jumps: every change passes the limiter,
-whatever caused it.
+All decisions of the service are made here. The module uses no socket, file or clock, so a recorded sample gives the
+same estimate and the same offset again, bit for bit. The published offset never jumps: every change passes the limiter.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ from compensator.service.status import CompensationStatus, Handover, Zero
 
 __all__ = ["Compensation", "Outcome", "model_of", "slowest_min"]
 
-#: Number of samples over which rate and heat are averaged before they decide anything.
+#: Number of samples over which rate and heat are averaged before they are used in a decision.
 MEAN_SAMPLES = 5
 
 #: Longest pause that is simulated, in samples: a longer one would delay the sample after it.
@@ -79,8 +78,8 @@ class Compensation:
         Parameters
         ----------
         mode : {"auto", "rest", "warm"}
-            `rest`: the machine is in thermal equilibrium; temperatures and deformation count from here.
-            `warm`: it is not; only the deformation counts from here, the stored heat stays in the state.
+            `rest`: the machine is in thermal equilibrium; temperatures and deformation are zeroed.
+            `warm`: it is not; only the deformation is zeroed, and the stored heat stays in the state.
             `auto`: `rest` if the predicted growth is below the configured rate, else `warm`.
         """
         self._zero.wanted, self._zero.mode = True, mode
@@ -92,7 +91,7 @@ class Compensation:
     def resume(self) -> None:
         """Follow the model again, at the permitted rate.
 
-        After exchanged sensors the state is wrong, so it starts unknown again.
+        If sensors were exchanged, the state is wrong and is treated as unknown.
         """
         self._memory.operator_hold = False
         self._memory.internal_error = False
@@ -141,7 +140,7 @@ class Compensation:
         return min(self._slowest_min if wanted is None else wanted, MOST_BRIDGED * self._period_min)
 
     def state(self) -> bytes:
-        """Return everything that decides the next outcome, as JSON that keeps every bit."""
+        """Return everything that determines the next outcome, as JSON without loss of precision."""
         return encode_state(
             CompensationState(
                 schema=STATE_SCHEMA,
@@ -157,12 +156,12 @@ class Compensation:
         )
 
     def restore(self, state: bytes) -> None:
-        """Continue from a state; all further outcomes are those that would have followed, bit for bit.
+        """Continue from a state; all further outcomes are the same as without the interruption, bit for bit.
 
         Raises
         ------
         DataError
-            If it cannot be read, or belongs to another model or other channels; then nothing is changed.
+            If it cannot be read, or belongs to another model or other channels; nothing is changed then.
         """
         restored = decode_state(state)
         for name, found, expected in (
@@ -184,21 +183,21 @@ class Compensation:
         self._engine, self._zero, self._memory = engine, restored.zero, restored.memory
         self._guards.restore(restored.guards)
         self._limiter.offset_um = restored.offset_um
-        # A state from a version without these checks has none of theirs.
+        # A state from a version without these checks does not contain theirs.
         self.plausibility.state = restored.plausibility or PlausibilityState()
 
     def pause(self, samples: int | None) -> None:
-        """Pass over samples that were not measured, such as those while the service did not run.
+        """Account for samples that were not measured, for example while the service was not running.
 
-        They count as missing: the prediction continues, its standard deviation grows, and the next sample with both
-        temperatures interpolates them. After more than `bridge_max_min` the state is unknown: the machine is assumed
-        to have been in its present condition throughout, and the reason `cold_start` remains until the error of that
-        assumption has decayed.
+        They count as missing: the prediction continues, its standard deviation grows, and at the next sample with both
+        temperatures they are interpolated. After more than `bridge_max_min` the state is unknown: the machine is
+        assumed to have been in its present condition throughout, and the reason `cold_start` remains until the error
+        of this assumption has decayed.
 
         Parameters
         ----------
         samples : int or None
-            Their number; nothing is done for none. None if it is unknown, which counts as too long to be bridged.
+            Number of samples; 0 has no effect. None if it is unknown, which counts as too long to be bridged.
         """
         if samples is None:
             longest = max(KNOWN_AFTER * self._slowest_min, self.bridge_max_min)
@@ -231,7 +230,7 @@ class Compensation:
         Parameters
         ----------
         zero : Zero or None
-            None to wait for the zero of the record, whatever the configuration requests for the start.
+            None to wait for the zero of the record, regardless of `zero.at_start`.
         """
         if zero is None:
             self._zero = ZeroState()
@@ -241,7 +240,7 @@ class Compensation:
         self._pass_cold(self._cold_samples)
 
     def continue_from(self, handover: Handover) -> None:
-        """Continue where another compensation ended: its offset moves on at the permitted rate, its holds stay."""
+        """Continue from another compensation: its offset moves on at the permitted rate, and its holds remain."""
         self._limiter.offset_um = handover.offset_um
         memory, zero = self._memory, self._zero
         memory.operator_hold, memory.internal_error = handover.operator_hold, handover.internal_error
@@ -256,7 +255,7 @@ class Compensation:
         Parameters
         ----------
         raw : Sample
-            What the devices gave.
+            Readings of the devices.
 
         Returns
         -------
@@ -282,7 +281,7 @@ class Compensation:
         if self.plausibility.is_on:
             notes += self.plausibility.update(self._evidence(raw, values, estimate, y_pred))
         decision = self._decision.decide(values, estimate, y_pred, self._memory, self.plausibility)
-        # During an alarm the offset may be wrong by the difference of measured and predicted Y.
+        # During an alarm the offset may be wrong by the difference between measured and predicted Y.
         std = math.hypot(estimate.y_std_um, self.plausibility.error_um) if estimate else NAN
         return Outcome(
             sample=sample,
@@ -292,14 +291,14 @@ class Compensation:
         )
 
     def _evidence(self, raw: Sample, values: Values, estimate: Estimate | None, y_pred: float) -> SensorEvidence:
-        """Return what the checks between the sensors use."""
+        """Return the input of the checks between the sensors."""
         t_q, at = (
             number(channel.mean) if channel is not None and channel.device_quality == SampleQuality.GOOD else NAN
             for channel in (raw.channels.get(name) for name in ("t_q_degc", "at_degc"))
         )
         reference = self._engine.reference
         rest = self._config.plausibility.rest if self._config.plausibility is not None else None
-        # A prediction without both temperatures, or from an unknown state, is no evidence against a sensor.
+        # A prediction without both temperatures, or from an unknown state, is not evidence against a sensor.
         usable = not math.isnan(values.t_q + values.at) and self._memory.cold_min <= 0.0
         return SensorEvidence(
             below_k=at - t_q,
@@ -316,7 +315,7 @@ class Compensation:
             return
         warm = self._engine.has_reference and self._is_warm(zero.mode)
         if warm:
-            # The state is that of the last sample; the growth since then belongs to what follows.
+            # The state is that of the last sample; the growth since then counts after the zero.
             zero.y_base = self._memory.estimate.y_um if self._memory.estimate else 0.0
         else:
             self._engine.set_reference(values.t_q, values.at)
@@ -335,7 +334,7 @@ class Compensation:
     def _is_warm(self, mode: ZeroMode) -> bool:
         if mode != "auto" or not self._memory.rates:
             return mode == "warm"
-        # A machine on a long plateau grows slowly but is heated: its heat must not become the zero.
+        # A machine at a long thermal plateau grows slowly but is heated: this must not become a zero at rest.
         heated = abs(mean(self._memory.heats)) > HEATED_W
         return heated or abs(mean(self._memory.rates)) > self._config.zero.rest_rate_um_per_min
 
@@ -346,7 +345,7 @@ def model_of(config: Config, data: bytes, *, source: str) -> ThermalModel:
     Raises
     ------
     ModelError
-        One line that names the source and what is wrong.
+        If the model cannot be used; the message names the source and the error.
     """
     model = parse_model(data, source=source)
     return model.with_alternative(config.model.alternative) if config.model.alternative else model

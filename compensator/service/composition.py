@@ -1,4 +1,4 @@
-"""Puts the service together and runs it."""
+"""Builds the service from its parts and runs it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ log = logging.getLogger("compensator")
 
 
 async def read_once(fleet: drivers.Fleet) -> dict[str, dict[int, Reading] | DriverError]:
-    """Read every device once, all at the same time."""
+    """Read every device once, in parallel."""
     results = await asyncio.gather(*(device.read() for device in fleet.devices.values()), return_exceptions=True)
     answers: dict[str, dict[int, Reading] | DriverError] = {}
     for name, result in zip(fleet.devices, results, strict=True):
@@ -56,9 +56,9 @@ async def run_service(
     Parameters
     ----------
     setup : Setup
-        What it is made of, see `loading.load`.
+        The parts of the service; see `loading.load`.
     clock : Clock, optional
-        The machine's own by default.
+        By default the system clock.
     samples : int, optional
         Number of samples to stop after.
     on_ready : callable, optional
@@ -91,7 +91,7 @@ async def run_service(
         try:
             for warning in setup.warnings():
                 log.warning("%s: warning: %s", loaded.path, warning.marked)
-        except ConfigError as error:  # recording continues, whether the offset can be received or not
+        except ConfigError as error:  # recording continues even if the offset cannot be received
             log.error("%s; the router will refuse the service", error)
         checkpoint = OffsetCheckpoint(folder, machine)
         checkpointed = checkpoint.read(config.limits.offset_max_um)

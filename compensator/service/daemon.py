@@ -1,4 +1,4 @@
-"""The service: polls devices, makes samples, lets the compensation decide, records, publishes.
+"""The service: polls devices, makes samples, runs the compensation, records, publishes.
 
 The order within a sample is fixed: everything is on disk before the offset is published.
 """
@@ -34,7 +34,7 @@ log = logging.getLogger("compensator")
 #: How long the loop waits for the disk: a fraction of the poll interval, so that no poll is late, and a limit in s.
 DISK_PART, DISK_S = 0.4, 2.0
 #: How long an offset waits for the disk while polling continues: a fraction of the sample's period, at least `DISK_S`,
-#: and a limit in s. An offset of that age is usable, since its rate is published with it.
+#: and a limit in s. An offset of that age is usable because its rate is published with it.
 PATIENCE_PART, PATIENCE_S = 0.25, 15.0
 
 
@@ -53,7 +53,7 @@ class Latency:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Decided:
-    """A sample whose outcome is on its way to the disk; `began` is when its processing began, s."""
+    """A sample whose outcome is being written to disk; `began` is the start of its processing, s."""
 
     outcome: Outcome
     entry: Entry
@@ -68,15 +68,15 @@ class Daemon:
     config : Config
         Settings.
     compensation : Compensation
-        Decides.
+        Computes the offset.
     devices : mapping of str to Device
-        Open or not; a device opens itself when it is read.
+        Open or closed; a device opens itself when it is read.
     recorder : Recorder
-        Where every sample is written before its offset is published.
+        Writes every sample before its offset is published.
     publish : callable
         Publishes a message by name and JSON; never waits.
     clock : Clock
-        Paces the loop.
+        Clock of the loop.
     first_sequence : int
         Sequence number of the first sample.
     recordings : pathlib.Path
@@ -126,7 +126,7 @@ class Daemon:
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
-        #: Outcomes that were published and not reported to the caller yet.
+        #: Outcomes that were published but not yet reported to the caller.
         self._unreported: list[Outcome] = []
         #: A sample that waits for the disk while polling continues.
         self._pending: asyncio.Task[None] | None = None
@@ -152,7 +152,7 @@ class Daemon:
         on_sample : callable, optional
             Called with the outcome after each sample was published.
         on_poll : callable, optional
-            Called after each poll, when its sample, if one ended there, is decided and published.
+            Called after each poll; if a sample ended with it, after that sample was published.
         """
         self._commands.open()
         period_s = self._compensation.model.period_s
@@ -186,10 +186,10 @@ class Daemon:
                 on_sample(outcome)
 
     async def _step(self, interval_s: float, label_ns: int | None) -> None:
-        """Poll, and process the sample if one ends here; on any error hold the offset and report it.
+        """Poll, and process the sample if one ends; on any error hold the offset and report the error.
 
-        This is the supervisor, the one place that catches everything: a defect anywhere must not silence the service,
-        and must never move the offset.
+        This is the supervisor, the only place that catches every exception: a defect must neither stop the service nor
+        move the offset.
         """
         try:
             await self._sampler.poll(interval_s)
@@ -225,7 +225,7 @@ class Daemon:
     # ------------------------------------------------------------------ one sample
 
     async def _sample(self, label_ns: int) -> None:
-        """Process a sample and publish it once it is on disk; polling continues if that takes long."""
+        """Process a sample and publish it once it is on disk; polling continues if this takes long."""
         await self._await_pending()
         began = time.perf_counter()
         self._pass_pause(label_ns)
@@ -283,7 +283,7 @@ class Daemon:
         self._unreported.append(outcome)
 
     def _pass_pause(self, label_ns: int) -> None:
-        """Account, before the first sample, for the time without measurements."""
+        """Account for the time without measurements before the first sample."""
         first, self._first = self._first, False
         last_ns = self._compensation.status.time_utc_ns
         if not first or last_ns == 0:
@@ -354,7 +354,7 @@ class Daemon:
             Empty or a JSON object. `zero` has `mode`: `auto`, `rest` or `warm`; `adopt` has `model`, the text of a
             model file, or `sha256`, that of one adopted before, or both; `adopt` and `back` have `force`.
         sender : Sender
-            Who sent it; recorded in the event.
+            Sender; recorded in the event.
 
         Returns
         -------

@@ -22,7 +22,7 @@ VALID_SAMPLES = 2.5
 
 @dataclass(frozen=True, slots=True)
 class Limited:
-    """An offset within its limits, its rate, and the limits that acted."""
+    """An offset within its limits, its rate, and the limits that were reached."""
 
     offset_um: float
     rate_um_per_min: float
@@ -31,14 +31,14 @@ class Limited:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """State, reasons and offset of one sample; without an offset before the first zero."""
+    """State, reasons and offset of one sample; there is no offset before the first zero."""
 
     state: State
     reasons: list[str]
     limited: Limited | None
 
     def message(self, model: ThermalModel, machine: str, seq: int, time_utc_ns: int, std_um: float) -> Offset:
-        """Return what is published."""
+        """Return the offset message to publish."""
         return Offset(
             schema=SCHEMA,
             machine=machine,
@@ -61,7 +61,7 @@ class OffsetLimiter:
         self._max_um = limits.offset_max_um
         self._rate_max = limits.offset_rate_max_um_per_min
         self._period_min = period_min
-        #: The last published offset, µm; a control that never received one applies none.
+        #: The last published offset, µm; 0 before the first, as the control then applies none.
         self.offset_um = 0.0
 
     def follow(self, target_um: float, target_rate_um_per_min: float) -> Limited:
@@ -70,14 +70,14 @@ class OffsetLimiter:
         Parameters
         ----------
         target_um : float
-            Where the offset should be, µm.
+            Target of the offset, µm.
         target_rate_um_per_min : float
-            How the target will move on, µm/min.
+            Rate of the target, µm/min.
 
         Returns
         -------
         Limited
-            The next offset, and the rate at which the one after it is expected.
+            The next offset, and the expected rate to the one after it.
         """
         reasons = []
         wanted = target_um
@@ -85,7 +85,7 @@ class OffsetLimiter:
             wanted = math.copysign(self._max_um, wanted)
             reasons.append(Reason.OFFSET_LIMITED)
         step_max = self._rate_max * self._period_min
-        # One sample's worth at most, however long ago the last offset was published.
+        # At most the change of one sample, regardless of the time since the last published offset.
         if abs(wanted - self.offset_um) > step_max:
             wanted = self.offset_um + math.copysign(step_max, wanted - self.offset_um)
             reasons.append(Reason.RATE_LIMITED)
@@ -127,9 +127,9 @@ class OffsetDecision:
         y_pred : float
             Predicted deformation since the zero, µm.
         memory : Memory
-            What is remembered from sample to sample; times in it advance.
+            Values kept from sample to sample; times in it advance.
         plausibility : PlausibilityCheck
-            Checks between the sensors, this sample included.
+            Checks between the sensors, including this sample.
         """
         pairs = ((Reason.T_Q_MISSING, values.t_q), (Reason.AT_MISSING, values.at))
         reasons: list[str] = [reason for reason, value in pairs if math.isnan(value)]
@@ -160,7 +160,7 @@ class OffsetDecision:
 
     def _blocking(self, values: Values, expired: bool, memory: Memory, plausibility: PlausibilityCheck) -> list[str]:
         """Return why the offset must be held."""
-        # A single estimate of the heat overshoots when a source is switched; its mean over some samples does not.
+        # A single heat estimate overshoots when a source is switched; the mean over some samples does not.
         heat = mean(memory.heats)
         outside = [
             f"{Reason.OUTSIDE_VALIDITY}:{name}"
@@ -189,5 +189,5 @@ def _validity(config: Config, model: ThermalModel) -> dict[str, tuple[float, flo
 
 
 def mean(values: list[float]) -> float:
-    """Return the mean, NaN of nothing."""
+    """Return the mean; NaN for an empty list."""
     return math.fsum(values) / len(values) if values else NAN

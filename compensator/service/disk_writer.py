@@ -1,7 +1,7 @@
-"""Brings samples to disk in their order, on a thread of its own.
+"""Writes samples to disk in order, on a separate thread.
 
-A slow disk delays neither polling nor commands. What waits is written together, with one sync, so that a slow disk
-catches up; what a disk refuses waits and is written once the disk accepts it.
+A slow disk delays neither polling nor commands. All queued samples are written together, with one sync, so that a slow
+disk catches up. After a write error the samples stay queued and are written once the disk accepts them.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from compensator.messages import Event, Offset, degraded, encode
 from compensator.recording.naming import day_of
 from compensator.service.event_log import WAITING_EVENTS
 
-#: Largest number of samples that wait for the disk (four hours at one a minute), so that a lost disk costs no memory;
-#: then the oldest are dropped.
+#: Largest number of queued samples (four hours at one per minute), which bounds the memory if the disk fails; beyond
+#: that the oldest are dropped.
 WAITING_SAMPLES = 240
 
 
 class Recorder(Protocol):
-    """What the writer needs of a recording; used on its thread, except `path` and `remarks`."""
+    """Interface of a recording for the writer; used on its thread, except `path` and `remarks`."""
 
     @property
     def path(self) -> Path | None:
@@ -35,7 +35,7 @@ class Recorder(Protocol):
     def write(
         self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"", sync: bool = True
     ) -> None:
-        """Write records, and bring them to disk unless `sync` is false."""
+        """Write records, and sync them to disk unless `sync` is false."""
 
     def start_new(self, attachments: Mapping[str, bytes] | None = None) -> None:
         """Finish the file; the next write opens a new one, with attachments that replace those of the same name."""
@@ -49,7 +49,7 @@ class Recorder(Protocol):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Entry:
-    """A sample on its way to the disk, with everything that is written together with it.
+    """A sample to be written to disk, with everything that is written together with it.
 
     Parameters
     ----------
@@ -62,11 +62,11 @@ class Entry:
     sample, estimate : bytes
         JSON; empty if there is none.
     offset : Offset, optional
-        As decided.
+        The offset as decided.
     new_file : bool
         Whether it must open a new file.
     model : bytes, optional
-        Model file that is attached to recordings from here on.
+        Model file that is attached to recordings from this sample on.
     """
 
     time_utc_ns: int
@@ -80,11 +80,11 @@ class Entry:
     #: Reason with which the offset was published before it was on disk, empty otherwise.
     reason: str = ""
     on_disk: bool = False
-    #: The attempt to bring it to disk.
+    #: The attempt to write it.
     attempt: asyncio.Future[None] = field(init=False)
 
     def records(self) -> list[tuple[str, bytes]]:
-        """Return topic and JSON of everything; the offset as it was published if it was already."""
+        """Return topic and JSON of all records; the offset as published, if it was published already."""
         records = [("event", encode(event)) for event in self.events]
         records += [(topic, data) for topic, data in (("sample", self.sample), ("estimate", self.estimate)) if data]
         if self.offset is not None:
@@ -93,11 +93,11 @@ class Entry:
 
     @property
     def day(self) -> str:
-        """Its day, UTC; a file holds one."""
+        """Day of the sample, UTC; a file contains one day."""
         return day_of(self.time_utc_ns)
 
     def inherit(self, dropped: Entry) -> None:
-        """Keep what must not be lost with a sample that is dropped."""
+        """Take over from a dropped sample what must not be lost."""
         self.events = [*dropped.events, *self.events][-WAITING_EVENTS:]
         self.model = self.model if self.model is not None else dropped.model
         self.new_file = True
@@ -109,7 +109,7 @@ class DiskWriter:
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="recording")
-        self._lock = threading.Lock()  # for what follows, which both threads use
+        self._lock = threading.Lock()  # protects the following attributes, which both threads use
         self._waiting: deque[Entry] = deque()
         self._writing: list[Entry] = []
         self._failed = False
@@ -120,7 +120,7 @@ class DiskWriter:
 
     @property
     def file(self) -> str:
-        """Name of the recording, empty if there is none."""
+        """Name of the recording; empty if there is none."""
         return self._recorder.path.name if self._recorder.path else ""
 
     @property
@@ -134,28 +134,28 @@ class DiskWriter:
         return self._recorder.remarks()
 
     def enqueue(self, entry: Entry) -> None:
-        """Enqueue an entry to be written after everything that waits."""
+        """Append an entry to the queue."""
         with self._lock:
             self._waiting.append(entry)
             if len(self._waiting) > WAITING_SAMPLES:
                 dropped = self._waiting.popleft()
                 self._waiting[0].inherit(dropped)
                 self._dropped += bool(dropped.sample)
-            # An attempt that has not started yet writes everything that waits by then.
+            # An attempt that has not started yet writes everything that is queued by then.
             if self._attempt is None or self._attempt.running() or self._attempt.done():
                 self._attempt = self._executor.submit(self._write_waiting)
             attempt = self._attempt
         entry.attempt = asyncio.wrap_future(attempt)
-        # Retrieve the error, also when the attempt ends later.
+        # Retrieve the error even if the attempt ends later.
         entry.attempt.add_done_callback(lambda done: done.cancelled() or done.exception())
 
     def release(self, entry: Entry) -> bool:
-        """Give an entry the reason with which its offset is published now, if it is not on disk.
+        """Set the reason with which the offset of an entry is published now, if the entry is not on disk.
 
         Returns
         -------
         bool
-            Whether it is being written without that reason.
+            Whether the entry is already being written without that reason.
         """
         with self._lock:
             if not entry.on_disk:
@@ -168,7 +168,7 @@ class DiskWriter:
         return dropped
 
     def close(self) -> asyncio.Future[None]:
-        """Write what waits and finish the recording; the future ends then, with the error if the disk refuses."""
+        """Write the queue and finish the recording; the future then completes, with the error if writing failed."""
         closing = asyncio.wrap_future(self._executor.submit(self._finish))
         self._executor.shutdown(wait=False)
         return closing
@@ -197,7 +197,7 @@ class DiskWriter:
                     self._failed, self._writing = not written, []
 
     def _next_batch(self) -> list[Entry]:
-        """Return the entries that come next into one file."""
+        """Return the next entries that belong into one file."""
         with self._lock:
             while self._waiting:
                 entry = self._waiting[0]

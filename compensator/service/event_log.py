@@ -1,4 +1,4 @@
-"""The events of a service: numbered, published at once, and kept until the next sample takes them to disk."""
+"""Events of a service: numbered, published at once, and kept until they are written with the next sample."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from compensator.clock import Clock
 from compensator.events import EventKind
 from compensator.messages import SCHEMA, Event, encode
 
-#: Largest number of events that wait for the disk; the newest are kept.
+#: Largest number of events that are kept for the recording; beyond that the oldest are dropped.
 WAITING_EVENTS = 1000
 
 
@@ -35,7 +35,7 @@ class EventLog:
             text=text,
             data=dict(data or {}),
         )
-        # Bounded, so that a loop that cannot record costs no memory.
+        # Bounded, so that memory does not grow if nothing can be recorded.
         self._events = [*self._events[1 - WAITING_EVENTS :], event]
         self._publish("event", encode(event))
 

@@ -1,6 +1,6 @@
-"""Which offset is published, and when: the sample is on disk first, unless the disk is too late.
+"""Decides when an offset is published: after its sample is on disk, unless the disk is too slow.
 
-An offset that cannot wait any longer is published with the reason `recording_late` or `recording_failed`. Events say
+An offset that cannot wait any longer is published with the reason `recording_late` or `recording_failed`. Events report
 when the disk stops accepting the recording and when it accepts it again.
 """
 
@@ -23,25 +23,25 @@ log = logging.getLogger("compensator")
 DISK_FAILED = "the disk does not accept the recording"
 DISK_LATE = "the disk accepts the recording too late"
 DISK_BACK = "the disk accepts the recording again"
-#: How often the log warns that the service waits for the disk at its end, s.
+#: Interval of the log's warnings that the stopping service waits for the disk, s.
 CLOSING_S = 10.0
 
 
 class Journal:
-    """Records samples with their events and knows whether the disk keeps up.
+    """Records samples with their events and monitors whether the disk keeps up.
 
     Parameters
     ----------
     events : EventLog
         Events that are recorded with the next sample.
     writer : DiskWriter
-        Brings them to disk.
+        Writes them to disk.
     clock : Clock
         For waiting.
     limit_s : float
         How long the loop waits for the disk, s.
     patience_s : float
-        How long an offset waits for the disk while polling continues, s; not if the previous one was late already.
+        How long an offset waits for the disk while polling continues, s; it does not wait if the previous one was late.
     checkpoint : OffsetCheckpoint, optional
         Keeps an offset that is published before it is on disk.
     """
@@ -62,13 +62,13 @@ class Journal:
         self._limit_s = limit_s
         self._patience_s = patience_s
         self._checkpoint = checkpoint
-        #: What the next sample carries: whether it opens a file, and another model.
+        #: For the next sample: whether it opens a new file, and the new model.
         self._new_file, self._model = False, None  # type: tuple[bool, bytes | None]
         #: Reason with which the last offset was published, and the last error of the disk.
         self._reason, self._error = "", None  # type: tuple[str, BaseException | None]
 
     def start_new_file(self, model: bytes | None = None) -> None:
-        """Let the next sample open a new file; with another model if one is given."""
+        """Open a new file with the next sample; attach another model if one is given."""
         self._new_file = True
         self._model = model if model is not None else self._model
 
@@ -81,7 +81,7 @@ class Journal:
         estimate: bytes = b"",
         offset: Offset | None = None,
     ) -> Entry:
-        """Enqueue a sample with the events since the previous one.
+        """Queue a sample with the events since the previous one.
 
         `state` is that of the compensation before the sample; `sample` and `estimate` are JSON, empty if there is none.
         """
@@ -100,7 +100,7 @@ class Journal:
         return entry
 
     async def wait_briefly(self, entry: Entry) -> bool:
-        """Wait while polling stands still; return whether longer waiting would be useless."""
+        """Wait while polling is paused; return whether waiting longer would be useless."""
         await self._clock.settle([entry.attempt], self._limit_s)
         return entry.attempt.done() or bool(self._reason)
 
@@ -125,13 +125,13 @@ class Journal:
         return degraded(entry.offset, entry.reason) if entry.offset is not None and entry.reason else entry.offset
 
     async def record(self, time_utc_ns: int, state: bytes, *, offset: Offset | None = None) -> Offset | None:
-        """Bring the waiting events, and an offset without a sample, to disk; return the offset to be published."""
+        """Write the queued events, and an offset without a sample, to disk; return the offset to be published."""
         entry = self.enqueue(time_utc_ns, state, offset=offset)
         await self.wait_briefly(entry)
         return self.resolve(entry)
 
     def expected(self, offset: Offset) -> Offset:
-        """Return the offset as it will be published if the disk does as it did with the previous sample."""
+        """Return the offset as it will be published if the disk behaves as with the previous sample."""
         return degraded(offset, self._reason) if self._reason else offset
 
     def _note_disk(self, reason: str, in_flight: bool, error: BaseException | None) -> None:
@@ -158,7 +158,7 @@ class Journal:
         self._reason, self._error = reason, error or self._error
 
     async def close(self, state: bytes) -> None:
-        """Note that the service ends, and finish the recording, however long the disk takes."""
+        """Note that the service ends, and finish the recording without a time limit."""
         self._events.note(EventKind.STOP, "the service ends")
         await self.record(self._clock.utc_ns(), state)
         closing = self._writer.close()
@@ -166,7 +166,7 @@ class Journal:
             figures = f"The disk has not accepted the rest of the recording for {CLOSING_S:g} s."
             log.warning("%s", Remark(ServiceWarning.DISK_FINISHING, figures).marked)
         if self._writer.waiting:
-            log.error("%d sample(s) are not on disk, which refused them", self._writer.waiting)
+            log.error("%d sample(s) could not be written to disk", self._writer.waiting)
         error = closing.exception()
         if isinstance(error, OSError):
             data = RecordingData(code=RecordingCode.NOT_FINISHED)

@@ -1,4 +1,4 @@
-"""Everything that a service is made of, read once: configuration, model, signing key, devices, certificate."""
+"""Reads everything that a service needs, once: configuration, model, signing key, devices, certificate."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from drivers.errors import DriverConfigError
 
 log = logging.getLogger("compensator")
 
-#: Names that depend on the order in which adapters are plugged in or found.
+#: Port names that depend on the order in which adapters are connected or found.
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 _BY_ID = Path("/dev/serial/by-id")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setup:
-    """A service as its configuration describes it; nothing is open.
+    """The parts of a service by its configuration; nothing is open.
 
     Parameters
     ----------
     loaded : LoadedConfig
         The configuration and its file.
     model : ThermalModel
-        The model in use: the adopted one, else the configured one.
+        The model in use: the adopted one, or else the configured one.
     model_bytes : bytes
-        Its file.
+        The model's file.
     store : ModelStore
         Adopted models.
     signer : Signer, optional
@@ -49,7 +49,7 @@ class Setup:
     fleet : drivers.Fleet
         The devices.
     certificate : Certificate, optional
-        The machine's own; None without TLS or without the package `cryptography`.
+        The machine's certificate; None without TLS or without the package `cryptography`.
     """
 
     loaded: LoadedConfig
@@ -71,12 +71,12 @@ class Setup:
         return self.loaded.resolve(self.config.recording.folder)
 
     def warnings(self, now: datetime.datetime | None = None) -> list[Remark]:
-        """Return what the configuration permits and should not; `check` shows it, `run` continues.
+        """Return warnings about the configuration; `check` shows them, and `run` continues in spite of them.
 
         Parameters
         ----------
         now : datetime.datetime, optional
-            Time at which the certificate is checked, UTC; now by default.
+            Time for which the certificate is checked, UTC; by default now.
 
         Raises
         ------
@@ -101,7 +101,7 @@ def load(path: str) -> Setup:
     Raises
     ------
     ConfigError
-        One line that names what is wrong.
+        If something cannot be used; the message is one line.
     """
     loaded = load_config(path)
     config = loaded.config
@@ -110,7 +110,7 @@ def load(path: str) -> Setup:
     if abs(polls - round(polls)) > 1e-9 or polls < 1:
         raise ConfigError(
             f"{path}: sampling.poll_interval_s = {config.sampling.poll_interval_s:g}, "
-            f"expected a whole part of the model's {model.period_s:g} s"
+            f"expected the model's {model.period_s:g} s divided by an integer"
         )
     fleet = _fleet(path, config)
     signer = load_signer(loaded)
@@ -165,7 +165,7 @@ def _fleet(path: str, config: Config) -> drivers.Fleet:
 
 
 def load_signer(loaded: LoadedConfig) -> Signer | None:
-    """Return what signs the recordings, None if no key is configured.
+    """Return the signer of the recordings; None if no key is configured.
 
     Raises
     ------
@@ -178,8 +178,8 @@ def load_signer(loaded: LoadedConfig) -> Signer | None:
     path, folder = loaded.resolve(name), loaded.resolve(loaded.config.recording.folder)
     if path.is_relative_to(folder):
         raise ConfigError(
-            f"{loaded.path}: recording.signing_key = {name!r}: is among the recordings, expected a place where "
-            f"whoever can change them cannot read it"
+            f"{loaded.path}: recording.signing_key = {name!r}: is in the recording folder, expected a place that "
+            "is not readable by those who can change the recordings"
         )
     return Signer(path)
 
@@ -188,22 +188,24 @@ def load_signer(loaded: LoadedConfig) -> Signer | None:
 
 
 def _numbered_port(line: Mapping[str, Any]) -> Remark | None:
-    """Warn of a serial port without a name of its own."""
+    """Warn of a serial port without a permanent name."""
     port = str(line.get("port", ""))
     if not _NUMBERED.fullmatch(port):
         return None
     lasting = [link for link in sorted(_BY_ID.glob("*")) if link.resolve() == Path(port).resolve()]
-    name = f" Its lasting name is {lasting[0]}." if lasting else ""
-    figures = f"Line {line.get('name')!r}: port {port} is numbered by the order of plugging in; after a restart it may "
+    name = f" Its permanent name is {lasting[0]}." if lasting else ""
+    figures = f"Line {line.get('name')!r}: port {port} is numbered in the order of connection; after a restart it may "
     return Remark(ServiceWarning.NUMBERED_PORT, f"{figures}be another adapter.{name}")
 
 
 def _exposures(zenoh: Zenoh) -> list[Remark]:
-    """Warn where others on the network can act in the name of the machine or its operator."""
+    """Warn if others on the network can act as the machine or its operator."""
     found = []
     outside = [endpoint for endpoint in zenoh.listen if not zenoh.is_loopback(endpoint)]
     if outside:
-        figures = f"zenoh.listen {', '.join(outside)}: whoever reaches it can publish offsets and send commands."
+        figures = (
+            f"zenoh.listen {', '.join(outside)}: any program that reaches it can publish offsets and send commands."
+        )
         found.append(Remark(ServiceWarning.OPEN_LISTEN, figures))
     outside = [endpoint for endpoint in zenoh.connect if not zenoh.is_loopback(endpoint)]
     if outside and not zenoh.secured():

@@ -1,8 +1,8 @@
-"""The last offset that was published before it was on disk, kept where it survives a kill of the service.
+"""Keeps the last offset that was published before it was on disk, so that it survives a kill of the service.
 
-After a kill the service continues from the last offset on disk. If the disk was full or hung, offsets published since
-then are missing there, and the offset would jump back. So the last of them is kept in the computer's memory, which
-needs no disk and survives a kill, but not a reboot or power cut. Once everything is on disk the checkpoint is removed.
+After a kill the service continues from the last offset on disk. If the disk was full or hung, later offsets are missing
+there, and the offset would jump back. The last published offset is therefore kept in a file in memory, which survives a
+kill, but not a reboot or a power cut. Once everything is on disk, the checkpoint is removed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from compensator.messages import Offset, number
 
 log = logging.getLogger("compensator")
 
-#: A file system in memory that every Linux has.
+#: An in-memory file system that every Linux has.
 MEMORY = Path("/dev/shm")
 _LONGEST = 4096
 
@@ -45,7 +45,7 @@ class OffsetCheckpoint:
     machine : str
         Name of the machine.
     memory : pathlib.Path, optional
-        Where the file is.
+        Folder of the file.
     """
 
     def __init__(self, recordings: Path, machine: str, memory: Path = MEMORY) -> None:
@@ -54,7 +54,7 @@ class OffsetCheckpoint:
         self._written = True
 
     def write(self, offset: Offset) -> None:
-        """Keep an offset that is being published; where that fails the service continues without it."""
+        """Keep an offset that is being published; if that fails the service continues without the checkpoint."""
         value = number(offset.y_offset_um)
         if math.isnan(value):
             return
@@ -78,7 +78,7 @@ class OffsetCheckpoint:
             log.warning("%s", Remark(ServiceWarning.NOTE_NOT_REMOVED, figures).marked)
 
     def read(self, offset_max_um: float) -> CheckpointedOffset | None:
-        """Return the offset; None without one, and for one that another user wrote or no service could have published.
+        """Return the offset; None if there is none, another user wrote it, or it is not a possible offset.
 
         Parameters
         ----------

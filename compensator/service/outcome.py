@@ -1,4 +1,4 @@
-"""Values that a sample gives, and everything that follows from it."""
+"""Values of a sample, and its outcome."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from compensator.service.state import ZeroState
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Everything that one sample leads to: the sample with final qualities, estimate, offset, and its events."""
+    """Outcome of one sample: the sample with final qualities, estimate, offset, and events."""
 
     sample: Sample
     estimate: EstimateMessage
@@ -33,7 +33,7 @@ class Values:
     y : float
         Measured deformation, µm.
     others : dict of str to float
-        Every other channel, by its name.
+        All other channels, by name.
     """
 
     t_q: float

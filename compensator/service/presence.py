@@ -1,9 +1,10 @@
-"""One service for each machine: a second one, started by mistake here or elsewhere, is refused.
+"""Ensures that each machine has only one service: a second one, on this or another computer, is refused.
 
-On one computer a lock on a file among the recordings shows it; the kernel releases it however the service ends.
-Elsewhere the liveliness token shows it: before anything is published, a client session of its own asks for
-`thermal/alive` (a router does not announce peers to each other). Two that start at the same moment declare a token
-each first: at most one continues. Two that start while no router is reached do not notice each other.
+On the same computer it is detected by a lock on a file in the recording folder, which the kernel releases however the
+service ends. On another computer it is detected by the liveliness token: before anything is published, a separate
+client session queries `thermal/alive` (a router does not announce peers to each other). Services that start at the same
+moment each declare a token first, and at most one continues. Services that start while no router is reached are not
+detected.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from compensator.service.session import ALIVE, client_config, tokens
 
 log = logging.getLogger("compensator")
 
-#: How long a router that refuses is retried at the start, s.
+#: How long a start retries a router that refuses the connection, s.
 REACHED_S = 1.0
 #: How long the token of a killed service may remain (the lease and a margin), s.
 STALE_S = 6.0
-#: How long a starting service waits for others that start, s.
+#: How long a starting service waits for others that are starting, s.
 SHOWN_S = 0.4
 #: Time limit of a query for tokens, s.
 ANSWER_S = 2.0
@@ -38,12 +39,12 @@ ANSWER_S = 2.0
 
 @contextmanager
 def sole_user(folder: Path, machine: str) -> Iterator[None]:
-    """Hold the folder of the recordings for one machine.
+    """Lock the recording folder for one machine.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Created if it does not exist. If it cannot be locked the service continues: compensation must not depend on a
+        Created if it does not exist. If it cannot be locked the service continues: compensation must not depend on the
         disk.
     machine : str
         Name of the machine.
@@ -61,16 +62,16 @@ def sole_user(folder: Path, machine: str) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ServiceError(
-                f"{path}: held by another service of {machine}, which continues; this one ends"
+                f"{path}: locked by another service of {machine}, which continues; this one ends"
             ) from error
         except OSError as error:
-            figures = f"{path}: cannot be locked, so a second service is not noticed here: {error}."
+            figures = f"{path}: cannot be locked, so a second service would not be detected here: {error}."
             log.warning("%s", Remark(ServiceWarning.NOT_LOCKED, figures).marked)
         yield
 
 
 def is_used(folder: Path, machine: str) -> bool:
-    """Return whether a service of a machine holds the folder of its recordings; changes nothing."""
+    """Return whether a service of a machine has locked its recording folder; nothing is changed."""
     try:
         descriptor = os.open(folder / f"{machine}.lock", os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
@@ -82,7 +83,7 @@ def is_used(folder: Path, machine: str) -> bool:
     except OSError:
         return False
     finally:
-        os.close(descriptor)  # and with it the lock
+        os.close(descriptor)  # also releases the lock
     return False
 
 
@@ -96,9 +97,9 @@ def _opened(path: Path) -> int:
 
 @contextmanager
 def sole_publisher(settings: Zenoh) -> Iterator[None]:
-    """Ensure that no other service of this prefix is alive; the block declares the own token.
+    """Ensure that no other service of this prefix is alive; the block declares the service's own token.
 
-    If no router is reached nothing is known about others, and compensation starts all the same.
+    If no router is reached, other services cannot be detected, and compensation starts nevertheless.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ def sole_publisher(settings: Zenoh) -> Iterator[None]:
     Raises
     ------
     ServiceError
-        If another service of this prefix is alive, or was first to start at the same moment.
+        If another service of this prefix is alive, or started at the same moment and has precedence.
     zenoh.ZError
         If a client reaches no router.
     """
@@ -117,9 +118,9 @@ def sole_publisher(settings: Zenoh) -> Iterator[None]:
             try:
                 session = held.enter_context(_reached(settings))
             except zenoh.ZError:
-                if settings.mode == "client":  # it can publish nothing either
+                if settings.mode == "client":  # it cannot publish either
                     raise
-                figures = "zenoh: no router is reached, so it is unknown whether another service runs elsewhere."
+                figures = "zenoh: no router is reached, so a service on another computer would not be detected."
                 log.warning("%s", Remark(ServiceWarning.OTHERS_UNKNOWN, figures).marked)
             else:
                 held.callback(_claim(session, settings.prefix).undeclare)
@@ -127,9 +128,9 @@ def sole_publisher(settings: Zenoh) -> Iterator[None]:
 
 
 def _reached(settings: Zenoh) -> zenoh.Session:
-    """Open a session; retry a router that a whole shop asks at once.
+    """Open a session; retry if the router is overloaded by the start of a whole shop.
 
-    A client without its router is retried by the publisher.
+    If a client reaches no router, the publisher retries.
     """
     end = time.monotonic() + REACHED_S
     while True:
@@ -142,7 +143,7 @@ def _reached(settings: Zenoh) -> zenoh.Session:
 
 
 def _claim(session: zenoh.Session, prefix: str) -> zenoh.LivelinessToken:
-    """Return the token of a starting service, if none is alive and no other was first."""
+    """Return the token of a starting service, if no other is alive or has precedence."""
     key = f"{prefix}/{ALIVE}"
     end = time.monotonic() + STALE_S
     while tokens(session, key, ANSWER_S):

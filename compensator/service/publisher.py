@@ -1,7 +1,7 @@
 """Publishes over Zenoh: offset, sample, estimate, status and event, and answers queries with the latest offset.
 
-Zenoh calls back on threads of its own. They only answer from a value that is replaced as a whole, and pass commands on
-to the service's loop.
+Zenoh's callbacks run on its own threads. They only answer from a value that is replaced atomically, and pass commands
+on to the service's loop.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ Reply = dict[str, Any] | Future[dict[str, Any]]
 
 
 def refusal(text: str) -> dict[str, Any]:
-    """Return the answer to a command that is refused."""
+    """Return the reply to a command that is refused."""
     return {"ok": False, "text": text}
 
 
 class Sender(NamedTuple):
-    """Who sent a command.
+    """The sender of a command.
 
-    Zenoh does not show the certificate of whoever sends a query. So the name is part of the key, and the router's
-    access list permits each certificate its own name only.
+    Zenoh does not show the certificate of the sender of a query. The name is therefore part of the key, and the
+    router's access list permits each certificate only its own name.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Sender(NamedTuple):
     proof: Literal["certificate", "none"] = "none"
 
     def data(self) -> dict[str, Any]:
-        """Return the sender for an event; it replaces what the payload claims."""
+        """Return the sender for an event; it replaces any sender in the payload."""
         return {"by": self.name, "by_proof": self.proof}
 
 
@@ -84,7 +84,7 @@ class _Declared(Protocol):
 
 
 class Publisher:
-    """The service's side of Zenoh. Use it as a context manager: an open session would hang the exit.
+    """The service's Zenoh session. Use it as a context manager: an open session would block the exit.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class Publisher:
     Raises
     ------
     ServiceError
-        From `open`, if an endpoint cannot be listened on, or another service of the machine is alive.
+        By `open`, if an endpoint cannot be listened on, or another service of the machine is alive.
     """
 
     def __init__(self, settings: Zenoh, on_command: CommandHandler) -> None:
@@ -125,14 +125,14 @@ class Publisher:
             words = f"zenoh: {error_text(error)} ({self._settings.mode}, {endpoints})"
             if self._settings.mode != "client":
                 raise ServiceError(words) from error
-            figures = f"{words.rstrip('.')}; it is tried again."
+            figures = f"{words.rstrip('.')}; retrying."
             log.warning("%s", Remark(ServiceWarning.ROUTER_NOT_REACHED, figures).marked)
             self._waiting = threading.Thread(target=self._begin_later, name="zenoh-router", daemon=True)
             self._waiting.start()
 
     def _begin(self) -> None:
-        with ExitStack() as unfinished:  # if a step fails everything is undone, and retried as a whole
-            # First: nothing may be published or answered in the name of a machine that has its service already.
+        with ExitStack() as unfinished:  # if a step fails, everything is undone and retried
+            # First: nothing may be published or answered for a machine that already has a service.
             with sole_publisher(self._settings):
                 session = zenoh.open(session_config(self._settings))
                 unfinished.callback(session.close)
@@ -146,7 +146,7 @@ class Publisher:
             log_links(session, self._settings.connect)
             unfinished.pop_all()
         self._publishers, self._declared = publishers, declared
-        self._session = session  # last: from here on other threads publish
+        self._session = session  # last: from now on other threads publish
 
     def _publisher(self, session: zenoh.Session, name: str) -> zenoh.Publisher:
         return session.declare_publisher(
@@ -154,8 +154,8 @@ class Publisher:
             encoding=zenoh.Encoding.APPLICATION_JSON,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH if name == "offset" else zenoh.Priority.DATA,
-            # Express messages take a packet each, and a router queues only a few packets: it would drop offsets of a
-            # shop that publishes at one instant. They save no measurable time.
+            # Each express message takes a packet, and a router queues only a few packets: it would drop offsets if a
+            # whole shop publishes at the same time. Express messages save no measurable time.
             express=False,
         )
 
@@ -169,7 +169,7 @@ class Publisher:
                 continue
             except ServiceError as error:  # the control must not receive offsets of two services
                 if str(error) != logged:
-                    log.error("%s; nothing is published from here until it is gone", error)
+                    log.error("%s; nothing is published here until that service has ended", error)
                     logged = str(error)
                 continue
             return
@@ -230,9 +230,9 @@ class Publisher:
         return answer
 
     def _sender(self, name: str, key: str) -> Sender | None:
-        """Return the sender of a command; None for a query of many keys at once, which is no command.
+        """Return the sender of a command; None for a query on many keys at once, which is not a command.
 
-        A query of `**` must not zero, hold and resume the machine.
+        A query on `**` must not zero, hold and resume the machine.
         """
         if key == self.key(name):
             return UNNAMED

@@ -1,16 +1,16 @@
-"""Replay: recorded samples through a compensation again.
+"""Replay: runs recorded samples through a compensation again.
 
 The audit, the comparison with another model, the restart and the warm-up of another model read and run recordings here.
-`apply` does what the service did with one group of records. This suffices where the state comes from the file: each
-file opens with the state before its first sample, after any pause. `FreeRun` is for a compensation of another model,
-whose state is in no file: it passes the pauses as well.
+`apply` repeats what the service did with one group of records. This suffices if the state comes from the file: each
+file starts with the state before its first sample, after any pause. `FreeRun` is for a compensation of another model,
+whose state is in no file: it also accounts for the pauses.
 
-A pause is a number of samples that the compensation did not get. It cannot be derived from times: the wall clock may be
-set and the computer may sleep, and the service passes no pause for either. A pause is therefore
+A pause is a number of samples that the compensation did not receive. It cannot be derived from times: the wall clock
+may be set and the computer may sleep, and neither counts as a pause for the service. A pause is therefore
 
-- at the start of a service, what that start recorded (`PauseData`), which may be a pause of unknown length;
-- else the numbers missing between two samples; the number of a held offset is not missing;
-- where files in between were not given, the time between the two: numbers do not count it across restarts.
+- at the start of a service, the pause recorded by that start (`PauseData`), which may be of unknown length;
+- otherwise, the numbers missing between two samples; the number of a held offset is not missing;
+- if files in between were not given, the time between the two, because numbers do not show it across restarts.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _ESTIMATE, _OFFSET = msgspec.json.Decoder(EstimateMessage), msgspec.json.Decoder
 
 @dataclass(slots=True)
 class RecordedStep:
-    """One recorded group: a sample and what followed from it, or an offset that was held without a sample.
+    """One recorded group: a sample and its outcome, or an offset that was held without a sample.
 
     Parameters
     ----------
@@ -49,11 +49,11 @@ class RecordedStep:
     run : dict of str to str
         Metadata of the file.
     records : dict of str to RawRecord
-        `sample`, `estimate` and `offset`, as far as they are there; a torn end lacks some.
+        `sample`, `estimate` and `offset`, as far as present; a torn end lacks some.
     events : list of Event
-        Events. Those of smaller numbers were held back by a full disk and are in the state of the file already.
+        Events. Those with smaller numbers were delayed by a full disk and are already in the state of the file.
     sample : Sample or None
-        The sample; None in a held offset, and in events alone.
+        The sample; None for a held offset or for events alone.
     """
 
     file: str
@@ -64,19 +64,19 @@ class RecordedStep:
 
     @property
     def estimate(self) -> EstimateMessage | None:
-        """What the model made of the sample."""
+        """The model's estimate for the sample."""
         record = self.records.get("estimate")
         return None if record is None else decode_with(_ESTIMATE, record, self.file)
 
     @property
     def offset(self) -> Offset | None:
-        """What was published."""
+        """The published offset."""
         record = self.records.get("offset")
         return None if record is None else decode_with(_OFFSET, record, self.file)
 
     @property
     def zero(self) -> ZeroMode | None:
-        """How a zero was set with this sample, None where none was."""
+        """Mode of the zero that was set with this sample; None if none was set."""
         sample = self.sample
         if sample is None or not any(e.kind == EventKind.ZERO and e.seq == sample.seq for e in self.events):
             return None
@@ -90,7 +90,7 @@ def step_of(records: Sequence[RawRecord], contents: Contents, file: str) -> Reco
     Raises
     ------
     DataError
-        If its sample or an event is not what the schema says.
+        If its sample or an event does not follow its schema.
     """
     found, events = {}, []
     for record in records:
@@ -103,12 +103,12 @@ def step_of(records: Sequence[RawRecord], contents: Contents, file: str) -> Reco
 
 
 def steps_in(container: Container) -> Iterator[RecordedStep]:
-    """Yield the groups of a recording as far as it can be read; what is complete in a torn group comes last.
+    """Yield the groups of a recording as far as it can be read; the complete part of a torn group comes last.
 
     Raises
     ------
     DataError
-        If it is no recording of ours.
+        If it is not a recording of the service.
     """
     with suppress(Damaged):
         for records, _, _ in groups_of(container):
@@ -117,13 +117,13 @@ def steps_in(container: Container) -> Iterator[RecordedStep]:
 
 
 def steps_of(path: Path) -> Iterator[RecordedStep]:
-    """Yield the groups of a recording, see `steps_in`."""
+    """Yield the groups of a recording; see `steps_in`."""
     with Container(path) as container:
         yield from steps_in(container)
 
 
 def opening_of(path: Path) -> dict[str, bytes]:
-    """Return the attachments of a recording by name; none where it is torn before them.
+    """Return the attachments of a recording by name; none if it is torn before them.
 
     Raises
     ------
@@ -135,12 +135,12 @@ def opening_of(path: Path) -> dict[str, bytes]:
 
 
 def setup_of(contents: Contents, file: str) -> tuple[Config, ThermalModel]:
-    """Return configuration and model that travel in a recording.
+    """Return the configuration and the model in a recording.
 
     Raises
     ------
     CompensatorError
-        If one of them is not there or cannot be used; the line names file and attachment.
+        If one of them is missing or cannot be used; the message names file and attachment.
     """
     config = parse_config(_attachment(contents, "config.toml", file), source=f"{file}: config.toml")
     return config, model_of(config, _attachment(contents, "model.toml", file), source=f"{file}: model.toml")
@@ -150,7 +150,7 @@ def _attachment(contents: Contents, name: str, file: str) -> bytes:
     found = contents.attachments.get(name)
     if found is None:
         there = ", ".join(contents.attachments) or "none"
-        raise DataError(f"{file}: attachment {name} is missing, there is: {there}; a replay needs it")
+        raise DataError(f"{file}: attachment {name} is missing (found: {there}); a replay needs it")
     return found.data
 
 
@@ -158,7 +158,7 @@ def _attachment(contents: Contents, name: str, file: str) -> bytes:
 
 
 def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
-    """Execute a command, live or recorded; `adopt` and `back` are not the compensation's own and change nothing."""
+    """Execute a command, live or recorded; `adopt` and `back` are handled elsewhere and change nothing here."""
     if name == CommandName.ZERO:
         mode = arguments.get("mode", "auto")
         compensation.zero(mode if mode in ("auto", "rest", "warm") else "auto")
@@ -171,7 +171,7 @@ def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) ->
 def apply(
     compensation: Compensation, step: RecordedStep, *, commands: bool = True, since: int | None = None
 ) -> Outcome | Offset | None:
-    """Do what the service did with one recorded group: commands and errors of its number, then the sample.
+    """Repeat what the service did with one recorded group: commands and errors of its number, then the sample.
 
     Parameters
     ----------
@@ -180,19 +180,19 @@ def apply(
     step : RecordedStep
         The group.
     commands : bool
-        Whether commands and errors count.
+        Whether commands and errors are applied.
     since : int, optional
-        Lowest number of the events that count; by default that of the group itself.
+        Lowest number of the events that are applied; by default that of the group.
 
     Returns
     -------
     Outcome or Offset or None
-        What follows from the sample; the offset that is held where the group has no sample; None for events alone.
+        Outcome of the sample; the held offset if the group has no sample; None for events alone.
 
     Raises
     ------
     DataError
-        If a message is not what the schema says, or the sample lacks a configured channel.
+        If a message does not follow its schema, or the sample lacks a configured channel.
     """
     sample = step.sample
     held = step.offset if sample is None else None
@@ -223,20 +223,20 @@ def apply(
 
 
 class FreeRun:
-    """Runs one file after the other through a compensation whose state they do not carry.
+    """Runs one file after the other through a compensation whose state they do not contain.
 
     Parameters
     ----------
     compensation : Compensation
-        Before the first of the samples.
+        In its state before the first sample.
     """
 
     def __init__(self, compensation: Compensation) -> None:
         self.compensation = compensation
-        #: Number and time of the last sample or held offset, −1 and 0 before the first.
+        #: Number and time of the last sample or held offset; −1 and 0 before the first.
         self.seq, self.time_ns = -1, 0
         self._file = ""
-        #: Offset before a sample of a torn end, whose own offset was not published.
+        #: Offset before the sample of a torn end, whose own offset was not published.
         self._before_torn_um: float | None = None
 
     def run(self, step: RecordedStep, *, commands: bool = True) -> Outcome | Offset | None:
@@ -245,7 +245,7 @@ class FreeRun:
         Raises
         ------
         DataError
-            Also if the sample is not as long as those of the model.
+            As in `apply`, or if the sample period is not that of the model.
         """
         sample, compensation = step.sample, self.compensation
         if sample is not None:
@@ -261,7 +261,7 @@ class FreeRun:
                 self._pass_pause(step, sample)
             self._before_torn_um = compensation.status.handover.offset_um if "offset" not in step.records else None
         elif self.seq >= 0 and step.offset is not None:
-            # The first sample of a start failed: its group holds the pause and a held offset.
+            # The first sample of a start failed: its group contains the pause and a held offset.
             self._pass_noted_pause(step, step.offset.seq)
         result = apply(compensation, step, commands=commands, since=self.seq + 1 if self.seq >= 0 else None)
         self._file = step.run.get("file", step.file)
@@ -279,12 +279,12 @@ class FreeRun:
             self.compensation.pause(sample.seq - self.seq - 1)
 
     def _pass_noted_pause(self, step: RecordedStep, seq: int) -> bool:
-        """Pass the pause that a start has noted, and return whether there is one."""
+        """Account for the pause that a start has recorded; return whether there is one."""
         pauses = ((event, data_of(event, PauseData)) for event in step.events if event.kind == EventKind.RESTART)
         for event, pause in pauses:
             if pause is None:
                 continue
-            # Noted with the first sample of that start; what a full disk never accepted is added.
+            # Recorded with the first sample of that start; samples that a full disk never accepted are added.
             missing = None if pause.missing is None else pause.missing + seq - event.seq
             self.compensation.pause(missing)
             return True

@@ -1,7 +1,7 @@
-"""From single readings to samples: when devices are polled, and the robust mean of what each channel gave.
+"""From single readings to samples: when devices are polled, and the robust mean of each channel's readings.
 
-Samples end at whole multiples of the period in UTC. Waiting always aims at the next point of this grid, so errors do
-not add up. A wall clock that is set changes the labels, not the pace: the step is reported, and the grid starts again.
+Samples end at whole multiples of the period in UTC. Each wait ends at the next point of this grid, so errors do not
+accumulate. Setting the wall clock changes the labels, not the pace: the step is reported, and the grid starts again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from drivers.reading import Device, Quality, Reading
 
 #: A poll waits for devices that answered last time for at most this fraction of the poll interval.
 WAIT_PART = 0.5
-#: A reading farther from the median than this many robust standard deviations is left out.
+#: A reading farther from the median than this number of robust standard deviations is left out.
 OUTLIER_SIGMA = 6.0
 #: Median absolute deviation of a normal distribution, as a fraction of its standard deviation.
 _MAD_OF_SIGMA = 0.6745
@@ -51,7 +51,7 @@ class Grid:
         self._index = min(gone * self._polls // self._period_ns, self._polls - 1)
 
     def seconds_to_next_poll(self) -> float:
-        """Return how long to wait for the next poll, s."""
+        """Return the time until the next poll, s."""
         point = self._end_ns - self._period_ns + (self._index + 1) * self._period_ns // self._polls
         return (point - self._clock.monotonic_ns()) / NS
 
@@ -66,7 +66,7 @@ class Grid:
         Returns
         -------
         float
-            By how much the wall clock was set since the last sample, s; 0 for the usual small corrections.
+            Step of the wall clock since the last sample, s; 0 for the usual small corrections.
         """
         off_ns = self._clock.utc_ns() - self._clock.monotonic_ns() - (self.label_ns - self._end_ns)
         self._index = 0
@@ -74,7 +74,7 @@ class Grid:
         if abs(off_ns) > NS or late_ns >= self._period_ns:
             self._restart()
             return off_ns / NS if abs(off_ns) > NS else 0.0
-        # Small differences come from a time service that slews the clock: follow it, the labels stay on the grid.
+        # Small differences come from a time service that slews the clock: follow it; the labels stay on the grid.
         self.label_ns += self._period_ns
         self._end_ns += self._period_ns - off_ns
         return 0.0
@@ -86,7 +86,7 @@ class ChannelCollector:
     Parameters
     ----------
     min_good_fraction : float
-        Fraction of the polls that must have given a good reading for the mean to count.
+        Fraction of the polls that must give a good reading for the mean to be valid.
     """
 
     def __init__(self, min_good_fraction: float) -> None:
@@ -106,7 +106,7 @@ class ChannelCollector:
             self._errors[error or str(SampleQuality.DEVICE_ERROR)] += 1
 
     def close(self) -> ChannelSample:
-        """Return the sample of what was collected and start the next one."""
+        """Return the sample of the collected readings and start the next one."""
         readings, errors, polls = self._readings, self._errors, self._polls
         self._readings, self._errors, self._polls = [], Counter(), 0
         kept, outliers = _without_outliers(readings)
@@ -131,14 +131,14 @@ class ChannelCollector:
 
 
 def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
-    """Leave single outliers out; a slope over the minute is none."""
+    """Leave out single outliers; a slope over the sample is not an outlier."""
     if len(readings) < 5:
         return readings, 0
     values = np.array([reading.value for reading in readings])
     distance = np.abs(values - np.median(values))
     sigma = float(np.median(distance)) / _MAD_OF_SIGMA
     if sigma == 0.0:
-        # Quantised and quiet: more than half are equal, and the step is the smallest distance there is.
+        # Quantised and quiet: more than half of the values are equal; the step is the smallest difference.
         steps = distance[distance > 0.0]
         sigma = float(steps.min()) if steps.size > 1 else math.inf if _near(values) else 0.0
     kept = [reading for reading, d in zip(readings, distance, strict=True) if d <= OUTLIER_SIGMA * sigma]
@@ -146,7 +146,7 @@ def _without_outliers(readings: list[Reading]) -> tuple[list[Reading], int]:
 
 
 def _near(values: Vector) -> bool:
-    """Return whether one deviating reading among equal ones is a step of the converter and no outlier."""
+    """Return whether a single deviating reading among equal ones is a converter step, not an outlier."""
     return bool(np.ptp(values) <= 1e-3 * max(1.0, abs(float(np.median(values)))))
 
 
@@ -171,9 +171,9 @@ class Sampler:
     Parameters
     ----------
     config : Config
-        Channels, and how many readings make a sample.
+        Channels, and the number of readings in a sample.
     devices : mapping of str to Device
-        Open or not; a device opens itself when it is read.
+        Open or closed; a device opens itself when it is read.
     clock : Clock
         For waiting.
     note : callable
@@ -195,7 +195,7 @@ class Sampler:
         self._collectors = {channel.name: ChannelCollector(fraction) for channel in config.channel}
 
     async def poll(self, interval_s: float) -> None:
-        """Ask every device once; wait briefly for those that answered last time."""
+        """Poll every device once; wait briefly for those that answered last time."""
         for state in self._devices.values():
             if state.task is None:
                 state.task = asyncio.create_task(_read(state.device))
@@ -222,7 +222,7 @@ class Sampler:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def _result(self, state: _DeviceState) -> tuple[Mapping[int, Reading] | None, str | None]:
-        """Return readings or error code of a device's poll; one that is still running counts as missing."""
+        """Return readings or error code of a device's poll; a poll that is still running counts as missing."""
         if state.task is None or not state.task.done():
             state.answered = False
             return None, SampleQuality.DEVICE_TIMEOUT

@@ -19,7 +19,7 @@ from compensator.errors import ConfigError
 
 log = logging.getLogger("compensator")
 
-#: Participants that a router admits at one time.
+#: Number of connections that a router accepts at a time.
 PENDING = 1000
 #: Time between two attempts to open a session, s.
 RETRY_S = 1.0
@@ -33,7 +33,7 @@ def set_key(config: zenoh.Config, key: str, value: object) -> None:
 
 
 def get(config: zenoh.Config, key: str) -> Any:
-    """Return one key of a Zenoh configuration, None if it is missing or unset."""
+    """Return one key of a Zenoh configuration; None if it is missing or unset."""
     try:
         return json.loads(config.get_json(key))
     except (zenoh.ZError, KeyError, ValueError):
@@ -53,17 +53,17 @@ def session_config(settings: Zenoh) -> zenoh.Config:
     set_key(config, "connect/endpoints", settings.connect)
     set_key(config, "scouting/multicast/enabled", False)
     set_key(config, "scouting/gossip/enabled", False)
-    # A router that comes back is found within a second, not within the default's four.
+    # A router that returns is found within 1 s instead of the default 4 s.
     set_key(config, "connect/retry", {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5})
-    # Shared memory between processes of one computer: others there could open it, and a killed process leaves its
-    # files behind in /dev/shm.
+    # No shared memory between processes of one computer: other users could open it, and a killed process leaves its
+    # files in /dev/shm.
     set_key(config, "transport/shared_memory/enabled", False)
-    # A dead service loses its liveliness token after this time, ms, if the network gives no sign.
+    # The liveliness token of a dead service expires after this time, ms, if the network does not report the loss.
     set_key(config, "transport/link/tx/lease", 4000)
     if settings.mode == "router":
         enlarge_queues(config)
     if settings.secured():
-        # Zenoh shows its certificate only where `enable_mtls` is set on its side too.
+        # Zenoh presents its certificate only if `enable_mtls` is set on its side too.
         set_key(config, "transport/link/tls/enable_mtls", True)
         set_key(config, "transport/link/tls/verify_name_on_connect", True)
         set_key(config, "transport/link/tls/root_ca_certificate", settings.tls_ca)
@@ -74,20 +74,20 @@ def session_config(settings: Zenoh) -> zenoh.Config:
 
 
 def client_config(settings: Zenoh, endpoints: Sequence[str]) -> zenoh.Config:
-    """Make the configuration of a client of a service, which tries the endpoints once."""
+    """Make the configuration of a client of a service that tries the endpoints once."""
     config = session_config(msgspec.structs.replace(settings, mode="client", listen=[], connect=list(endpoints)))
     try_once(config)
     return config
 
 
 def try_once(config: zenoh.Config) -> None:
-    """Let opening a session fail at once where nothing answers: a running service or router answers at once."""
+    """Let opening a session fail at once if nothing answers: a running service or router answers at once."""
     set_key(config, "connect/timeout_ms", 0)
     set_key(config, "connect/exit_on_failure", True)
 
 
 def local_endpoints(settings: Zenoh) -> list[str]:
-    """Return where a service listens, as reached from its own computer; ports that the system chose are left out.
+    """Return a service's listening endpoints, as reached from the same computer, without ports chosen by the system.
 
     Examples
     --------
@@ -99,22 +99,22 @@ def local_endpoints(settings: Zenoh) -> list[str]:
 
 
 def tokens(session: zenoh.Session, key: str, timeout_s: float) -> list[str]:
-    """Return the keys of the liveliness tokens that a key expression matches, as far as the session may see them."""
+    """Return the keys of the liveliness tokens that match a key expression and are visible to the session."""
     replies = session.liveliness().get(key, timeout=timeout_s)
     return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
 
 def alive_services(session: zenoh.Session, timeout_s: float, key: str = f"**/{ALIVE}") -> list[str]:
-    """Return the prefixes of the services that are alive, of all of them or of those whose token is `key`."""
+    """Return the prefixes of the services that are alive: all, or those whose token matches `key`."""
     return [token.removesuffix(f"/{ALIVE}") for token in tokens(session, key, timeout_s)]
 
 
 def enlarge_queues(config: zenoh.Config) -> None:
     """Enlarge a router's queues for a whole shop that publishes at the same instant.
 
-    Services whose clocks agree publish at the same time, and what does not fit into a client's queue is dropped. A
-    queue has packets of 64 KiB, 16 at most. After a power cut all services connect at once, two sessions each; by
-    default Zenoh admits a hundred at a time.
+    Services with synchronised clocks publish at the same time, and messages that do not fit into a client's queue are
+    dropped. A queue has at most 16 packets of 64 KiB. After a power cut all services connect at once, with two sessions
+    each; by default Zenoh accepts 100 at a time.
     """
     set_key(config, "transport/unicast/accept_pending", PENDING)
     for priority in ("interactive_high", "data"):
@@ -122,7 +122,7 @@ def enlarge_queues(config: zenoh.Config) -> None:
 
 
 def tls_files(settings: Zenoh) -> TlsFiles | None:
-    """Return the TLS files of the service, None if it uses none."""
+    """Return the TLS files of the service; None without TLS."""
     if settings.tls_ca is None or settings.tls_certificate is None or settings.tls_key is None:
         return None
     return TlsFiles(Path(settings.tls_ca), Path(settings.tls_certificate), Path(settings.tls_key))
@@ -153,7 +153,7 @@ def read_config_file(path: Path) -> ConfigFile:
     Raises
     ------
     ConfigError
-        One line that names the file and what is wrong.
+        If the file cannot be used; the message names the file and the error.
     """
     if not path.is_file():
         raise ConfigError(f"{path}: no such file, expected a Zenoh configuration")
@@ -194,19 +194,19 @@ def files_of(source: Path, tls: dict[str, str], side: str) -> TlsFiles:
 def log_links(session: zenoh.Session, endpoints: Sequence[str]) -> None:
     """Log when a link is established or lost, and once if there is none yet.
 
-    Without this, a certificate that the router refuses looks like a running service.
+    Without this, the service would appear to work while the router refuses its certificate.
     """
 
     def log_event(event: zenoh.TransportEvent) -> None:
         established = event.kind == zenoh.SampleKind.PUT
         kind = str(event.transport.whatami).rpartition(".")[2].lower()
         who = f"zenoh: {kind} {event.transport.zid}"
-        if established or kind == "client":  # clients look at the service and leave as they like
-            log.info("%s is %s", who, "connected" if established else "gone")
+        if established or kind == "client":  # clients of the service may connect and disconnect at any time
+            log.info("%s is %s", who, "connected" if established else "disconnected")
         else:
-            log.warning("%s", Remark(ServiceWarning.LINK_LOST, f"{who} is gone; it is tried again.").marked)
+            log.warning("%s", Remark(ServiceWarning.LINK_LOST, f"{who} is disconnected; retrying.").marked)
 
     if endpoints and not session.info.transports():
-        figures = f"zenoh: no connection to {', '.join(endpoints)} yet; it is tried again."
+        figures = f"zenoh: no connection to {', '.join(endpoints)} yet; retrying."
         log.warning("%s", Remark(ServiceWarning.ROUTER_NOT_REACHED, figures).marked)
     session.info.declare_transport_events_listener(log_event, history=True)

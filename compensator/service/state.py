@@ -1,7 +1,7 @@
-"""The state of a compensation as JSON: everything that decides the next outcome, bit for bit.
+"""The state of a compensation as JSON: everything that determines the next outcome, bit for bit.
 
-A number that is not finite is a text (`"nan"`, `"inf"`, `"-inf"`), since JSON has none; every other one has as many
-digits as give the same bits back.
+A number that is not finite is a string (`"nan"`, `"inf"`, `"-inf"`), because JSON has no such numbers; every other
+number has enough digits to restore the same bits.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from compensator.service.plausibility import PlausibilityState
 #: Version of the state; a state of another version is refused.
 STATE_SCHEMA = 1
 
-#: Covariances are far smaller; the products of larger ones would not be finite.
+#: Valid covariances are far smaller; products of larger ones would not be finite.
 LARGEST_COVARIANCE = 1e60
 
 ZeroMode = Literal["auto", "rest", "warm"]
@@ -29,7 +29,7 @@ ZeroMode = Literal["auto", "rest", "warm"]
 
 @dataclass(slots=True)
 class ZeroState:
-    """References beyond those of the engine, and the zero that waits for a sample.
+    """References in addition to those of the engine, and a requested zero.
 
     Parameters
     ----------
@@ -38,9 +38,9 @@ class ZeroState:
     y_base : float
         Predicted deformation at the last zero on a warm machine, µm.
     wanted : bool
-        Whether a zero waits for both temperatures.
+        Whether a zero was requested and waits for both temperatures.
     mode : {"auto", "rest", "warm"}
-        How it is to be set.
+        Its mode.
     """
 
     y_ref: float = NAN
@@ -51,24 +51,24 @@ class ZeroState:
 
 @dataclass(slots=True)
 class Memory:
-    """What is remembered from sample to sample.
+    """Values kept from sample to sample.
 
     Parameters
     ----------
     seq, time_utc_ns : int
         Number and time of the last sample, −1 and 0 before the first.
     estimate : Estimate, optional
-        What the engine knew after it.
+        The engine's estimate after it.
     missing_min : float
-        For how long a temperature has been missing, min.
+        Time for which a temperature has been missing, min.
     rates, heats : list of float
-        Growth, µm/min, and heat, W, of the last samples.
+        Rates of the deformation, µm/min, and heats, W, of the last samples.
     operator_hold, internal_error : bool
-        Why the offset is held.
+        Whether the offset is held for this cause.
     model_changed : bool
         Whether the offset is still moving to that of another model.
     cold_min : float
-        For how much longer the state counts as unknown, min.
+        Remaining time for which the state counts as unknown, min.
     """
 
     seq: int = -1
@@ -84,28 +84,28 @@ class Memory:
 
 
 class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The whole state.
+    """The complete state.
 
     Parameters
     ----------
     schema : int
         `STATE_SCHEMA`.
     model_sha256 : str
-        Hash of the model file that it belongs to.
+        Hash of the model file to which it belongs.
     alternative : str or None
         The alternative path used instead of the model's own.
     engine : EngineState
-        Observer, effects, held channels, reference, gap under way.
+        Observer, effects, held channels, reference, current gap.
     guards : dict of str to four floats
-        By channel: last good value, min since it, value that it is stuck at, min for which it has been.
+        By channel: last good value, time since then (min), constant value, time for which it has been constant (min).
     offset_um : float
         The last offset, µm.
     zero : ZeroState
         References of Y.
     memory : Memory
-        What is remembered from sample to sample.
+        Values kept from sample to sample.
     plausibility : PlausibilityState, optional
-        What the checks between the sensors remember; left out where none is on, as it was before there were any.
+        State of the checks between the sensors; omitted if none is on, as in versions without these checks.
     """
 
     schema: int
@@ -128,7 +128,7 @@ def encode_state(state: CompensationState) -> bytes:
 
 
 def _encodable(value: Any) -> Any:
-    """Replace numbers that are not finite by texts."""
+    """Replace numbers that are not finite by strings."""
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, dict):
@@ -142,10 +142,10 @@ def decode_state(data: bytes) -> CompensationState:
     Raises
     ------
     DataError
-        If it is no state of this version.
+        If it is not a state of this version.
     """
     try:
-        # Not strict: only so may a text be a number.
+        # Not strict, so that a string may be a number.
         state = msgspec.json.decode(data, type=CompensationState, strict=False)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise DataError(f"state: {error}") from error
@@ -154,5 +154,5 @@ def decode_state(data: bytes) -> CompensationState:
     nested = (state.engine, *([state.engine.gap.state] if state.engine.gap else []))
     numbers = [state.offset_um, *(value for engine in nested for value in (*engine.observer.x, *engine.observer.p))]
     if not all(-LARGEST_COVARIANCE < value < LARGEST_COVARIANCE for value in numbers):
-        raise DataError("state: a number of the offset or of the observer is not finite, or larger than any can be")
+        raise DataError("state: a number of the offset or of the observer is not finite, or too large to be valid")
     return state

@@ -1,4 +1,4 @@
-"""What a compensation is like between two samples: its zero, its target, and what a successor continues with."""
+"""Status of a compensation between two samples: its zero, its target, and the handover to a successor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from compensator.service.state import ZeroMode, ZeroState
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Zero:
-    """The values from which temperatures and deformation count; NaN where one is unknown.
+    """Reference values of temperatures and deformation; NaN if unknown.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Zero:
 
     @classmethod
     def of_references(cls, reference: Reference, zero: ZeroState) -> Zero:
-        """Return the zero that a state consists of: the reference of the engine, and those of Y."""
+        """Return the zero of a state, from the engine's reference and those of Y."""
         return cls(
             t_q_ref_degc=reference.t_q_degc,
             at_ref_degc=reference.at_degc,
@@ -51,27 +51,27 @@ class Zero:
 
     @property
     def is_absolute(self) -> bool:
-        """Whether the model used the temperatures as they are."""
+        """Whether the model uses absolute temperatures, not changes."""
         return self.t_q_ref_degc == self.at_ref_degc == 0.0
 
     def equals(self, other: Zero) -> bool:
-        """Return whether all values are equal, where unknown equals unknown."""
+        """Return whether all values are equal; two unknown values count as equal."""
         pairs = zip(astuple(self), astuple(other), strict=True)
         return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Handover:
-    """What a compensation passes on to its successor, so that the published offset does not jump.
+    """State that a compensation passes on to its successor, so that the published offset does not jump.
 
     Parameters
     ----------
     offset_um : float
-        The last published offset, µm; a control that never received one applies none.
+        The last published offset, µm; 0 before the first, as the control then applies none.
     operator_hold, internal_error : bool
-        Why the offset is held until `resume`.
+        Whether the offset is held until `resume`, and for which cause.
     waiting_zero : {"auto", "rest", "warm"} or None
-        A zero that waits for both temperatures.
+        A requested zero that waits for both temperatures.
     model_changed : bool
         Whether the offset is still moving to that of another model.
     """
@@ -92,13 +92,13 @@ class CompensationStatus:
     seq, time_utc_ns : int
         Number and time, ns since 1970 UTC, of the last sample; −1 and 0 before the first.
     zero : Zero or None
-        The zero in force, None before the first.
+        The current zero; None before the first.
     is_known : bool
-        Whether the thermal state is known: it did not start unknown, or long enough ago.
+        Whether the thermal state is known: it started known, or long enough ago.
     target_um, std_um : float
-        The offset that the model asks for and its standard deviation, µm; NaN while there is no estimate.
+        The offset by the model, before limits, and its standard deviation, µm; NaN without an estimate.
     handover : Handover
-        What a successor continues with.
+        State for a successor.
     """
 
     seq: int

@@ -1,9 +1,9 @@
-"""systemd: how the service is, and log records with fields.
+"""systemd: status of the service, and log records with fields.
 
-The service manager gets its messages by the notify protocol, see sd_notify(3): one datagram of `KEY=value` lines to the
-socket that `NOTIFY_SOCKET` names; without that variable nothing is sent. The journal gets log records by its native
-protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL), so that `journalctl MACHINE=vmc-07 STATE=hold` finds them. Sending never
-waits: a manager or journal that does not read must not delay a sample.
+Messages to the service manager use the notify protocol, see sd_notify(3): one datagram of `KEY=value` lines to the
+socket named by `NOTIFY_SOCKET`; without that variable nothing is sent. Log records use the journal's native protocol
+(systemd.io/JOURNAL_NATIVE_PROTOCOL), so that `journalctl MACHINE=vmc-07 STATE=hold` finds them. Sending never blocks: a
+manager or journal that does not read must not delay a sample.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ POLLS_TO_MISS = 3
 
 
 class ServiceManager:
-    """The service's side of systemd's notify protocol.
+    """Client of systemd's notify protocol.
 
     Parameters
     ----------
     environment : mapping of str to str
-        Where `NOTIFY_SOCKET`, `WATCHDOG_USEC` and `WATCHDOG_PID` are looked for; usually `os.environ`.
+        Contains `NOTIFY_SOCKET`, `WATCHDOG_USEC` and `WATCHDOG_PID`; usually `os.environ`.
 
     Examples
     --------
@@ -40,11 +40,11 @@ class ServiceManager:
         # "@" stands for the zero byte of an abstract address.
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
-        #: Messages that must arrive and were not accepted yet.
+        #: Messages that must arrive and were not yet accepted.
         self._unsent: list[str] = []
         for_us = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         microseconds = environment.get("WATCHDOG_USEC", "")
-        #: Longest time between two signs of life, s; None without a watchdog.
+        #: Watchdog timeout, s; None without a watchdog.
         self.watchdog_s = int(microseconds) / 1e6 if address and for_us and microseconds.isdecimal() else None
 
     def watch(self, poll_interval_s: float) -> None:
@@ -53,7 +53,7 @@ class ServiceManager:
         Parameters
         ----------
         poll_interval_s : float
-            Time between two signs of life, s.
+            Time between two calls of `alive`, s.
         """
         needed_s = POLLS_TO_MISS * poll_interval_s
         if self.watchdog_s is not None and self.watchdog_s < needed_s:
@@ -65,7 +65,7 @@ class ServiceManager:
         self._send_surely("READY=1")
 
     def alive(self) -> None:
-        """Give a sign of life; to be called only after a poll is complete."""
+        """Feed the watchdog; to be called only after a complete poll."""
         self._flush()
         if self.watchdog_s is not None:
             self._send("WATCHDOG=1")
@@ -104,7 +104,7 @@ class ServiceManager:
         try:
             self._socket.sendto(message.encode(), socket.MSG_DONTWAIT, self._address)
         except OSError:
-            # The manager is away, or its queue is full: the next poll tries again.
+            # The manager is not reachable, or its queue is full: the next poll retries.
             return False
         return True
 
@@ -120,7 +120,7 @@ _PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), 
 
 
 def is_connected(environment: Mapping[str, str], descriptor: int) -> bool:
-    """Return whether a descriptor leads to the journal, as systemd states in `JOURNAL_STREAM`.
+    """Return whether a descriptor is connected to the journal, according to `JOURNAL_STREAM`.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def datagram(fields: Mapping[str, object]) -> bytes:
 
 
 class JournalHandler(logging.Handler):
-    """Sends log records to the journal; the dict `fields` of a record becomes fields of their own.
+    """Sends log records to the journal; the items of a record's dict `fields` become journal fields.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ class JournalHandler(logging.Handler):
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Send one record without waiting; what the journal refuses goes to stderr."""
+        """Send one record without blocking; a record that the journal refuses is written to stderr."""
         text = self.format(record)
         priority = next((number for level, number in _PRIORITIES if record.levelno >= level), 7)
         fields = {"MESSAGE": text, "PRIORITY": priority, "SYSLOG_IDENTIFIER": "compensator", "LOGGER": record.name}

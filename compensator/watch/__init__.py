@@ -1,1 +1,1 @@
-"""Observes running services, one machine or a shop: terminal, live page, Foxglove, recorder."""
+"""Observes the running services of one machine or a shop: terminal, live page, Foxglove, recorder."""

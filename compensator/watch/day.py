@@ -14,7 +14,7 @@ from compensator.report.notation import plain
 from compensator.watch.words import TONES, here
 
 _BARS = "▁▂▃▄▅▆▇█"
-#: Bar of each severity: higher is worse, for readers without colour.
+#: Bar of each severity: higher is worse, so that the strip is readable without colour.
 _STRIP = {"good": "▁", "warn": "▄", "bad": "█"}
 #: Colour of each severity.
 STYLES = {"good": "green", "warn": "yellow", "bad": "bold red"}
@@ -39,7 +39,7 @@ def drawn(history: Mapping[str, Sequence[Any]], width: int, *, short: bool = Fal
     Parameters
     ----------
     history : mapping of str to sequence
-        Columns as of `MachineHistory`.
+        Columns as in `MachineHistory`.
     width : int
         Available width, characters.
     short : bool
@@ -90,7 +90,7 @@ def _axis(t_s: Sequence[float], count: int) -> Text:
 
 
 def evenly(t_s: Sequence[float], values: Sequence[float | None], width: int) -> list[float | None]:
-    """Return means over even steps of time, at most `width` of them; None where there is no value."""
+    """Return means over at most `width` equal steps of time; None where there is no value."""
     if len(t_s) < 2 or t_s[-1] <= t_s[0]:
         return list(values)
     count = min(width, len(t_s))

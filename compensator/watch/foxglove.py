@@ -22,7 +22,7 @@ EVENTS = 20
 
 
 def topic_of(key: str, prefix: str) -> tuple[str, str] | None:
-    """Return topic and kind of a key, None if it is unknown.
+    """Return topic and kind of a key; None if it is unknown.
 
     Examples
     --------
@@ -43,7 +43,7 @@ class FoxgloveServer:
     Parameters
     ----------
     prefix : str
-        Prefix that is watched.
+        Watched prefix.
     port : int
         0 selects a free port.
 
@@ -57,13 +57,13 @@ class FoxgloveServer:
         try:
             import foxglove
         except ImportError as error:
-            raise ServiceError("--foxglove: needs the extra: pip install quill-compensator[foxglove]") from error
+            raise ServiceError("--foxglove: not installed: pip install quill-compensator[foxglove]") from error
         self._foxglove: Any = foxglove
         self._prefix, self._port = prefix, port
         self._context: Any = foxglove.Context()
         self._lock = threading.Lock()
         self._channels: dict[str, Any] = {}
-        #: What a new viewer receives at once, by topic: the latest message, the last events.
+        #: Messages for a new viewer, by topic: the latest message, the last events.
         self._latest: dict[str, list[tuple[bytes, int]]] = {}
         self._server: Any = None
 
@@ -91,7 +91,7 @@ class FoxgloveServer:
             server.stop()
 
     def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
-        """Forward a message at its own time; malformed ones are dropped."""
+        """Forward a message with its own time; malformed messages are dropped."""
         found = topic_of(key, self._prefix)
         if found is None:
             return
@@ -113,12 +113,12 @@ class FoxgloveServer:
         channel.log(payload, log_time=message.time_utc_ns)
 
     def set_alive(self, key: str, alive: bool) -> None:
-        """Ignore liveliness: recordings have none either."""
+        """Ignore liveliness, which recordings do not contain either."""
 
     def _join(self, topic: str) -> None:
         """Send a new viewer the latest messages, so that it need not wait for the next sample.
 
-        The library cannot address one viewer: others receive the same messages with the same times again.
+        The library cannot address a single viewer: other viewers receive the same messages again, with the same times.
         """
         with self._lock:
             known, channel = list(self._latest.get(topic, ())), self._channels.get(topic)

@@ -129,7 +129,7 @@ def state_intervals(history: Mapping[str, Sequence[Any]], valid_for_s: float | N
     Parameters
     ----------
     history : mapping of str to sequence
-        Columns as of `MachineHistory`.
+        Columns as in `MachineHistory`.
     valid_for_s : float, optional
         Validity of an offset, s: a longer pause separates two intervals.
 
@@ -155,11 +155,11 @@ def state_intervals(history: Mapping[str, Sequence[Any]], valid_for_s: float | N
 
 
 def usable(sample: Sample, name: str) -> float | None:
-    """Return the mean of a channel; None if it is missing or refused."""
+    """Return the mean of a channel; None if it is missing or its quality is not good."""
     channel = sample.channels.get(name)
     return channel.mean if channel is not None and channel.is_good else None
 
 
 def _short(value: Any) -> Any:
-    """Round to the digits that a figure can show."""
+    """Round to the digits that a figure shows."""
     return round(value, 4) if isinstance(value, float) else value

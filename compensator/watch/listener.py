@@ -1,7 +1,7 @@
 """Subscribes to everything below a prefix over Zenoh and queries the latest messages; sends nothing else.
 
-Commands are queries, too: a query on `thermal/**` would zero and hold every machine of the shop. So only the keys
-in `ASKED` are ever queried.
+Commands are queries, too: a query on `thermal/**` would zero and hold every machine of the shop. Therefore only the
+keys in `ASKED` are queried.
 """
 
 from __future__ import annotations
@@ -77,16 +77,16 @@ def below(prefix: str, rest: str) -> str:
 
 
 class Listener:
-    """A Zenoh session that listens. Use it as a context manager: an open session would hang the exit.
+    """A listening Zenoh session. Use it as a context manager: an open session would block the exit.
 
     Parameters
     ----------
     source : Source
         Where to listen.
     sinks : sequence of Sink
-        Get everything.
+        Receive all messages and liveliness changes.
     on_connection : callable
-        Called with whether there is a connection, whenever that changes.
+        Called with the state of the connection whenever it changes.
     """
 
     def __init__(self, source: Source, *sinks: Sink, on_connection: Callable[[bool], None] = lambda _: None) -> None:
@@ -112,8 +112,8 @@ class Listener:
         except zenoh.ZError as error:
             raise ServiceError(f"zenoh: no answer at {self._source.where}: {error_text(error)}") from error
         prefix = self._source.prefix
-        # Zenoh's own threads fill the channel without waiting for Python: if they had to wait, the router would drop
-        # messages when a whole shop publishes at one instant.
+        # Zenoh's threads fill the channel without waiting for Python: if they had to wait, the router would drop
+        # messages when a whole shop publishes at the same time.
         subscriber = session.declare_subscriber(below(prefix, "**"), zenoh.handlers.FifoChannel(WAITING))
         self._receiving = threading.Thread(target=self._forward_all, args=(subscriber,), name="watch receives")
         self._receiving.start()
@@ -127,8 +127,8 @@ class Listener:
         Parameters
         ----------
         tokens : bool
-            Query liveliness tokens, too. The subscription reports them anyway, and a late answer would revive a
-            service that has ended since.
+            Query liveliness tokens, too. Not needed while subscribed: the subscription reports them, and a late answer
+            would show a service as alive that has ended since.
         """
         session = self._session
         if session is None:
@@ -199,7 +199,7 @@ class Listener:
             self._wanted.clear()
 
     def _transport(self, event: Any) -> None:
-        """Query after each reconnection, which Zenoh makes by itself."""
+        """Query after each automatic reconnection of Zenoh."""
         came = event.kind == zenoh.SampleKind.PUT
         self._on_connection(came)
         if came:
@@ -216,19 +216,19 @@ class Listener:
     def _token(self, sample: Any) -> None:
         alive = sample.kind == zenoh.SampleKind.PUT
         if alive:
-            # A service declares its token last: from now on it answers queries.
+            # A service declares its token last, so from now on it answers queries.
             self._wanted.set()
         for sink in self._sinks:
             sink.set_alive(str(sample.key_expr), alive)
 
 
 def of_endpoints(prefix: str, endpoints: list[str]) -> Source:
-    """Return the source at some endpoints, without TLS.
+    """Return the source for endpoints without TLS.
 
     Raises
     ------
     UsageError
-        If one is not an endpoint.
+        If one of them is not a valid endpoint.
     """
     for endpoint in endpoints:
         if not re.fullmatch(r"(tcp|tls|quic|ws|unixsock-stream)/\S+", endpoint):
@@ -237,12 +237,12 @@ def of_endpoints(prefix: str, endpoints: list[str]) -> Source:
 
 
 def of_settings(settings: Zenoh) -> Source:
-    """Return the source of a configuration's service, as reached from its own computer.
+    """Return the source for the service of a configuration on this computer.
 
     Raises
     ------
     UsageError
-        If it has no endpoint, or uses TLS: the machine's own certificate is not permitted to read.
+        If it has no endpoint, or uses TLS: the machine's own certificate must not subscribe.
     """
     if settings.secured():
         raise UsageError(
@@ -261,7 +261,7 @@ def of_file(path: Path, prefix: str) -> Source:
     Raises
     ------
     ConfigError
-        If it or a file named in it cannot be used.
+        If the file, or a file named in it, cannot be used.
     """
     endpoints = get(operator_of_file(path).config, "connect/endpoints")
     return Source(prefix, ", ".join(endpoints), lambda: operator_of_file(path).config)

@@ -1,5 +1,5 @@
 "use strict";
-// Requests the present state every other second and draws it. Everything from a machine is inserted as text.
+// Requests the present state every two seconds and draws it. Everything from a machine is inserted as text.
 const POLL_MS = 2000, MOST_ACTIONS = 10, DAY_S = 86400, SIGNS = {good: "✓", warn: "⚠", bad: "✗"};
 const TONES = {ok: "good", starting: "warn", degraded: "warn", hold: "bad", fault: "bad"};
 const $ = (id) => document.getElementById(id);
@@ -319,7 +319,7 @@ function bands(t, one, from, x, y) {
 }
 
 function strips(svg, t, states, from, x, top) {
-  // Higher is worse, for readers without colour; intervals without messages are blank.
+  // Higher is worse, so that the strip is readable without colour; intervals without messages are blank.
   const tall = {good: 5, warn: 12, bad: 20};
   let i = 0;
   while (i < t.length) {

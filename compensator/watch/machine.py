@@ -1,4 +1,4 @@
-"""The state of one machine as its messages show it; no clock, socket or file."""
+"""The state of one machine from its messages; no clock, socket or file."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ EVENTS = 50
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
 #: Warnings that need attention although the service itself reports `ok`.
 ATTENTION = {WatchWarning.TOKEN_GONE, WatchWarning.MALFORMED_MESSAGES, WatchWarning.MISFIT}
-#: A message farther ahead of this computer's clock shows that the clocks differ, s.
+#: A message farther ahead of this computer's clock than this shows that the clocks differ, s.
 AHEAD_S = 5.0
-#: Values of a snapshot that come from the messages as they are.
+#: Values of a snapshot that are copied from the messages.
 _OFFSET = ("state", "seq", "time_utc_ns", "valid_for_s", "y_offset_um", "y_offset_std_um", "model_sha256")
 _ESTIMATE = ("y_um", "y_pred_um", "residual_um", "heat_w", "heat_std_w")
 _STATUS = ("version", "model", "model_kind", "started_utc_ns", "recording", "devices")
@@ -119,7 +119,7 @@ class WatchedMachine:
 
     def _update_offset(self, message: Offset, monotonic_s: float, asked: bool) -> bool:
         # Answers are not counted: until the subscription has reached every service, messages between an answer and
-        # the first one received were never sent here.
+        # the first message received are not sent here.
         if not asked and not self.numbers.update(message.seq, message.time_utc_ns):
             return False
         if self._offset is not None and message.machine == self._offset.machine and message.seq <= self._offset.seq:
@@ -130,7 +130,7 @@ class WatchedMachine:
         return True
 
     def _update_other(self, message: Sample | EstimateMessage | Status | Event) -> bool:
-        """Add a message other than an offset; older ones than the last are ignored."""
+        """Add a message other than an offset; messages older than the last are ignored."""
         if isinstance(message, Event):
             if message in self.events:
                 return False
@@ -212,14 +212,14 @@ class WatchedMachine:
             figures = f"{self.malformed} malformed message(s), the last: {self.last_malformed}."
             found.append(Remark(WatchWarning.MALFORMED_MESSAGES, figures))
         if self.numbers.missed:
-            found.append(Remark(WatchWarning.MISSED_MESSAGES, f"{self.numbers.missed} message(s) never arrived here."))
+            found.append(Remark(WatchWarning.MISSED_MESSAGES, f"{self.numbers.missed} message(s) did not arrive here."))
         if self.numbers.repeated:
             figures = f"{self.numbers.repeated} message(s) had a number that was received before."
             found.append(Remark(WatchWarning.REPEATED_NUMBERS, figures))
         return found
 
     def _misfit(self, now_ns: int, shown: str) -> Remark | None:
-        """Warn if Y differs from its prediction by more than the service states, unless the service warns of it itself.
+        """Warn if Y differs from its prediction by more than the service states, unless the service itself warns of it.
 
         The median is used because a valid model deviates for some minutes after the heat is switched.
         """
@@ -231,7 +231,7 @@ class WatchedMachine:
         if count < MISFIT_MIN // 2 or residual_um < max(MISFIT_STDS * std_um, MISFIT_UM):
             return None
         figures = (
-            f"Over half an hour, measured and predicted Y were {residual_um:.1f} µm apart (median); the service "
+            f"Over half an hour, measured and predicted Y differed by {residual_um:.1f} µm (median); the service "
             f"states a standard deviation of {std_um:.2f} µm."
         )
         return Remark(WatchWarning.MISFIT, figures)

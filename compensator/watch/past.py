@@ -1,4 +1,4 @@
-"""The day before the watch began, from the recordings of a machine."""
+"""The last day before the watch started, from the recordings of a machine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TOPICS = ("sample", "estimate", "offset", "event")
 
 
 def last_day(folder: Path, machine: str, now_ns: int) -> Iterator[Sample | EstimateMessage | Offset | Event]:
-    """Yield the messages of the last day in a machine's recordings; files that cannot be read are skipped.
+    """Yield the messages of the last day in a machine's recordings; unreadable files are skipped.
 
     The file that is being written is read up to its present end.
 

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 class Sequence:
     """Sequence numbers of one kind of message of one machine.
 
-    A skipped number is a lost message, unless the service was restarted in between: its numbers advance with the time
-    that it was down. Only later messages tell of a restart, so the last gap can still be revoked.
+    A skipped number is a lost message, unless the service was restarted in between: its numbers advance by the time
+    that it was down. A restart is known only from later messages, so the last gap can still be revoked.
 
     Parameters
     ----------
     last : int
         Highest number that arrived, −1 before the first.
     received, missed, repeated : int
-        Messages that arrived in order, that never arrived, and that arrived with a number already seen.
+        Messages that arrived in order, that did not arrive, and that arrived with a repeated number.
 
     Examples
     --------

@@ -1,7 +1,7 @@
 """Server of the live page: one HTML file and JSON, on loopback only.
 
-Only users of this computer can read it. Requests under another host name (DNS rebinding) are refused, nothing can be
-changed, and the page loads nothing from elsewhere.
+Only users of this computer can read it. Requests with another host name (DNS rebinding) are refused, nothing can be
+changed, and the page loads nothing from other servers.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class PageServer:
         self._server = self._thread = None
 
     def _answer(self, path: str, query: dict[str, list[str]]) -> tuple[str, bytes] | None:
-        """Return content type and body of a path, None if it does not exist."""
+        """Return content type and body of a path; None if it does not exist."""
         if path == "/":
             return "text/html; charset=utf-8", page()[0]
         if path == "/shop.json":
@@ -126,13 +126,13 @@ def page() -> tuple[bytes, str]:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    # Otherwise another program could share the port.
+    # Otherwise another program could use the same port.
     allow_reuse_port = False
     answer: Callable[[str, dict[str, list[str]]], tuple[str, bytes] | None]
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """A request; only GET and HEAD under the address's own name are answered."""
+    """A request; only GET and HEAD with the address's host name are answered."""
 
     server: _Server
     server_version, sys_version = "compensator", ""
@@ -142,7 +142,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Answer a request."""
         if not self._has_own_host():
-            # 421: the name in the request is not that of this server.
+            # 421: the host name in the request is not that of this server.
             return self._send(HTTPStatus.MISDIRECTED_REQUEST, "text/plain", b"expected this page by its own address\n")
         parts = urlsplit(self.path)
         found = self.server.answer(parts.path, parse_qs(parts.query))
@@ -181,4 +181,4 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Log nothing: an open page sends requests every other second."""
+        """Log nothing: an open page sends a request every two seconds."""

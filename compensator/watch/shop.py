@@ -1,4 +1,4 @@
-"""All machines that were received; filled by other threads, read by views."""
+"""All machines whose messages were received; written by other threads, read by views."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from compensator.clock import NS, Clock
 from compensator.watch.machine import KINDS, WatchedMachine
 from compensator.watch.words import TONES
 
-#: Largest number of machines; messages of others are only counted.
+#: Largest number of machines; messages of further machines are only counted.
 MACHINES = 1000
 _ORDER = {"bad": 0, "warn": 1, "good": 2}
 
@@ -21,7 +21,7 @@ class Shop:
     Parameters
     ----------
     clock : Clock
-        Handed in.
+        Clock for ages.
 
     Examples
     --------

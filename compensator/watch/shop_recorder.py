@@ -1,8 +1,8 @@
 """Records everything that a shop publishes to MCAP: every message as received, with its key and time of arrival.
 
-This is a copy for viewing and for comparing machines. The evidence is each service's own recording, which holds the
+This is a copy for viewing and for comparing machines. The evidence is each service's own recording, which contains the
 sample before its offset was published, and a hash chain. Here a message is on disk within `SYNC_S` of its arrival, a
-kill loses no more than that, and lost messages are counted by their sequence numbers.
+kill loses at most this time, and lost messages are counted by their sequence numbers.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ log = logging.getLogger("compensator")
 
 #: Longest time from the arrival of a message until it is on disk, s.
 SYNC_S = 2.0
-#: Largest number of messages that wait for the disk; the oldest are dropped first, and counted.
+#: Largest number of queued messages; beyond that the oldest are dropped and counted.
 WAITING = 200_000
-#: Largest number of channels in one file: invented keys cannot fill the memory.
+#: Largest number of channels in one file, so that arbitrary keys cannot fill the memory.
 CHANNELS = 20_000
-#: What the names of a shop's recordings begin with.
+#: Prefix of the file names of a shop's recordings.
 NAME = "shop"
 #: Topic prefix of messages that follow no schema.
 OTHER = "other/"
@@ -50,7 +50,7 @@ class _Arrival(NamedTuple):
 
 
 class ShopRecorder:
-    """Recorder of a shop. Use it as a context manager; at its exit everything is on disk and compact.
+    """Recorder of a shop. Use it as a context manager; at its exit everything is on disk and compacted.
 
     Parameters
     ----------
@@ -126,13 +126,13 @@ class ShopRecorder:
         found = {f"{prefix}/thermal/{kind}": one.missed for (prefix, kind), one in self._numbers.items()}
         return {key: count for key, count in sorted(found.items()) if count}
 
-    # ------------------------------------------------------------------ on a thread of its own
+    # ------------------------------------------------------------------ on a separate thread
 
     def _work(self) -> None:
         while not self._ended:
             self._wake.wait(SYNC_S / 2.0)
             self._write_waiting()
-        # The last messages, and once more those that the disk refused.
+        # The last messages, and those that could not be written before.
         if not self._write_waiting():
             with self._lock:
                 self.not_recorded += len(self._waiting)
@@ -154,7 +154,7 @@ class ShopRecorder:
         return True
 
     def _write(self, batch: list[_Arrival]) -> None:
-        """Write a batch, each day to its own file; remove from the batch what is on disk."""
+        """Write a batch, each day to its own file; remove written messages from the batch."""
         while batch:
             day, same = next(groupby(batch, lambda arrival: day_of(arrival.time_ns)))
             part = list(same)
@@ -169,7 +169,7 @@ class ShopRecorder:
             del batch[: len(part)]
             if self._failed:
                 self._failed = False
-                log.info("compensator: the shop's recording is written again")
+                log.info("compensator: the shop's recording is being written again")
 
     def _numbered(self, arrival: _Arrival) -> tuple[str, int, int]:
         """Return kind, number and time of a message, and count it; `other` if it follows no schema."""
@@ -194,7 +194,7 @@ class ShopRecorder:
         return kind, message.seq & 0xFFFFFFFF, message.time_utc_ns
 
     def _give_up(self, batch: list[_Arrival], error: OSError) -> None:
-        """Leave the file as it was at the last sync and queue the batch for another file."""
+        """Truncate the file to its last sync and queue the batch for another file."""
         file, self._file = self._file, None
         if file is not None:
             file.give_up()
@@ -215,11 +215,11 @@ class ShopRecorder:
 
 
 def _compacted(path: Path) -> str:
-    """Make a shop's recording compact and describe the copy; empty where it was compact."""
+    """Compact a shop's recording and describe the copy; empty if it was already compact."""
     copy = rewrite(path)
     if copy is None:
         return ""
-    end = "" if copy.contents.ended else "; it had no end, every whole message was kept"
+    end = "" if copy.contents.ended else "; it had no end, every complete message was kept"
     return f"{copy.messages} messages, compact{end}"
 
 
@@ -240,7 +240,7 @@ class _File(LiveFile):
         self.writer.add_metadata("shop", metadata)
 
     def add(self, arrival: _Arrival, numbered: tuple[str, int, int]) -> bool:
-        """Write a message (log time: arrival, publish time: its own); return whether there was a channel for it."""
+        """Write a message (log time: arrival; publish time: its own); return whether it has a channel."""
         kind, number, time_ns = numbered
         topic = f"/{OTHER if kind == 'other' else ''}{arrival.key}"
         channel = self._channels.get(topic)

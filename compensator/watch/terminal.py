@@ -19,7 +19,7 @@ from compensator.watch.history import StateInterval, state_intervals
 from compensator.watch.shop import Shop, headline
 from compensator.watch.words import SIGNS, age, here, zone
 
-#: Columns of the table of a shop: heading, least width of the terminal.
+#: Columns of the table of a shop: heading, minimum width of the terminal.
 _COLUMNS = (
     ("machine", 0),
     ("state", 0),
@@ -38,9 +38,9 @@ _COLUMNS = (
 EVENTS, INTERVALS = 6, 4
 #: Action for a machine in state ok that has warnings.
 BELOW = "See the warnings below."
-#: Height of a terminal from which on everything is drawn.
+#: Minimum height of a terminal for the complete view.
 TALL = 44
-#: Lists above the numbers; the others come below the day.
+#: Lists above the numbers; the other lists follow the last day.
 URGENT, PAST = ("Reasons", "Warnings", "Channels", "Devices"), "States of the last day, the newest first"
 
 
@@ -142,7 +142,7 @@ def overview(shop: Shop, machines: Sequence[dict[str, Any]], width: int, rows: i
 
 
 def _cells(machine: dict[str, Any]) -> dict[str, Text]:
-    # Codes, as sentences would be cut off; the actions are below, or in the view of one machine.
+    # Codes, because sentences would be cut off; the actions are below, or in the view of one machine.
     reasons = [reason["code"] for reason in machine["reasons"]] if machine["shown"] != WatchWarning.SILENT else []
     why = " ".join([*reasons, *machine["warning_codes"]])
     return {

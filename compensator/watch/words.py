@@ -23,17 +23,17 @@ TONES: Mapping[str, Tone] = {
     State.STARTING: "warn",
     State.OK: "good",
 }
-#: Sign of each severity, for readers without colour.
+#: Sign of each severity, readable without colour.
 SIGNS: Mapping[Tone, str] = {"good": "✓", "warn": "⚠", "bad": "✗"}
 #: Action for each kind of event.
 _DO: Mapping[str, str] = {
-    EventKind.DEVICE: "Check power, cable and address of the device; `compensator probe` reads it once.",
+    EventKind.DEVICE: "Check the power, cable and address of the device; `compensator probe` reads it once.",
     EventKind.RECORDING: "Check free space, permissions and the disk.",
     EventKind.CLOCK: "Check the time service of the machine's computer.",
     EventKind.ERROR: "Report it with its text; the offset is held until the error is gone.",
     EventKind.COMMAND_REFUSED: "Find out who sent it and with what permission; the offset did not change.",
-    EventKind.ADOPT: "The previous model remains active; see the text for what is wrong with the new one.",
-    EventKind.RESTART: "None if the standard deviation is small enough for the work.",
+    EventKind.ADOPT: "The previous model remains active; the text states why the new one was refused.",
+    EventKind.RESTART: "Nothing, if the standard deviation is small enough for the work.",
 }
 
 

@@ -1,4 +1,4 @@
-"""Shared by the families: settings of a module, its verification, and the poll of a Modbus module."""
+"""Base classes of the families: settings of a module, its verification, and the poll of a Modbus module."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Family:
     Parameters
     ----------
     protocols : tuple of str
-        Of the lines that it can be on.
+        Protocols of the lines that it supports.
     kind : type
         Class of its settings.
     make : callable
@@ -94,11 +94,11 @@ class Check:
     expected : Mapping
         Expected value by place in the answer.
     what : str
-        Content of the register, in words.
+        Content of the register, as text.
     mask : int
         Bits of the register that are compared.
     words : callable
-        Returns a value in words.
+        Returns a value as text.
     """
 
     request: Request
@@ -109,7 +109,7 @@ class Check:
 
 
 class Module(Generic[CheckT]):
-    """A module on a shared line: read and verified with the line to itself.
+    """A module on a shared line, read and verified with exclusive use of the line.
 
     Parameters
     ----------
@@ -152,11 +152,11 @@ class Module(Generic[CheckT]):
         return await self._place.serve(self._verify_and_poll)
 
     async def close(self) -> None:
-        """Leave the line; the last device on it closes it."""
+        """Release the line; the last device closes it."""
         await self._place.close()
 
     async def _verify_and_poll(self) -> dict[int, Reading]:
-        """Verify once after each connecting or timeout, continuing where the last call ran out of time; then poll."""
+        """Verify once after each connection or timeout, continuing a verification that ran out of time; then poll."""
         if self._checked != self._place.generation:
             self._to_check = list(self._checks)
             self._checked = self._place.generation
@@ -207,7 +207,7 @@ class ModbusDevice(Module[Check]):
         super().__init__(config.name, units, self._member, checks)
 
     def readings(self, answers: Sequence[Sequence[int]]) -> dict[int, Reading]:
-        """Turn the answers to the polls into readings."""
+        """Convert the answers to the polls to readings."""
         raise NotImplementedError
 
     async def _poll(self) -> dict[int, Reading]:

@@ -45,7 +45,7 @@ class DconSettings(DeviceSettings, frozen=True, kw_only=True, forbid_unknown_fie
     address : int
         0..255.
     checksum : bool
-        Whether the module is set to send and expect one.
+        Whether the module is set to send and expect a checksum.
     format : str
         `engineering`, `percent` or `hex`, as the module is set.
     vendor : str, optional
@@ -55,7 +55,7 @@ class DconSettings(DeviceSettings, frozen=True, kw_only=True, forbid_unknown_fie
     couple : str, optional
         Thermocouple type of the inputs that name none.
     diagnose : bool
-        Whether `$AAB` is asked each time (4018+ and others): a set bit is an open thermocouple or out of range.
+        Whether `$AAB` is queried each time (4018+ and others): a set bit is an open thermocouple or out of range.
     verify : bool
         Whether, after connecting, the module's own settings are compared with these.
     """

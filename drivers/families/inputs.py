@@ -93,7 +93,7 @@ def analogue_inputs(config: DeviceSettings, count: int, where: Where) -> dict[in
 
 
 def check_input(number: int, taken: Mapping[int, object], count: int, model: str, where: Where) -> None:
-    """Raise where a module has no such input, or it is given twice."""
+    """Raise an error if a module has no such input, or it is given twice."""
     if number >= count:
         raise where.wrong("input", number, f"0..{count - 1} on {model}")
     if number in taken:

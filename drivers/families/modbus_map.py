@@ -1,4 +1,4 @@
-"""Any Modbus device whose registers are written into the configuration: drives, chillers, transmitters.
+"""Any Modbus device whose registers are given in the configuration: drives, chillers, transmitters.
 
 `value = (number in the registers) × scale + offset`, in the input's unit. Numbers that mean a fault
 (`bad_values`) and limits of what is plausible (`minimum`, `maximum`, in the unit) give the quality.
@@ -88,7 +88,7 @@ class _Spot:
 
 
 class ModbusMap(ModbusDevice):
-    """A device read by the registers in its configuration."""
+    """A device whose registers are given in its configuration."""
 
     def __init__(self, config: MapSettings, line: ModbusLine, where: Where) -> None:
         inputs: dict[int, MapInput] = {}

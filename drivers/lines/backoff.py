@@ -1,8 +1,8 @@
-"""Space out the attempts to reach a device that does not answer, so that it does not block the others on its line."""
+"""Back-off: delays attempts to reach a device that does not answer, so that it does not block others on its line."""
 
 from __future__ import annotations
 
-# Below this many failures in a row every call is an attempt: one lost reply must not cost a second sample.
+# Below this number of failures in a row every call is an attempt, so that one lost reply costs only one sample.
 FREE_ATTEMPTS = 3
 FIRST_WAIT_S = 0.25
 

@@ -1,11 +1,11 @@
 """A DCON line: one serial port, shared by its modules, one command at a time.
 
-Data replies carry no address, so a late one could pass for another module's. They are kept apart as follows:
+Data replies contain no address, so a late one could be taken for another module's. They are distinguished as follows:
 
-- Before each command everything received is dropped, and only one command is sent at a time.
+- Before each command all received bytes are dropped, and only one command is sent at a time.
 - After a missing or broken data reply the module is *unsettled*. The line first waits until it is quiet,
-  and the module is asked for its name (`$AAM`) until it answers: names carry the address, and a module
-  answers in order, so after its name no data reply of it is left.
+  and the module is asked for its name (`$AAM`) until it answers: name replies contain the address, and a module
+  answers in order, so after its name no data reply of it is pending.
 - For `LOOSE_S` after a missing data reply the *other* modules' data are confirmed: each is asked for
   its name right after its data. With the late reply there would be two data replies before the name; then
   both are dropped.
@@ -21,7 +21,7 @@ from drivers.lines.settings import SerialLine
 from drivers.lines.shared_line import Place, SharedLine
 from drivers.protocols.dcon import BadTextError, Reply, command, reply
 
-# Longer than any module or converter holds a reply back, s.
+# Longer than any module or converter delays a reply, s.
 LOOSE_S = 10.0
 
 
@@ -37,7 +37,7 @@ class DconMember(Place):
     address : int
         0..255.
     with_checksum : bool
-        Whether commands and replies carry one.
+        Whether commands and replies have one.
     """
 
     line: DconLine
@@ -72,7 +72,7 @@ class DconLine(SharedLine[DconMember]):
         self._loose_until_s: dict[int, float] = {}
 
     def join(self, name: str, address: int, *, with_checksum: bool) -> DconMember:
-        """Give a module its place."""
+        """Add a module to the line."""
         member = DconMember(self, name, address, with_checksum=with_checksum)
         self._places.append(member)
         return member
@@ -105,7 +105,7 @@ class DconLine(SharedLine[DconMember]):
         self._loose_until_s.pop(member.address, None)
 
     async def data(self, member: DconMember, text: str) -> str:
-        """Ask for data, and confirm their sender while another module's may still come."""
+        """Query data, and confirm their sender while another module's late data may still arrive."""
         now_s = asyncio.get_running_loop().time()
         member.unsettled = True
         try:

@@ -5,10 +5,10 @@ Faults, and how they are handled:
 - *Late answer (RTU).* An RTU frame does not say which request it answers. After a missing, broken or
   refused answer the unit is *unsettled*: before its next request the line first waits until it is quiet,
   then sends a fence (`drivers.protocols.modbus.fence_for`), whose answer differs from all other answers of
-  the unit. A device answers in order, so after the fence's answer nothing late is left. Answers of other
+  the unit. A device answers in order, so after the fence's answer no late answer is pending. Answers of other
   units differ by their unit id.
 - *Late answer (TCP).* Recognised by the transaction number. A stream out of step is disconnected.
-- *Dead device.* Its attempts are spaced out (`drivers.lines.backoff`); the others continue.
+- *Dead device.* Its attempts are delayed by a back-off (`drivers.lines.backoff`); the other devices continue.
 - *Dead host.* A connection that times out is not attempted again by each waiting device.
 """
 
@@ -95,7 +95,7 @@ class ModbusLine(SharedLine[Member]):
         self._timeouts = 0
 
     def join(self, name: str, address: int, fence: Request) -> Member:
-        """Give a device its place."""
+        """Add a device to the line."""
         member = Member(self, name, address, fence)
         self._places.append(member)
         return member

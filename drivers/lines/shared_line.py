@@ -1,4 +1,4 @@
-"""Shared by lines with several devices: one job at a time, time limits, spaced attempts, late answers."""
+"""Base classes of lines with several devices: one job at a time, time limits, back-off, late answers."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class Place:
         self.name = name
         self.address = address
         self.backoff = Backoff(line.timeout_s)
-        #: Whether an answer of this device may still come; how often the line was cleared of such answers.
+        #: Whether a late answer of this device may be pending; how often the line was cleared of such answers.
         self.unsettled = False
         self.settlings = 0
         self.closed = False
 
     async def serve(self, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
-        """Run a job of requests with the line to itself; see `SharedLine.serve`."""
+        """Run a job of requests with exclusive use of the line; see `SharedLine.serve`."""
         return await self.line.serve(self, job)
 
     @property
@@ -50,7 +50,7 @@ class Place:
         return self.line.generation, self.settlings
 
     async def close(self) -> None:
-        """Leave the line; the last one closes it."""
+        """Release the line; the last device closes it."""
         self.closed = True
         self.line.left()
 
@@ -81,9 +81,9 @@ class SharedLine(ABC, Generic[PlaceT]):
         """Close the line; a pending request fails at once."""
 
     async def serve(self, place: PlaceT, job: Callable[[], Awaitable[ResultT]]) -> ResultT:
-        """Run a job of one device, with the line to itself.
+        """Run a job of one device, with exclusive use of the line.
 
-        The time limit, twice the line's, runs from when the device gets the line.
+        The time limit, twice the line's, starts when the device gets the line.
 
         Raises
         ------
@@ -127,11 +127,11 @@ class SharedLine(ABC, Generic[PlaceT]):
             raise DeviceTimeout(place.name, f"no answer {failures} times, next attempt in {wait_s:.1f} s")
 
     def _backoffs(self, place: PlaceT) -> list[Backoff]:
-        """Return the back-offs that an attempt has to wait for."""
+        """Return the back-offs that delay an attempt."""
         return [place.backoff]
 
     def _check_turn(self, place: PlaceT, asked_at_s: float) -> None:
-        """Refuse a waiting device where another one has meanwhile found the host unreachable."""
+        """Refuse a waiting device if another one has meanwhile found the host unreachable."""
 
     @abstractmethod
     async def _open(self, place: PlaceT) -> None:
@@ -139,14 +139,14 @@ class SharedLine(ABC, Generic[PlaceT]):
 
     @abstractmethod
     async def _settle(self, place: PlaceT) -> None:
-        """Make sure that no late answer of a device is left on the line."""
+        """Ensure that no late answer of a device is pending on the line."""
 
     @abstractmethod
     def _heard_at_s(self) -> float | None:
-        """Return the time of the last bytes received, s of the loop's clock; None where the line is not open."""
+        """Return the time of the last bytes received, s of the loop's clock; None if the line is not open."""
 
     async def _be_quiet(self) -> None:
-        """Wait until the line is quiet, for at most half a time limit."""
+        """Wait until the line is quiet, for at most half the time limit."""
         loop = asyncio.get_running_loop()
         give_up_s = loop.time() + self.timeout_s / 2.0
         while (heard_at_s := self._heard_at_s()) is not None and loop.time() < give_up_s:

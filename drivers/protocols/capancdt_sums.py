@@ -1,4 +1,4 @@
-"""Sums of a channel's values in one block: enough for mean, extremes and quality, whatever the block's size."""
+"""Sums of a channel's values in one block, from which mean, extremes and quality are computed."""
 
 from __future__ import annotations
 

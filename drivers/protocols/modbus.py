@@ -68,9 +68,8 @@ def exception_text(code: int) -> str:
 def fence_for(requests: tuple[Request, ...]) -> Request:
     """Choose a request whose answer cannot be confused with that of any of a device's requests.
 
-    After a missing answer it is sent first. A device answers in order, so once the fence's own answer is there every
-    earlier one has come, or will never come. The fence reads the start of the first block, with a length that no other
-    request has.
+    It is the first request after a missing answer. A device answers in order, so after the fence's own answer no
+    earlier answer can arrive. The fence reads the start of the first block, with a length that no other request has.
 
     Parameters
     ----------
@@ -131,7 +130,7 @@ def find_rtu(data: bytes, unit: int, request: Request) -> bytes | None:
 
 
 def describe_rtu(data: bytes, unit: int, request: Request) -> str | None:
-    """Return why the bytes of a line are no answer.
+    """Return why the bytes of a line are not an answer.
 
     Returns
     -------

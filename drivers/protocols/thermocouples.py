@@ -1,4 +1,4 @@
-"""Thermocouple ranges and type codes, maker by maker.
+"""Thermocouple ranges and type codes by manufacturer.
 
 Sources: ICP DAS ET-7000/PET-7000 register table, appendix A; Advantech ADAM-4000 manual, appendix B, with the
 scaling of Advantech's own class library; for modules that report °C the limits of IEC 60584-1.
@@ -76,7 +76,7 @@ class Span:
     def advantech(self, raw: int) -> Reading:
         """Scale a word of an Advantech module: `low + word / 65535 × (high − low)`.
 
-        Such a module cannot report a value outside its range: it stays at the end.
+        Such a module cannot report a value outside its range: it is clamped to the end.
 
         Examples
         --------

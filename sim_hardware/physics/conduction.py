@@ -9,7 +9,7 @@ which bends while its front wall is warmer than its rear wall.
 
 The conduction is stepped exactly (``network.py``). What is not linear, the film's dependence on temperature
 and everything that an effect adds, is held over a substep of at most 10 s, which is short against every time
-constant it acts on.
+constant on which it acts.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class QuillMachine:
     Parameters
     ----------
     design : QuillDesign, optional
-        Dimensions; the sized ones if left out.
+        Dimensions; by default the sized ones.
     effects : sequence of UndeclaredEffect
-        Undeclared effects at work.
+        Undeclared effects that act.
     longest_substep_s : float
         Bound for the splitting, s.
 
@@ -82,10 +82,10 @@ class QuillMachine:
         self._observe()
 
     def advance(self, dt_s: float, inputs: Inputs) -> None:
-        """Let `dt_s` seconds pass with the inputs held.
+        """Advance by `dt_s` seconds with constant inputs.
 
-        Pieces under a second are collected while the inputs stay the same, and the signals stand still
-        meanwhile: nothing here moves by more than 0.1 µm in that time.
+        Steps under a second are accumulated while the inputs stay the same, and the signals do not change
+        meanwhile: the displacement changes by at most 0.1 µm in that time.
 
         Raises
         ------
@@ -171,7 +171,7 @@ class QuillMachine:
         return factor
 
     def _observe(self) -> None:
-        """Turn temperatures into the signals at the probe and the thermocouple."""
+        """Compute the signals at the probe and the thermocouple from the temperatures."""
         rise_k = self.degc - REST_DEGC
         growth_um = float(self.layout.growth_um_per_k @ rise_k)
         for action in self._joints:

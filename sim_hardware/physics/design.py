@@ -1,8 +1,8 @@
 """The sized quill: dimensions, masses, films and lever arms of :class:`QuillMachine`.
 
 The dimensions of the machine in the experiment were not published. These values are plausible for a hollow steel
-quill of that size in a cast headstock on a column, and were sized by ``sizing.py`` so that the responses come
-near the functions published by M. Mareš and P. Bárta.
+quill of that size in a cast headstock on a column, and were sized by ``sizing.py`` so that the responses
+approximate the functions published by M. Mareš and P. Bárta.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QuillDesign:
-    """Dimensions and properties; every field carries its unit."""
+    """Dimensions and properties; the name of every field contains its unit."""
 
     # The quill: a hollow steel body along Y, cut into nodes from its rear (0) to its nose (1).
     quill_nodes: int = 18
@@ -61,7 +61,7 @@ class QuillDesign:
     base_j_per_k: float = 400e3
     base_area_m2: float = 1.5
 
-    # A further mass on the housing that the calibration never saw; 0 J/K: none.
+    # A further mass on the housing, absent from the calibration; 0 J/K: none.
     second_j_per_k: float = 0.0
     second_link_w_per_k: float = 0.0
     second_lever_m: float = 0.0

@@ -1,4 +1,4 @@
-"""Duties of a machine: inputs over time, by seed, on a grid of 10 s."""
+"""Duty cycles of a machine: inputs over time, by seed, on a grid of 10 s."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ Array = NDArray[np.float64]
 
 GRID_S = 10.0
 HOUR_S = 3600.0
-#: A working day begins with this long a rest, s.
+#: Rest at the start of a working day, s.
 IDLE_S = 1800.0
 
 CHANNELS = ("heat_w", "ambient_degc", "coolant_degc", "coolant_flow_lpm", "spindle_rpm", "fan_rpm")
 
 
 class Duty:
-    """Inputs on a grid, held in between.
+    """Duty cycle: inputs on a grid, constant in between.
 
     Parameters
     ----------
     duration_s : float
-        Length, s; afterwards the last inputs go on.
+        Length, s; after that the last inputs remain.
     **columns : array or float
         Inputs by the names of :class:`Inputs`, each of the grid's length or constant. Other names are
-        channels that act on nothing.
+        channels without an effect.
 
     Examples
     --------
@@ -54,7 +54,7 @@ class Duty:
         self._inputs = [Inputs(**v, extras=x) for v, x in zip(values, others, strict=True)]
 
     def at(self, t_s: float) -> Inputs:
-        """Return the inputs that hold at a time, s."""
+        """Return the inputs at a time, s."""
         # A microsecond of slack, so that sums of steps such as 0.1 s do not fall short of the grid.
         return self._inputs[min(max(int((t_s + 1e-6) / GRID_S), 0), len(self._inputs) - 1)]
 
@@ -78,14 +78,14 @@ class Duty:
     def working_day(cls, seed: int, hours: float = 24.0) -> Duty:
         """Return a realistic job: heat at several levels, spindle, coolant with its thermostat, fan, air.
 
-        The channels have schedules of their own, so that an observer can tell them apart; the coolant flows
-        mostly while the spindle turns. ``cabinet_degc`` and ``hydraulic_bar`` act on nothing.
+        The channels have independent schedules, so that their effects can be distinguished; the coolant flows
+        mostly while the spindle turns. ``cabinet_degc`` and ``hydraulic_bar`` have no effect.
         """
         random = np.random.default_rng([seed, 7])
         n = int(np.ceil(hours * HOUR_S / GRID_S)) + 1
         heat_w = levels(random, n, np.array([0.0, 0.0, 30.0, 45.0, 60.0, 75.0, 90.0]), (20.0, 150.0))
         rpm = levels(random, n, np.array([0.0, 0.0, 1500.0, 3000.0, 4500.0, 6000.0, 8000.0]), (6.0, 90.0))
-        # The shift starts on a cold machine: a service that zeroes itself at its start must find it at rest.
+        # The shift starts on a cold machine: a service that sets its zero at the start must find it at rest.
         idle = int(IDLE_S / GRID_S)
         heat_w[:idle] = rpm[:idle] = 0.0
         flow_lpm = flow_while(random, rpm > 0.0)

@@ -24,13 +24,13 @@ class Film:
     area_m2 : array, shape (n,)
         Surfaces, m².
     forced_w_per_m2k : float
-        Coefficient of the air that always moves in a shop, W/m²K.
+        Coefficient due to the permanent air movement in a shop, W/m²K.
     height_m : float
         Height of the faces, m.
     emissivity : float
-        Of painted or oily steel, 1.
+        Emissivity of painted or oily steel, 1.
     reference_degc : float
-        Where the linear part is taken, °C.
+        Temperature of the linearisation, °C.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Which masses the machine has, how they touch, and how far each one moves the tool centre point."""
+"""The masses of the machine, their contacts, and their levers on the tool centre point."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 class Layout:
-    """Nodes of a design, by name and by place.
+    """Nodes of a design, by name and by position.
 
     Parameters
     ----------

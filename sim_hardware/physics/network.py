@@ -55,12 +55,12 @@ class Network:
         return len(self.names) - 1
 
     def link(self, a: int, b: int, w_per_k: float) -> None:
-        """Let heat flow between two masses.
+        """Add a conductance between two masses.
 
         Raises
         ------
         ValueError
-            If the conductance is negative: heat does not flow uphill.
+            If the conductance is negative.
         """
         if w_per_k < 0.0:
             raise ValueError(f"{self.names[a]} to {self.names[b]}: {w_per_k} W/K")
@@ -104,7 +104,7 @@ class Conduction:
     def step(self, dt_s: float) -> tuple[Array, Array]:
         """Return Φ and Ψ of :math:`T(t+dt) = Φ T(t) + Ψ (g T_{air} + q)`.
 
-        The step length counts in whole microseconds; recent lengths are kept.
+        The step length is rounded to whole microseconds; results for recent lengths are cached.
         """
         key = round(dt_s * 1e6)
         found = self._steps.get(key)

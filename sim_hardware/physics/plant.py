@@ -28,7 +28,7 @@ class Inputs:
     spindle_rpm, fan_rpm : float
         Speeds, 1/min.
     extras : mapping of str to float
-        Channels that act on nothing; they go through to the signals by their own names.
+        Channels without an effect; they are passed to the signals under their own names.
     """
 
     heat_w: float = 0.0
@@ -40,7 +40,7 @@ class Inputs:
     extras: Mapping[str, float] = field(default_factory=dict)
 
     def channels(self) -> dict[str, float]:
-        """Return the inputs that are measured as they are, by signal name."""
+        """Return the inputs that are measured directly, by signal name."""
         return {
             "heat_w": self.heat_w,
             "coolant_degc": self.coolant_degc,
@@ -55,7 +55,7 @@ class Plant(Protocol):
     """A simulated machine."""
 
     def advance(self, dt_s: float, inputs: Inputs) -> None:
-        """Let `dt_s` seconds pass with the inputs held."""
+        """Advance by `dt_s` seconds with constant inputs."""
 
     def signals(self) -> dict[str, float]:
         """Return the true values now, by channel name (units in the names)."""

@@ -85,14 +85,14 @@ def step_responses(minutes: int, heat_w: float = 90.0) -> tuple[Array, Array, Ar
 class PublishedQuill:
     """The quill by the paper's equations.
 
-    The functions step at the whole minutes, with the inputs given to the first piece of that minute, and
-    their outputs hold until the next one: a sample of a minute's mean is exactly one step. T_Q is the present
+    The functions step at whole minutes, with the inputs of the first step of that minute, and their outputs are
+    constant until the next minute: a sample (a mean over one minute) is exactly one step. T_Q is the present
     ambient temperature plus the function's output.
 
     Parameters
     ----------
     effects : sequence of UndeclaredEffect
-        Undeclared effects that act on what leaves the machine (probe, joint, thermocouple).
+        Undeclared effects that act on the outputs (probe, joint, thermocouple).
 
     Raises
     ------
@@ -126,7 +126,7 @@ class PublishedQuill:
         self._rise_k = 0.0
 
     def advance(self, dt_s: float, inputs: Inputs) -> None:
-        """Let `dt_s` seconds pass with the inputs held.
+        """Advance by `dt_s` seconds with constant inputs.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class PublishedQuill:
         for action in self._joints:
             growth_um = action.growth_um(growth_um)
         self._y_um = growth_um + self._tdtf.step(inputs.ambient_degc - REST_DEGC)
-        # The thermocouple lags with respect to the rise: the ambient's part of T_Q is there at once.
+        # The thermocouple's lag acts on the rise: a change of the ambient temperature acts on T_Q at once.
         self._rise_k = self._ttf.step(inputs.heat_w)
         for action in self._thermocouples:
             self._rise_k = action.t_q_degc(self._next_s, self._rise_k)

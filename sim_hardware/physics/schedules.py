@@ -15,7 +15,7 @@ DAY_S = 86_400.0
 
 
 def levels(random: np.random.Generator, n: int, choices: Array, minutes: tuple[float, float]) -> Array:
-    """Return levels that hold for random times within `minutes`; never the same one twice running."""
+    """Return levels that are constant for random times within `minutes`; consecutive levels differ."""
     out = np.empty(n)
     at, last = 0, -1.0
     while at < n:
@@ -31,7 +31,7 @@ def levels(random: np.random.Generator, n: int, choices: Array, minutes: tuple[f
 def shop_air(random: np.random.Generator, n: int, doors_per_day: float, swing_k: float = 1.0) -> Array:
     """Return the air's temperature in °C: ±`swing_k` a day, slow noise of 0.15 K, doors that let cold air in.
 
-    It begins at 20 °C, the machine being at rest there.
+    It starts at 20 °C, the temperature at which the machine is at rest.
     """
     t_s = np.arange(n) * GRID_S
     air = swing_k * np.sin(2.0 * np.pi * t_s / DAY_S) * random.choice([-1.0, 1.0])
@@ -70,7 +70,7 @@ def coolant(random: np.random.Generator, air_degc: Array, flow_lpm: Array) -> Ar
 
 
 def cabinet(random: np.random.Generator, air_degc: Array) -> Array:
-    """Return a cabinet's °C that follows the air and its own load, and acts on nothing."""
+    """Return a cabinet's °C, which follows the air and its own load, and has no effect."""
     load_k = levels(random, len(air_degc), np.array([3.0, 6.0, 9.0]), (30.0, 240.0))
     keep = float(np.exp(-GRID_S / 1800.0))
     start = [keep * float(load_k[0])]

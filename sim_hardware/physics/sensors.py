@@ -30,7 +30,7 @@ class SensorSpec:
     lag_s : float
         Time constant, s.
     outlier_share, outlier_size : float
-        Share of readings that are off by up to `outlier_size`, and that size.
+        Share of readings with an error of up to `outlier_size`, and that size.
     dropout_share : float
         Share of readings that are missing (NaN).
     """
@@ -45,14 +45,14 @@ class SensorSpec:
 
 
 class Sensor:
-    """One sensor with its own stream of randomness.
+    """One sensor with its own random number stream.
 
     Parameters
     ----------
     spec : SensorSpec
-        What is wrong with it.
+        Errors of the sensor.
     seed : int
-        Same seed, same readings.
+        Seed; the same seed gives the same readings.
     name : str
         Channel; sensors of one seed and different names are independent.
 
@@ -71,7 +71,7 @@ class Sensor:
         self._last_s = math.nan
 
     def read(self, true_value: float, t_s: float | None = None) -> float:
-        """Return a reading; NaN where it dropped out.
+        """Return a reading; NaN for a dropout.
 
         Raises
         ------
@@ -131,7 +131,7 @@ def usual_sensors(
 ) -> dict[str, SensorSpec]:
     """Return the sensors of a usual set-up: thermocouples, a capacitive probe and the control's own values.
 
-    `extras` are the channels of a duty that act on nothing; with `heat_known`, a wattmeter reads the heater.
+    `extras` are the channels of a duty cycle without an effect; with `heat_known`, a wattmeter measures the heater.
     """
     couple = SensorSpec(noise_std=temperature_noise_k, quantum=0.01)
     usual = {

@@ -1,6 +1,6 @@
 """Size the quill: fit the dimensions of :class:`QuillDesign` to the published responses.
 
-Run ``python -m sim_hardware.physics.sizing`` to see how near the stored dimensions come, with ``--fit`` to
+Run ``python -m sim_hardware.physics.sizing`` to show the fit of the stored dimensions, with ``--fit`` to
 search again (some minutes) and print the new ones, rounded. Least squares over three responses: displacement
 and T_Q − AT after 90 W from rest, and the displacement after the air has become 1 K warmer; dimensions are
 searched in their logarithms (masses, films and contacts are positive) within plausible
@@ -80,13 +80,13 @@ def responses(design: QuillDesign, longest_substep_s: float = 60.0) -> tuple[Arr
 
 
 def fit(start: QuillDesign, evaluations: int = 40) -> QuillDesign:
-    """Return the design whose responses come nearest to the published ones."""
+    """Return the design with the best fit to the published responses."""
     names = list(BOUNDS)
     signs = np.array([np.sign(getattr(start, n)) for n in names])
     lower, upper = (np.log([BOUNDS[n][i] for n in names]) for i in (0, 1))
     x0 = np.clip(np.log([abs(getattr(start, n)) for n in names]), lower + 1e-3, upper - 1e-3)
     y, t, a = step_responses(HORIZON_MIN, STEP_W)
-    # Dense where things move fast, and evenly in the logarithm of time later.
+    # Dense during fast changes, later uniform in the logarithm of time.
     at = np.unique(np.concatenate([np.arange(1, 60, 3), np.geomspace(60, HORIZON_MIN, 50).astype(int)]))
 
     def design(x: Array) -> QuillDesign:
@@ -104,7 +104,7 @@ def fit(start: QuillDesign, evaluations: int = 40) -> QuillDesign:
 
 
 def main() -> None:
-    """Print how near the responses come; with an option, search first."""
+    """Print the fit of the responses; with an option, search first."""
     parser = argparse.ArgumentParser(description="fit the simulated quill to the published responses")
     parser.add_argument("--fit", action="store_true", help="search for new dimensions first")
     parser.add_argument("--evaluations", type=int, default=40, help="bound for the search")

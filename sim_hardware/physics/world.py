@@ -1,4 +1,4 @@
-"""A machine at work, seen through its sensors; time is passed in, and readers may be in other threads."""
+"""A working machine and its sensors; time is passed in, and readers may be in other threads."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ READING_S = 1.0
 
 
 class World:
-    """One machine, its duty and its sensors.
+    """One machine, its duty cycle and its sensors.
 
     Parameters
     ----------
@@ -29,9 +29,9 @@ class World:
     duty : Duty
         Its inputs over time.
     sensors : mapping of str to SensorSpec, optional
-        Sensors by channel; :func:`usual_sensors` if left out. Channels without one have no reading.
+        Sensors by channel; by default :func:`usual_sensors`. Channels without one have no reading.
     seed : int
-        Of all sensors' randomness.
+        Seed of all sensors.
 
     Examples
     --------
@@ -68,7 +68,7 @@ class World:
             return self._t_s
 
     def advance_to(self, t_s: float) -> None:
-        """Let time pass up to `t_s`, in steps that end on the grid of 10 s.
+        """Advance to `t_s`, in steps that end on the grid of 10 s.
 
         Raises
         ------
@@ -111,10 +111,10 @@ class World:
             return {"t_s": np.array(self._times), **columns}
 
     def record(self, period_s: float = 60.0, until_s: float | None = None) -> dict[str, Array]:
-        """Run on to the duty's end, or to `until_s`, and return the table of a logger.
+        """Advance to the end of the duty cycle, or to `until_s`, and return the table of a logger.
 
         Each row is the mean of one reading a second over ``(t_s, t_s + period_s]``. The readings draw from
-        streams of their own, so that a recording is the same whatever has been read before.
+        separate random streams, so that a recording does not depend on earlier readings.
 
         Returns
         -------
@@ -128,7 +128,7 @@ class World:
         count = int((past["t_s"][-1] - start_s) / period_s + 1e-9)
         each = max(1, round(period_s / READING_S))
         when = start_s + (np.arange(count * each) + 1.0) * (period_s / each)
-        # The true value holds from a step's end back to its start, as the inputs are held.
+        # The true value at the end of a step applies to the whole step, because the inputs are constant.
         index = np.minimum(np.searchsorted(past["t_s"], when - 1e-6), len(past["t_s"]) - 1)
         table: dict[str, Array] = {"t_s": np.arange(count, dtype=np.float64) * period_s}
         for name, spec in self._specs.items():

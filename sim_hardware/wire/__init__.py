@@ -1,4 +1,4 @@
-"""Simulated measuring devices that speak the real protocols over TCP ports and pseudo-terminals."""
+"""Simulated measuring devices with the real protocols over TCP ports and pseudo-terminals."""
 
 from sim_hardware.wire.adam import Adam
 from sim_hardware.wire.capancdt import CapaNcdt

@@ -36,7 +36,7 @@ class CapaNcdt(Server):
     ranges : float or Mapping[int, float]
         Measuring range, of all channels or of each, µm.
     realtime : bool
-        Whether the controller streams with its own sample time. Otherwise blocks leave by `push` alone.
+        Whether the controller streams with its own sample time. Otherwise blocks are sent only by `push`.
     data_port, command_port : int
         Port numbers; 0 takes a free one.
 
@@ -138,7 +138,7 @@ class CapaNcdt(Server):
             await (port.refuse() if self.faults.active("disconnect") else port.listen())
 
     def execute(self, command: str) -> str:
-        """Answer a command of the Telnet port; what follows the echo."""
+        """Return the answer to a command of the Telnet port, without the echo."""
         if self._layers.use("exception") is not None:
             return WRONG
         answer = self.controller.answer(command)
@@ -202,7 +202,7 @@ class CapaNcdt(Server):
         return self._last[channel]
 
     def _convert(self, channel: int, faults: Mapping[str, Parameters]) -> int:
-        # The stream has no code for a bad sensor: no cable looks like an infinite distance.
+        # The stream has no code for a faulty sensor: a missing cable reads as an infinite distance.
         if "open" in faults or "over" in faults:
             return FULL_SCALE
         if "under" in faults:

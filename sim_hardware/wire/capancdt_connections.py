@@ -32,11 +32,11 @@ class DataConnection(Connection):
         self._writable.set()
 
     def pause_writing(self) -> None:
-        """Note that the socket is full."""
+        """Handle a full socket."""
         self._writable.clear()
 
     def resume_writing(self) -> None:
-        """Note that the socket is empty again."""
+        """Handle a socket that is empty again."""
         self._writable.set()
 
     async def drained(self) -> None:
@@ -45,7 +45,7 @@ class DataConnection(Connection):
 
 
 class CommandConnection(Connection):
-    """A client of the command port: every character comes back, an answer follows each command.
+    """A client of the command port: every character is echoed, and an answer follows each command.
 
     Parameters
     ----------

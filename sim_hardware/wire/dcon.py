@@ -26,7 +26,7 @@ _SPEAKS = ("i-", "m-", "adam-41", "adam-40")
 class DconLine(Server):
     """Serve modules by DCON on a serial line.
 
-    There is no reply at all to a wrong syntax, a wrong checksum or an address without a module; `?AA` says
+    There is no reply to a wrong syntax, a wrong checksum or an address without a module; the reply `?AA` means
     that a command was understood but is not allowed.
 
     Parameters
@@ -34,14 +34,14 @@ class DconLine(Server):
     modules : Mapping[int, IcpDas or Adam]
         Modules by address, 0..255.
     settings : Mapping[int, DconSettings], optional
-        Settings of the modules that do not have those of the factory.
+        Settings of the modules that differ from the factory settings.
     baud : float, optional
         Pace of the replies; without it they come at once.
 
     Raises
     ------
     ValueError
-        If a module does not speak the protocol.
+        If a module does not support the protocol.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class DconLine(Server):
         super().__init__()
         for module in modules.values():
             if not module.model.startswith(_SPEAKS):
-                raise ValueError(f"{module.model} does not speak DCON")
+                raise ValueError(f"{module.model} does not support DCON")
         self.modules = dict(modules)
         chosen = settings or {}
         self._slaves = {a: DconSlave(m, chosen.get(a, DconSettings())) for a, m in modules.items()}

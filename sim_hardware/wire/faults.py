@@ -1,6 +1,6 @@
-"""Faults that a test switches on and off while the simulated device runs.
+"""Faults that a test switches on and off while the simulated device is running.
 
-Faults of the whole device act on what travels over the wire, faults of one input on what the device
+Faults of a device act on the transmitted bytes, faults of an input on the value that the device
 measures there.
 """
 
@@ -36,8 +36,8 @@ _NONE: Parameters = MappingProxyType({})
 class Faults:
     """Hold the faults of one device or line.
 
-    May be used from any thread. `set` and `clear` return when the device's server has taken note, so that
-    the next request already meets the new state.
+    May be used from any thread. `set` and `clear` return when the device's server has applied the change, so that
+    it affects the next request.
 
     Examples
     --------
@@ -52,7 +52,7 @@ class Faults:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        # Replaced, never changed in place: the server thread reads without taking the lock.
+        # Replaced, never changed in place: the server thread reads without the lock.
         self._device: dict[str, Parameters] = {}
         self._inputs: dict[int, dict[str, Parameters]] = {}
         self._supported = DEVICE_FAULTS | INPUT_FAULTS
@@ -70,7 +70,7 @@ class Faults:
         **parameters
             `code` of "exception"; `delay_s` of "late" (s); `value` of "wild" (the input's unit); `frames` of
             "gap"; `pieces` and `pause_s` of "split" (s). Every fault of a device also takes `times`: the
-            number of replies after which it goes away by itself.
+            number of replies after which it is cleared automatically.
 
         Raises
         ------

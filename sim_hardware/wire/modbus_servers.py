@@ -22,7 +22,7 @@ LONGEST_PDU = 253
 
 
 class _ModbusServer(Server):
-    """Shared by the three carriers: modules by unit id, and their faults."""
+    """Base class of the three carriers: modules by unit id, and their faults."""
 
     def __init__(self, modules: Mapping[int, Module], supported: frozenset[str]) -> None:
         super().__init__()

@@ -43,7 +43,7 @@ Table = dict[int, Cell]
 
 
 class State(enum.Enum):
-    """State of an input, as the module sees it."""
+    """State of an input, as detected by the module."""
 
     GOOD = enum.auto()
     OPEN = enum.auto()

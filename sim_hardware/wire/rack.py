@@ -1,4 +1,4 @@
-"""The thread that all simulated devices of a test live in."""
+"""The thread in which all simulated devices of a test run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Server(ABC):
     Attributes
     ----------
     faults : Faults
-        Faults of the line as a whole. They come before those of the devices on it.
+        Faults of the whole line. They have precedence over those of the devices on it.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Server(ABC):
 
     @abstractmethod
     async def apply_faults(self) -> None:
-        """Bring the ports into the state that the faults ask for."""
+        """Set the ports to the state required by the faults."""
 
     def _faults_changed(self) -> None:
         if self._rack is not None:
@@ -71,8 +71,8 @@ _Server = TypeVar("_Server", bound=Server)
 class Rack:
     """Run servers in one background thread, and stop them all on leaving.
 
-    Sources are called in that thread. What goes wrong in it (a source that raises, say) is kept and raised on
-    leaving.
+    Sources are called in that thread. Errors in it (such as an exception in a source) are stored and raised on
+    exit.
 
     Examples
     --------

@@ -96,7 +96,7 @@ def test_what_was_fitted_cannot_judge_wherever_it_was_copied_to(run: Path, tmp_p
     copy = tmp_path / "copy.csv"
     copy.write_bytes(run.read_bytes())
     for data, validate in ((run, copy), (frame(run), frame(run)), (tc.read(arrays(run)), arrays(run))):
-        with pytest.raises(tc.CompensatorError, match="takes part in the fit"):
+        with pytest.raises(tc.CompensatorError, match="is used for the fit"):
             tc.identify(data, validate=validate)
 
 

@@ -81,7 +81,7 @@ def test_what_cannot_be_read_is_one_line_and_exit_code_2(
         ([str(rec), "--out", "x.csv"], "--out: is for --model"),
         ([str(rec), "--public-key", str(text)], "day.csv: no PEM public key"),
         ([str(rec), "--public-key", str(private)], "key.pem: is a private key"),
-        ([str(rec), "--public-key", str(text), "--model", "quill"], "--public-key: belongs to the audit"),
+        ([str(rec), "--public-key", str(text), "--model", "quill"], "--public-key: is for the audit"),
         ([str(rec), "--model", str(tmp_path / "none.toml")], "none.toml"),
         ([str(no_config), "--model", "quill"], "attachment config.toml is missing"),
     ):
@@ -114,7 +114,7 @@ def test_a_recording_without_any_trace_of_its_chain_proves_nothing(
 
     rewrite(rec, lambda lines: [line for line in lines if line.topic not in ("chain", "seal")], contents=bare)
     assert main(["replay", str(rec)]) == 3
-    assert f"{rec.name}: removed: channel /chain: the recorder writes it" in capsys.readouterr().out
+    assert f"{rec.name}: removed: channel /chain: missing, although the recorder writes it" in capsys.readouterr().out
 
 
 def test_samples_that_cannot_be_worked_out_again_prove_nothing(rec: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -129,7 +129,7 @@ def test_samples_that_cannot_be_worked_out_again_prove_nothing(rec: Path, capsys
 
 @pytest.mark.parametrize(
     ("topic", "expected"),
-    [("/temperature", "no recording of this service"), ("/shop/vmc-07/thermal/sample", "a shop's recording")],
+    [("/temperature", "not a recording of the service"), ("/shop/vmc-07/thermal/sample", "a shop's recording")],
 )
 def test_a_file_that_no_service_wrote_is_no_clean_recording(
     rec: Path, capsys: pytest.CaptureFixture[str], topic: str, expected: str
@@ -146,4 +146,4 @@ def test_a_file_that_no_service_wrote_is_no_clean_recording(
     assert not said.out and said.err.count("\n") == 1 and f"foreign.mcap: {expected}" in said.err
     for other in (["replay", str(foreign), "--model", "quill"], ["report", str(foreign), "--out", f"{foreign}.html"]):
         assert main(other) == 2
-        assert "foreign.mcap: no samples in it" in capsys.readouterr().err
+        assert "foreign.mcap: no samples" in capsys.readouterr().err

@@ -92,7 +92,7 @@ def test_a_recording_that_begins_on_a_running_machine_is_remarked(tmp_path: Path
     Service(tmp_path, start_ns=EVENING_NS).run(100).stop()
     second = recordings(tmp_path, MACHINE)[1]
     found = compare([second], OTHER)
-    assert found.samples == 40 and "begins on a running machine" in found.remarks[0]
+    assert found.samples == 40 and "starts while the machine is running" in found.remarks[0]
 
 
 def test_a_time_without_samples_is_a_pause(tmp_path: Path) -> None:

@@ -82,8 +82,8 @@ def test_a_file_without_an_end_is_said_to_have_none(tmp_path: Path, capsys: pyte
 def test_both_offsets_of_two_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Service(tmp_path / "rec", model=other_model()).run(200).stop()
     text = page(capsys, 0, tmp_path / "rec", "--model", "quill")
-    assert "Model “quill” on what “other” recorded" in text and "with “other”, which was recorded." in text
-    assert "Offset of both models" in text and "What is left: measured deformation + offset" in text
+    assert "Model “quill” on what “other” recorded" in text and "with “other”, the recorded model." in text
+    assert "Offset of both models" in text and "Remaining error: measured deformation + offset" in text
     figures = [line for line in re.findall(r"<desc>(.*?)</desc>", text) if "other (recorded): " in line]
     assert len(figures) == 2
     assert text.index("<svg") < text.index("Before and after")

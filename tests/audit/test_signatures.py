@@ -118,7 +118,7 @@ def test_a_recovered_end_is_signed(tmp_path: Path) -> None:
 def test_a_key_among_the_recordings_is_refused(tmp_path: Path) -> None:
     (tmp_path / "rec").mkdir()
     private, _ = write_key(tmp_path / "rec", "machine", 7)
-    for name, reason in ((private.name, "expected a key"), (f"rec/{private.name}", "among the recordings")):
+    for name, reason in ((private.name, "expected a key"), (f"rec/{private.name}", "in the recording folder")):
         config = tmp_path / "machine.toml"
         config.write_bytes(
             CONFIG.replace(b"recording.folder", f'recording.signing_key = "{name}"\nrecording.folder'.encode())

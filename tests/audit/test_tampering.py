@@ -345,7 +345,7 @@ def test_the_oldest_file_may_be_gone(folder: Path) -> None:
     first.unlink()
     found = look(folder)
     assert found.clean
-    assert any(f"begins after {first.name}, not given here" in remark for remark in found.remarks)
+    assert any(f"continues {first.name}, which was not given" in remark for remark in found.remarks)
 
 
 def test_another_recording_in_its_place_is_told(folder: Path, tmp_path: Path) -> None:

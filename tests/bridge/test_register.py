@@ -51,7 +51,7 @@ def test_somebody_elses_write_stops_it_until_that_stands() -> None:
     assert r.check(0.0, 0.0)
     r.wrote(0.004)
     assert r.check(1.0, 0.00405)  # within the tolerance
-    assert not r.check(2.0, 0.010) and "+10.000 µm, written was +4.000 µm" in r.trouble
+    assert not r.check(2.0, 0.010) and "+10.000 µm instead of the written +4.000 µm" in r.trouble
     assert not r.check(6.0, 0.020) and not r.check(10.0, 0.020)  # still at it
     assert r.check(11.1, 0.020) and r._follower.applied_um == pytest.approx(20.0)
     r.wrote(0.020)

@@ -69,20 +69,20 @@ def test_without_the_service_the_model_is_kept_for_its_next_start(
     for model in (first, second):
         assert main(["adopt", str(model), "--config", str(idle), "--json"]) == 0
         answer = result(capsys)
-        assert answer["service_reached"] is False and "not reached" in answer["text"]
+        assert answer["service_reached"] is False and "could not be reached" in answer["text"]
         assert in_use(idle, capsys) == answer["model_sha256"] == sha256_of(model.read_bytes())
     assert idle.read_bytes() == before  # the configuration stays as it is
     assert main(["adopt", str(second), "--config", str(idle)]) == 1
     assert "already" in capsys.readouterr().err
     assert main(["back", "--config", str(idle)]) == 0
-    assert "not reached" in capsys.readouterr().out
+    assert "could not be reached" in capsys.readouterr().out
     assert in_use(idle, capsys) == sha256_of(first.read_bytes())
     assert main(["back", "--config", str(idle)]) == 0
     capsys.readouterr()
     assert in_use(idle, capsys) == configured
     assert main(["back", "--config", str(idle)]) == 1
     error = capsys.readouterr().err
-    assert "none before it" in error and error.count("\n") == 1
+    assert "no previous model" in error and error.count("\n") == 1
 
 
 def test_an_adopted_model_that_was_damaged_is_said_and_the_configured_one_stands_in(

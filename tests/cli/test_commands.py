@@ -250,7 +250,7 @@ BAD_CONFIGS = [
     ("predict_for_min = 30.0", "predict_for_min = -1.0", "loss.predict_for_min = -1.0"),
     ('device = "probe"', 'device = "prob"', "device 'prob' is not configured"),
     ('name = "y_um"\ndevice = "probe"', 'name = "y_um"\ndevice = "control"', "expected um"),
-    ("poll_interval_s = 10.0", "poll_interval_s = 7.0", "expected a whole part of the model's 60 s"),
+    ("poll_interval_s = 10.0", "poll_interval_s = 7.0", "expected the model's 60 s divided by an integer"),
     ('model = "icpdas-m7018r"', 'model = "icpdas-m7018x"', "icpdas-m7018r"),
     ('file = "quill"', 'file = "absent.toml"', "expected a model file"),
     ("range = [0.0, 80.0]", "range = [80.0, 0.0]", "expected the lower bound first"),

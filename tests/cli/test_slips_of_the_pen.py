@@ -60,7 +60,7 @@ def test_what_is_read_is_never_written_over(tmp_path: Path, capsys: pytest.Captu
     model.write_text("the only copy")
     recording = tmp_path / "day.mcap"
     recording.write_bytes(b"evidence")
-    there = "would be written over"
+    there = "would be overwritten"
     refused(capsys, ["simulate", str(run), "--model", "quill", "--out", str(run)], there)
     refused(capsys, ["simulate", str(run), "--model", str(model), "--out", str(model)], there)
     refused(capsys, ["export", str(recording), "--out", str(recording)], there)

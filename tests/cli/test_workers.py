@@ -95,7 +95,7 @@ def test_a_cluster_and_all_cores_diagnose_as_one_process_does(
 
 @pytest.mark.parametrize(
     ("address", "code", "words"),
-    [("tcp://127.0.0.1:9", 1, "no scheduler answers"), ("nonsense://x", 2, "expected an address")],
+    [("tcp://127.0.0.1:9", 1, "no scheduler answered"), ("nonsense://x", 2, "expected an address")],
 )
 def test_a_cluster_that_is_not_there_is_said_in_one_line(
     tmp_path: Path,

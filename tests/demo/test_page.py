@@ -39,4 +39,4 @@ def test_the_page_says_whether_a_model_was_taken_over(adopted: bool, there: str,
     }
     page = words(loop)
     assert there in page and not_there not in page and "partly explained" in page
-    assert ("drift) is not deployable" in page) is not adopted
+    assert ("drift) are not deployable" in page) is not adopted

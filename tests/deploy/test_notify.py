@@ -335,9 +335,9 @@ def test_the_process_under_a_manager(tmp_path: Path, listener: Listener) -> None
         try:
             lines = listener.until(lambda lines: lines.count("WATCHDOG=1") >= 6)
             assert lines[:3] == [
-                "STATUS=starting: reads the last recording",
+                "STATUS=starting: reading the last recording",
                 "WATCHDOG_USEC=750000",
-                "STATUS=starting: waits for the first poll",
+                "STATUS=starting: waiting for the first poll",
             ]
             assert lines.count("READY=1") == 1 and lines.index("READY=1") < lines.index("WATCHDOG=1")
             listener.until(lambda lines: any("no offset yet; sample" in line for line in lines))

@@ -121,7 +121,7 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     """However well it fits: the verdict must not say found, and the model is left as it was."""
     columns, _, _ = record([draw("gain DTF", 3)], 77, hours=24.0)
     good = diagnose(QUILL, runs_from(columns))
-    assert good.verdict == "explained" and good.model.effects and "is found" in verdict(figures(good))
+    assert good.verdict == "explained" and good.model.effects and "were found" in verdict(figures(good))
     held_out = diagnosis_module._held_out
 
     def worse(*arguments):
@@ -132,4 +132,4 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     bad = diagnose(QUILL, runs_from(columns))
     assert bad.verdict == "partly_explained" and not bad.model.effects
     assert "made_worse" in [warning.code for warning in bad.warnings]
-    assert "does not hold on held-out data" in verdict(figures(bad)) and "is found" not in verdict(figures(bad))
+    assert "increases the error on held-out data" in verdict(figures(bad)) and "were found" not in verdict(figures(bad))

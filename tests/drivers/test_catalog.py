@@ -39,7 +39,7 @@ MISTAKES = [
     # A name with a line break in it does not tear the message apart.
     ([NET], [{**COUPLES, "name": "a\nb", "adress": 1}], "devices[0] \"a\\nb\": key 'adress' is not known"),
     ([{**NET, "name": "a\nb"}], [COUPLES], "key 'line' is 'net', expected the name of a line (a\\nb)"),
-    ([], [COUPLES], "expected the name of a line (there is none)"),
+    ([], [COUPLES], "expected the name of a line (none configured)"),
 ]
 
 

@@ -93,7 +93,7 @@ def test_quiet_ambient():
 
 
 def test_short_record():
-    assert said(made(machine(300)), "The longest record has 5.0 h")
+    assert said(made(machine(300)), "The longest record covers 5.0 h")
 
 
 def test_a_zero_outside_the_unit_circle(good):
@@ -118,7 +118,10 @@ def test_white_residuals_are_seldom_blamed():
 
 
 def test_drive_and_ambient_together():
-    assert said(made(machine(follows=True)), "Drive and ambient changed together (correlation 1.00)")
+    assert said(
+        made(machine(follows=True)),
+        "The drive of the DTF and the ambient temperature changed together (correlation 1.00)",
+    )
 
 
 def test_worse_than_no_compensation(good):

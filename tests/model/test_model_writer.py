@@ -9,7 +9,7 @@ import pathlib
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from compensator.errors import ModelError
@@ -83,6 +83,7 @@ def test_any_text_survives(text):
     assert read_back(model) == model
 
 
+@settings(deadline=None)  # the first call imports
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_any_number_survives_to_the_bit(value):
     assert math.copysign(1, read_back(direct_model(provenance={"x": value})).provenance["x"]) == math.copysign(1, value)

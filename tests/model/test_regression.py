@@ -457,8 +457,8 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
     )
     for words in (
         "t1_degc, base_degc, deployed in model.toml",
-        "explains nothing: 1.40 to 0.90 µm",
-        "explain 83 %",
+        "from 1.40 to 0.90 µm",
+        "83 %",
         "0.80 µm",
     ):
         assert words in printed

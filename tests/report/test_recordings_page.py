@@ -191,7 +191,7 @@ def test_the_command(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
         (["x.csv"], "x.csv: not an MCAP file, expected a recording"),
         ([str(folder), "--out", "page.txt"], "--out page.txt: expected a name that ends in .html, .pdf or .png"),
         ([str(folder), "--out", "none/page.html"], "--out none/page.html: no such folder"),
-        ([str(tmp_path / "empty")], "empty: neither recordings (*.mcap) nor pages"),
+        ([str(tmp_path / "empty")], "empty: contains neither recordings (*.mcap) nor pages"),
     ):
         (tmp_path / "empty").mkdir(exist_ok=True)
         assert main(["report", *arguments]) == 2, arguments
@@ -223,10 +223,13 @@ def test_a_folder_with_results_leads_to_its_pages(tmp_path: Path, capsys: pytest
     (inner / "other.html").write_text("<h1>not ours</h1>")
     assert main(["report", str(inner.parent), "--out", str(tmp_path / "all.html")]) == 0
     said = capsys.readouterr().out
-    assert "something is left. Drift." in said and "0.50 µm rms in free run (9.0 without compensation)" in said
+    assert (
+        "part of the residual remains unexplained. Drift." in said
+        and "0.50 µm rms in free run (9.0 without compensation)" in said
+    )
     page = (tmp_path / "all.html").read_text(encoding="utf-8")
     assert re.findall(r'<a href="([^"]*)"', page) == ["demo%20out/report.html", "demo%20out/calibration/report.html"]
-    assert '<p class="verdict warn"><b>⚠ Caution</b>Part of what' in page and "not ours" not in page
+    assert '<p class="verdict warn"><b>⚠ Caution</b>Some of the missing' in page and "not ours" not in page
     assert "Calibration: The &lt;spindle&gt;" in page
 
 

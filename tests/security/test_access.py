@@ -135,7 +135,7 @@ def test_an_operator_commands_in_the_own_name_only(
     assert plant.commands == [("hold", b"{}", by), ("zero", b'{"mode": "warm"}', by)]
     plant.forget()
     assert main(["hold", "--prefix", PREFIX, "--zenoh", bert, "--timeout", "2"]) == 1  # his is the other machine
-    assert "not reached" in capsys.readouterr().err  # it is not even told to be there
+    assert "cannot be reached" in capsys.readouterr().err  # it is not even told to be there
     receiver = str(shop.client_file("receiver-cnc-07"))
     assert main(["hold", "--prefix", PREFIX, "--zenoh", receiver, "--timeout", "2"]) == 1
     error = capsys.readouterr().err

@@ -63,10 +63,10 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, keys: Path, capsys: p
     key.write_bytes((keys / "machine-vmc-08.key").read_bytes())
     assert "not the key of" in refused(config, capsys)
     key.write_bytes(b"nonsense")
-    assert "no PEM" in refused(config, capsys)
+    assert "not a PEM file" in refused(config, capsys)
     key.write_bytes(good)
     ca.write_bytes((keys.parent / "other/ca.pem").read_bytes())
-    assert "not of the authority" in refused(config, capsys)
+    assert "not issued by the authority" in refused(config, capsys)
     ca.unlink()
     assert "zenoh.tls_ca" in refused(config, capsys)
 
@@ -91,7 +91,7 @@ def test_an_expired_certificate_is_said_with_its_date(
 @pytest.mark.parametrize(
     ("zenoh", "expected"),
     [
-        (TLS.format(stem="a") + 'listen = ["tcp/127.0.0.1:7447"]\n', "connect alone"),
+        (TLS.format(stem="a") + 'listen = ["tcp/127.0.0.1:7447"]\n', "only connect"),
         (TLS.format(stem="a").replace("tls/127", "tcp/127"), "expected tls/HOST:PORT"),
         ('connect = ["tls/127.0.0.1:7447"]\n', "with tls_ca, …"),
         ('connect = ["tls/127.0.0.1:7447"]\ntls_ca = "keys/ca.pem"\n', "zenoh.tls_certificate: missing"),
@@ -116,7 +116,7 @@ def test_open_doors_and_numbered_ports_are_warned_of(tmp_path: Path, capsys: pyt
         "zenoh.listen tcp/0.0.0.0:7447",
         "zenoh.connect tcp/router.shop:7447",
         "zenoh.unproven_commands",
-        "port /dev/ttyUSB0 is numbered by the order of plugging in",
+        "port /dev/ttyUSB0 is numbered in the order of connection",
     ):
         assert words in said, words
     assert said.count("\n") == 4 and "after a restart it may be another adapter" in said

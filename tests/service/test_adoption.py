@@ -175,7 +175,7 @@ async def test_a_long_warm_up_delays_no_sample_and_is_caught_up(
     machine.at_sample[200] = held.set
     await machine.run(500, adopted(STRONGER))
     assert asked.answer["ok"]
-    assert not second.answer["ok"] and "another model is under way" in second.answer["text"]
+    assert not second.answer["ok"] and "another model is being prepared" in second.answer["text"]
     swap = len(machine.outcomes) - 1
     assert swap >= 200
     times = [o.offset.time_utc_ns for o in machine.outcomes]
@@ -203,7 +203,10 @@ async def test_too_little_on_record_is_refused_and_taken_only_by_force(tmp_path:
     arrived = adopted(STRONGER, then=10)
     await machine.run(300, when_refused)
     assert not refused.answer["ok"]
-    assert "the recordings reach back" in refused.answer["text"] and "µm only" in refused.answer["text"]
+    assert (
+        "the recordings without a gap cover" in refused.answer["text"]
+        and "standard deviation of its offset" in refused.answer["text"]
+    )
     events = machine.events("adopt")
     assert events[0].text.startswith("refused:") and events[0].data["ok"] is False
     assert forced.answer["ok"] and forced.answer["state_known"] is False and "too little" in forced.answer["text"]
@@ -231,7 +234,7 @@ async def test_back_and_further_back_to_the_configured_one(tmp_path: Path) -> No
         assert machine.store.in_use() == expected
     asked = machine.at_sample[len(machine.outcomes) + 2] = Asked(machine, "back")
     await machine.run(60, lambda _: asked.reply is not None and asked.reply.done())
-    assert not asked.answer["ok"] and "none before it" in asked.answer["text"]
+    assert not asked.answer["ok"] and "no previous model" in asked.answer["text"]
     again = machine.at_sample[len(machine.outcomes) + 2] = Asked(
         machine, "adopt", json.dumps({"sha256": sha256_of(STRONGER)}).encode()
     )

@@ -128,7 +128,7 @@ def test_a_failure_is_said_and_the_recording_goes_on(tmp_path: Path, monkeypatch
     service.recorder.start_new()
     service.run(5).stop()
     remarks = service.recorder.remarks()
-    assert len(remarks) == 2 and "could not be made compact and stays as it is" in remarks[0][0]
+    assert len(remarks) == 2 and "could not be compacted and remains unchanged" in remarks[0][0]
     found = audit(recordings(tmp_path, MACHINE))
     assert found.clean and found.samples == 10
 
@@ -209,9 +209,7 @@ def test_old_files_are_removed_and_the_audit_says_where_it_begins(tmp_path: Path
     assert names == ["20260107", "20260108", "20260109", "20260110"]
     found = audit(recordings(tmp_path, MACHINE))
     assert found.clean
-    assert "begins after vmc-07_20260106T060000Z.mcap, which the limit of what is kept removed" in " ".join(
-        found.remarks
-    )
+    assert "continues vmc-07_20260106T060000Z.mcap, which the retention limit removed" in " ".join(found.remarks)
 
 
 def test_the_size_of_all_files_is_limited_and_the_newest_stay(tmp_path: Path) -> None:
@@ -234,7 +232,7 @@ def test_a_disk_that_refuses_the_copy_is_made_room_on(tmp_path: Path, monkeypatc
     service = days(tmp_path, 6, keep_days=2.5)
     remarks = service.recorder.remarks()
     assert [data["removed"][0][7:15] for _, data in remarks if "removed" in data] == ["20260105", "20260106"]
-    assert sum("could not be made compact and stays as it is" in text for text, _ in remarks) >= 5
+    assert sum("could not be compacted and remains unchanged" in text for text, _ in remarks) >= 5
     live = service.recorder.path
     service.kill()
     left = recordings(tmp_path, MACHINE)
@@ -260,13 +258,15 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_on_a_full_disk_the_limit_makes_the_room_that_the_recording_needs(small_disk: Path) -> None:
-    service = days(small_disk, 4, keep_days=3.5)
+    # Finished files are small: several must go for a live one.
+    service = days(small_disk, 9, keep_days=8.5)
+    service.recorder._finisher.wait()
     before = recordings(small_disk, MACHINE)
     with (small_disk / "other").open("wb", buffering=0) as other, suppress(OSError):
         while other.write(bytes(4096)) == 4096:
             pass
-    # A week later: the day's end does not fit any more, nor does the new file.
-    service.start_ns += 7 * DAY_NS
+    # Two weeks later: the day's end does not fit any more, nor does the new file.
+    service.start_ns += 14 * DAY_NS
     with pytest.raises(OSError, match="No space"):
         service._write([], service.compensation.state())
     service.recorder._finisher.wait()
@@ -281,7 +281,7 @@ def test_on_a_full_disk_the_limit_makes_the_room_that_the_recording_needs(small_
     service.run(1).stop()
     found = audit(recordings(small_disk, MACHINE))
     assert found.clean, found.findings
-    assert f"begins after {before[2].name}, which the limit of what is kept removed" in " ".join(found.remarks)
+    assert f"continues {before[-2].name}, which the retention limit removed" in " ".join(found.remarks)
 
 
 def test_over_weeks_the_folder_stays_below_the_limit(tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_over_weeks_the_folder_stays_below_the_limit(tmp_path: Path) -> None:
     found = audit(left)
     assert found.clean, found.findings
     assert found.files[0].previous_file and any(
-        f"begins after {found.files[0].previous_file}, which the limit of what is kept removed" in remark
+        f"continues {found.files[0].previous_file}, which the retention limit removed" in remark
         for remark in found.remarks
     )
 

@@ -247,7 +247,7 @@ async def test_recordings_without_a_state_and_files_that_are_none(
     whole = awake.by_time()
     after = machine.outcomes[300:]
     assert [o.estimate.y_pred_um for o in after] == [whole[o.offset.time_utc_ns].estimate.y_pred_um for o in after]
-    assert any("carries no state that can be used" in event.text for event in machine.events("restart"))
+    assert any("contains no state that can be used" in event.text for event in machine.events("restart"))
 
 
 async def test_killed_again_and_again(tmp_path: Path) -> None:

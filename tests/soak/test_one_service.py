@@ -56,7 +56,7 @@ def test_a_second_service_is_refused_and_the_first_goes_on(site: Site, port: int
         with site.service() as first:
             control.more(2)
             for config, expected in (
-                (site.config, "vmc-07.lock: held by another service"),
+                (site.config, "vmc-07.lock: locked by another service"),
                 (elsewhere(site, "second"), "alive: another service is alive"),
             ):
                 # A token that stands for this long is that of a living one, for whoever does not wait for a dead one's.

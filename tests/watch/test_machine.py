@@ -134,7 +134,9 @@ def test_malformed_messages_are_counted_and_change_nothing(heard: Heard, payload
     assert after["malformed"] == 1 and after["last_malformed"].startswith("offset:") and after["tone"] == "warn"
     changed = {name for name in before if before[name] != after[name]}
     assert changed == {"malformed", "last_malformed", "warnings", "warning_codes", "to_do", "tone"}
-    assert after["to_do"].startswith("1 malformed") and after["to_do"].endswith("who publishes below the prefix.")
+    assert after["to_do"].startswith("1 malformed") and after["to_do"].endswith(
+        "which programs publish below the prefix."
+    )
 
 
 def test_what_is_repeated_or_late_changes_nothing_and_is_counted(heard: Heard) -> None:
@@ -161,7 +163,7 @@ def test_what_was_lost_is_told_from_a_restart(heard: Heard) -> None:
     assert heard.machine["missed"] == 13
     heard.hear(status=status(20, started_ns=START_NS + 660 * NS))
     assert heard.machine["missed"] == 2
-    assert any("2 message(s) never arrived" in text for text in heard.machine["warnings"])
+    assert any("2 message(s) did not arrive" in text for text in heard.machine["warnings"])
 
 
 def test_two_services_below_one_prefix_are_told(heard: Heard) -> None:
@@ -194,7 +196,7 @@ def test_a_probe_that_sees_more_than_the_service_states_is_told_after_half_an_ho
     for i in range(30, 60):
         minute(i, -6.5)
     assert heard.machine["tone"] == "warn" and heard.machine["warning_codes"] == ["misfit"]
-    assert heard.machine["shown"] == "ok" and "6.5 µm apart" in heard.machine["to_do"]
+    assert heard.machine["shown"] == "ok" and "differed by 6.5 µm" in heard.machine["to_do"]
     assert "compensator diagnose" in heard.machine["to_do"] and "Nothing." not in heard.machine["to_do"]
     minute(60, -6.5, y_offset_std_um=4.0)  # one minute changes nothing
     assert heard.machine["warning_codes"] == ["misfit"]

@@ -1,4 +1,4 @@
-"""Whether measured values can be true: each channel alone, T_Q against AT, and measured against predicted Y."""
+"""Plausibility of measured values: each channel alone, T_Q against AT, and measured against predicted Y."""
 
 from compensator.service.plausibility.checks import BLOCK_SAMPLES, PlausibilityCheck, PlausibilityState, SensorEvidence
 from compensator.service.plausibility.guards import HEATED_W, SensorGuards

@@ -1,18 +1,18 @@
 """Plausibility of T_Q, AT and measured Y: exchanged sensors, sensors that drifted apart, a residual that is too large.
 
-Three checks, each on only where the configuration states its limit:
+Three checks, each on only if the configuration has its limit:
 
 - *exchanged*: T_Q is below AT by more than `guards.t_q_below_at_max_k` for longer than `t_q_below_at_after_min`.
-  Without heat both are alike, so exchanged wires show only once the machine heats up; by then the offset has the wrong
+  Without heat both are equal, so exchanged wires show only once the machine heats up; by then the offset has the wrong
   sign. The state is `fault`, latched until `resume` or a zero at rest.
-- *at rest*: where a channel shows that nothing heats the machine, T_Q and AT must return to the difference that they
-  had at the zero. The reason stays until a later rest clears it.
+- *at rest*: while a channel shows that nothing heats the machine, T_Q − AT must return to its value at the zero. The
+  reason remains until a later rest clears it.
 - *residual*: measured − predicted Y against its stated standard deviation, by a two-sided CUSUM on its innovations.
   Model errors are correlated over `residual_correlation_min`, so only what the previous block does not predict counts:
   e = z − φ z'. The threshold follows from the mean time between false alarms, by Siegmund's formula. `isolation` finds
-  the sensor that explains the residual best. The offset continues, its standard deviation includes the residual.
+  the sensor that explains the residual best. The offset continues; its standard deviation includes the residual.
 
-The checks use nothing but the sample and know no clock; their state is part of the compensation's.
+The checks use only the sample and no clock; their state is part of the compensation's.
 
 Source: Page (1954) for the CUSUM; Siegmund, Sequential Analysis (1985), for its mean time between false alarms;
 Basseville and Nikiforov (1993), chapter 8, for whitening first.
@@ -33,11 +33,11 @@ from compensator.events import EventKind, Implausibility, Note
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.plausibility.isolation import LOG_ODDS, FaultFit, FaultIsolation, ResidualBlock
 
-#: Samples in a block of the residual: single minutes after a heat step are no evidence against a sensor.
+#: Samples in a block of the residual: single minutes after a heat step are not evidence against a sensor.
 BLOCK_SAMPLES = 10
 #: Fraction of a block that must be usable.
 _USABLE = 0.5
-#: Blocks that faults are isolated from: 12 h of one-minute samples.
+#: Number of blocks used for fault isolation: 12 h of one-minute samples.
 WINDOW = 72
 #: Shift, in standard deviations of the residual, that the CUSUM is designed for.
 _SHIFT = 5.0
@@ -61,13 +61,13 @@ class PlausibilityState(msgspec.Struct, kw_only=True, rename=_STORED):
     Parameters
     ----------
     below_min : float
-        For how long T_Q has been below AT, min.
+        Time for which T_Q has been below AT, min.
     exchanged : bool
         Whether that has lasted too long.
     rest_min : float
-        For how long nothing has heated the machine, min.
+        Time for which nothing has heated the machine, min.
     apart : bool
-        Whether T_Q and AT were apart at the last rest.
+        Whether T_Q − AT had not returned to its value at the last rest.
     samples, used : int
         Samples in the current block, and the usable ones among them.
     sums : tuple of three floats
@@ -107,16 +107,16 @@ class PlausibilityState(msgspec.Struct, kw_only=True, rename=_STORED):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorEvidence:
-    """One sample, as the checks use it; NaN where something cannot be used.
+    """Input of the checks for one sample; NaN for values that cannot be used.
 
     Parameters
     ----------
     below_k : float
-        AT − T_Q as measured, K, whatever the guards decided.
+        AT − T_Q as measured, K, regardless of the guards.
     apart_k : float
         T_Q − AT as a change since the zero, K.
     rest : float
-        Value of the channel that shows whether the machine rests.
+        Value of the channel that shows whether the machine is at rest.
     residual_um, std_um, predicted_um : float
         Measured − predicted, the prediction's stated standard deviation, and the prediction, µm.
     """
@@ -157,11 +157,11 @@ class PlausibilityCheck:
 
     @property
     def is_on(self) -> bool:
-        """Whether anything is checked."""
+        """Whether any check is on."""
         return self._watched or self._limits.t_q_below_at_after_min is not None or self._limits.rest is not None
 
     def describe(self) -> str:
-        """Describe what is checked and what is not."""
+        """Describe which checks are on and off."""
         parts = []
         limits = self._limits
         parts.append(
@@ -199,7 +199,7 @@ class PlausibilityCheck:
 
     @property
     def reasons(self) -> list[str]:
-        """What is implausible now; the offset continues with these reasons."""
+        """Current reasons; the offset continues with them."""
         apart: list[str] = [Reason.T_Q_AT_APART] if self.state.apart else []
         return apart + [f"{Reason.IMPLAUSIBLE}:{name}" for name in self.state.suspects]
 
@@ -217,12 +217,12 @@ class PlausibilityCheck:
 
     @property
     def too_large(self) -> bool:
-        """Whether the residual is too large for the offset to follow the model."""
+        """Whether the residual exceeds `residual_hold_um`, so that the offset is held."""
         limit = self._limits.residual_hold_um
         return limit is not None and self.error_um > limit
 
     def reset(self, *, at_rest: bool) -> None:
-        """Restart at a zero: measured and predicted Y count from here; at rest, T_Q and AT do, too."""
+        """Restart at a zero of measured and predicted Y, and at rest also of T_Q and AT."""
         old = self.state
         self.state = PlausibilityState(below_min=old.below_min, rest_min=old.rest_min)
         if not at_rest:
@@ -324,7 +324,7 @@ class PlausibilityCheck:
             self._isolate(block)
 
     def _isolate(self, block: ResidualBlock) -> None:
-        """Find the likely causes; every further block may improve this until the onset leaves the window."""
+        """Find the likely causes; each further block may improve the result until the onset leaves the window."""
         self.state.blocks_in_alarm += 1
         if self.state.blocks_in_alarm > WINDOW // 2:
             return
@@ -360,7 +360,7 @@ class PlausibilityCheck:
 
 
 def cusum_threshold(allowance: float, std: float, blocks: float) -> float:
-    """Return the threshold that a two-sided CUSUM crosses by chance once in a number of blocks.
+    """Return the threshold that a two-sided CUSUM crosses by chance on average once in a number of blocks.
 
     Siegmund's approximation of the mean time of one side, with increments e − k, e ~ N(0, s²):
     ``(exp(2 Δ b) − 2 Δ b − 1) / (2 Δ²)``, Δ = k / s, b = h / s + 1.166; both sides together cross twice as often.

@@ -1,6 +1,6 @@
-"""Guards of the channels: an impossible value is not used, and the quality in the sample says why.
+"""Guards of the channels: an implausible value is not used, and its quality in the sample gives the reason.
 
-The guards use nothing but the recorded sample and their own state, so an audit repeats them on recorded values.
+The guards use only the recorded sample and their own state, so an audit repeats them on recorded values.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from compensator.codes import SampleQuality
 from compensator.config import Channel, Guards
 from compensator.messages import ChannelSample, number
 
-#: Estimated heat, W, above which the machine counts as heated where heat is not measured.
+#: Estimated heat, W, above which the machine counts as heated if heat is not measured.
 HEATED_W = 10.0
 
 GuardState = tuple[float, float, float, float]
 
 
 class ChannelGuard:
-    """Range, rate and stuck guard of one channel; `period_min` is the length of a sample, min."""
+    """Guard of range, rate and constant values of one channel; `period_min` is the length of a sample, min."""
 
     def __init__(self, channel: Channel, period_min: float) -> None:
         self._channel = channel
@@ -32,7 +32,7 @@ class ChannelGuard:
         self._still_min = 0.0
 
     def check(self, sample: ChannelSample) -> str:
-        """Return the quality of a sample and remember what the next one needs."""
+        """Return the quality of a sample and update the state."""
         self._since_good_min += self._period_min
         if sample.device_quality != SampleQuality.GOOD:
             return sample.device_quality
@@ -93,13 +93,13 @@ class SensorGuards:
         Parameters
         ----------
         channels : mapping of str to ChannelSample
-            What the devices gave.
+            Samples with the devices' qualities.
         heat_w : float
             The model's estimate before this sample, W; NaN if there is none.
         """
         qualities = {name: self._guards[name].check(sample) for name, sample in channels.items()}
         if self._t_q_below_at(channels, qualities, heat_w):
-            # Which of the two is wrong is unknown: neither is used.
+            # It is unknown which of the two is wrong, so neither is used.
             qualities["t_q_degc"] = qualities["at_degc"] = SampleQuality.T_Q_BELOW_AT
         return {
             name: sample

@@ -1,11 +1,11 @@
-"""Fault isolation: which sensor, T_Q, AT or measured Y, or the model, explains a residual best.
+"""Fault isolation: whether T_Q, AT, measured Y or the model explains a residual best.
 
-A fault of T_Q or AT reaches the residual through the model, so its shape in time is the model's response to a ramp or
+A fault of T_Q or AT acts on the residual through the model, so its shape in time is the model's response to a ramp or
 a step in that input. A fault of the probe is itself a ramp or step. A wrong gain of the model, or a probe with another
-scale, looks like a fraction of the prediction. Size and onset of every shape are fitted and the likelihoods compared;
-whatever comes within odds of 20 of the best is a suspect.
+scale, appears as a fraction of the prediction. Size and onset of every shape are fitted and the likelihoods compared;
+every fault whose likelihood is at least 1/20 of the best is a suspect.
 
-Model errors are correlated in time, so residual and shapes pass the same first-order whitening filter first. The loops
+Model errors are correlated in time, so residual and shapes first pass the same first-order whitening filter. The loops
 have a fixed order, so that an audit finds the same suspects on another processor.
 
 Source: Basseville and Nikiforov, Detection of Abrupt Changes (1993), chapter 7 (generalised likelihood ratio).
@@ -24,7 +24,7 @@ from compensator.model.thermal_model import ThermalModel
 
 #: Suspects whose log likelihood is within this of the best cannot be distinguished from it: odds of 20.
 LOG_ODDS = 3.0
-#: Mean square that the best shape leaves, relative to the expected one, above which no shape fits.
+#: Remaining mean square with the best shape, relative to the expected one, above which no shape fits.
 MISFIT = 4.0
 #: Samples without a change before a response is computed, so that the observer's gains have settled.
 _SETTLING = 120
@@ -51,7 +51,7 @@ class FaultFit:
     words : str
         The fault with its size, such as `T_Q drifts by +0.1 K/h`.
     blocks_ago : int
-        How many blocks ago it started.
+        Number of blocks since it started.
     gain : float
         Log likelihood over that of no fault.
     """
@@ -91,7 +91,7 @@ class FaultIsolation:
         self._hours = block_samples * model.period_s / 3600.0
 
     def fits(self, blocks: Sequence[ResidualBlock]) -> tuple[list[FaultFit], bool]:
-        """Return the best fit of each suspect, the likeliest first, and whether even that one fits badly.
+        """Return the best fit of each suspect, the most likely first, and whether even the best fits badly.
 
         Parameters
         ----------
@@ -140,7 +140,7 @@ class FaultIsolation:
         return tuple(made)
 
     def _response(self, t_q_k: float, at_k: float, *, ramp: bool) -> tuple[float, ...]:
-        """Return the effect of a sensor's fault on the residual, µm by block: minus that on the prediction."""
+        """Return the effect of a sensor fault on the residual, µm by block: minus its effect on the prediction."""
         engine = Engine(dataclasses.replace(self._model, effects=()))
         engine.set_reference(0.0, 0.0)
         for _ in range(_SETTLING):

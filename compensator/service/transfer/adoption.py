@@ -1,6 +1,6 @@
-"""Another model for the running service: prepared on a thread of its own, swapped in between two samples.
+"""Changes the model of the running service: prepared on a separate thread, swapped in between two samples.
 
-The thread checks the model, warms it up on the recordings and stores it for the next start; it gives way to samples.
+The thread checks the model, warms it up on the recordings and stores it for the next start; samples have priority.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from compensator.service.transfer.model_store import ModelStore, check_model, sh
 
 log = logging.getLogger("compensator")
 
-#: Longest payload of a command that brings a model, bytes.
+#: Longest payload of a command that contains a model, bytes.
 LONGEST_MODEL = 1_000_000
-#: Number of samples of a warm-up after which the thread sleeps for a moment, so that it never delays a sample.
+#: Number of samples of a warm-up after which the thread sleeps briefly, so that it never delays a sample.
 SAMPLES_PER_TURN = 10
 MOMENT_S = 0.001
-_ADVICE = "wait, zero the machine at rest, or adopt it nevertheless with --force"
+_ADVICE = "wait, zero the machine at rest, or use --force"
 
 
 class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -46,11 +46,11 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     Parameters
     ----------
     sha256 : str
-        Hash of the model file, empty where the command does not name one.
+        Hash of the model file; empty if the command does not contain one.
     model : str
-        The model file, empty where it is in the store already.
+        The model file; empty if it is already in the store.
     force : bool
-        Adopt it even where the recordings do not determine its state.
+        Adopt it even if the recordings do not determine its state.
     """
 
     sha256: str = ""
@@ -64,7 +64,7 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         Raises
         ------
         ServiceError
-            Saying what was expected.
+            If the arguments are invalid; the message states what was expected.
         """
         try:
             request = msgspec.convert(arguments, cls)
@@ -80,7 +80,7 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 @dataclass(slots=True)
 class _Order:
-    """A command that is being carried out, with the samples that came meanwhile."""
+    """A command that is being executed, with the samples since its arrival."""
 
     action: str
     request: ModelRequest
@@ -91,20 +91,20 @@ class _Order:
 
 
 class Adoption:
-    """Carries out `adopt` and `back`, one at a time.
+    """Executes `adopt` and `back`, one at a time.
 
     Parameters
     ----------
     config : Config
-        Settings that the model must fit.
+        Settings with which the model must be compatible.
     recordings : pathlib.Path
         Folder of the recordings for the warm-up.
     store : ModelStore or None
         Adopted models; without it every command is refused.
     events, journal, clock
-        For events, the file of another model, and the history of models.
+        For events, the recording of another model, and the history of models.
     running : callable
-        Returns the compensation that runs.
+        Returns the running compensation.
     """
 
     def __init__(
@@ -131,13 +131,13 @@ class Adoption:
     def begin(self, action: str, request: ModelRequest, reply: Future[dict[str, Any]], sender: Sender) -> None:
         """Begin to prepare a model; the reply comes once it is ready or refused. In the loop only."""
         if self._store is None or self._ended or self._order is not None:
-            why = f"{action}: this service adopts no model now"
+            why = f"{action}: this service cannot change its model now"
             if self._order is not None:
-                why = f"{action}: another model is under way until the next sample; ask again then"
+                why = f"{action}: another model is being prepared; retry after the next sample"
             self._events.note(EventKind.COMMAND_REFUSED, why, {"name": action, "ok": False} | sender.data())
             reply.set_result(refusal(why))
             return
-        # The text of the model is not repeated here: it travels in the recording that begins with it.
+        # The event does not contain the model's text: it is attached to the recording that starts with it.
         data = {"sha256": request.sha256, "force": request.force}
         self._events.note(EventKind.COMMAND, action, data | {"command": action} | sender.data())
         self._order = _Order(action, request, reply)
@@ -145,12 +145,12 @@ class Adoption:
         self._order.task.add_done_callback(self._answer_refusal)
 
     def follow(self, outcome: Outcome) -> None:
-        """Keep a sample that comes while a model is prepared."""
+        """Keep a sample that arrives while a model is prepared."""
         if self._order is not None:
             self._order.since.append(outcome)
 
     def swap(self) -> Compensation:
-        """Return the compensation for the next sample: the running one, or one with a model that is ready."""
+        """Return the compensation for the next sample: the running one, or the prepared one once it is ready."""
         order, old = self._order, self._running()
         if order is None or order.ready is None:
             return old
@@ -182,15 +182,15 @@ class Adoption:
         return new
 
     async def end(self) -> None:
-        """Wait until a model under way is answered: one that was stored is used at the next start."""
+        """Wait until a command in progress is answered: a stored model is used at the next start."""
         self._ended = True
-        await asyncio.sleep(0)  # one that was asked for just now is refused
+        await asyncio.sleep(0)  # a command that has just arrived is refused
         order = self._order
         if order is not None and order.task is not None:
             await asyncio.gather(order.task, return_exceptions=True)
 
     async def _prepare(self, store: ModelStore, order: _Order) -> None:
-        """Have the model prepared on another thread, then answer; the swap comes with the next sample."""
+        """Prepare the model on another thread, then answer; the swap follows at the next sample."""
         running, now_ns = self._running(), self._clock.utc_ns()
         order.ready = await asyncio.to_thread(self._prepared, store, order, running.model, running.status.zero, now_ns)
         _, candidate = order.ready
@@ -198,7 +198,7 @@ class Adoption:
         how = f"warmed up on {candidate.samples} sample(s) of {candidate.minutes / 60.0:.1f} h"
         if not candidate.is_known:
             std_um = candidate.compensation.status.std_um
-            how += f", too little to know its state: standard deviation {std_um:.1f} µm for now"
+            how += f", too little to determine its state: standard deviation {std_um:.1f} µm for now"
         order.reply.set_result(
             {
                 "ok": True,
@@ -210,7 +210,7 @@ class Adoption:
         )
 
     def _answer_refusal(self, task: asyncio.Task[None]) -> None:
-        """Answer with the reason where a model could not be prepared; the running one stays."""
+        """Answer with the reason if a model could not be prepared; the running one remains."""
         order, error = self._order, None if task.cancelled() else task.exception()
         if order is None or error is None:
             return
@@ -222,16 +222,16 @@ class Adoption:
         self._events.note(EventKind.ADOPT, f"refused: {text}", {"ok": False, "action": order.action})
         order.reply.set_result(refusal(text))
 
-    # ------------------------------------------------------------------ on a thread of its own
+    # ------------------------------------------------------------------ on a separate thread
 
     def _prepared(
         self, store: ModelStore, order: _Order, running: ThermalModel, zero: Zero | None, now_ns: int
     ) -> tuple[bytes, ModelCandidate]:
-        """Return the file of a model and its candidate, and store it for the next start; this takes a while."""
+        """Return the file of a model and its candidate, and store it for the next start; this takes time."""
         data = _model_file(store, order)
         model = check_model(self._config, data, source=f"model {sha256_of(data)[:12]}")
         if model.sha256 == running.sha256:
-            raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is the service's model already")
+            raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is already the service's model")
         if model.period_s != running.period_s:
             raise ServiceError(
                 f"model {model.name}: sample_period_s = {model.period_s:g}, the service runs at {running.period_s:g} s"
@@ -256,9 +256,9 @@ class Adoption:
             return ModelCandidate(compensation=compensation)
         if not candidate.is_known and not force:
             raise ServiceError(
-                f"model {model.name}: the recordings reach back {candidate.minutes / 60.0:.1f} h without a gap, its "
-                f"slowest time constant is {slowest_min(model) / 60.0:.1f} h and {WARM_UP:g} of them are wanted; its "
-                f"offset would be known to ±{candidate.compensation.status.std_um:.1f} µm only (standard deviation); "
+                f"model {model.name}: the recordings without a gap cover {candidate.minutes / 60.0:.1f} h, but "
+                f"{WARM_UP:g} times the slowest time constant of {slowest_min(model) / 60.0:.1f} h is needed; the "
+                f"standard deviation of its offset would be {candidate.compensation.status.std_um:.1f} µm; "
                 f"{_ADVICE}"
             )
         return candidate
@@ -269,7 +269,7 @@ def _model_file(store: ModelStore, order: _Order) -> bytes:
         return order.request.model.encode() if order.request.model else store.load(order.request.sha256)
     before = store.before()
     if before is None:
-        raise ServiceError("back: the configured model is in use, there is none before it")
+        raise ServiceError("back: the configured model is in use; there is no previous model")
     return before
 
 

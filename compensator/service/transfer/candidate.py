@@ -1,6 +1,6 @@
-"""A compensation that did not run gets the state that it would have had: from the recordings, then from live samples.
+"""Warm-up: brings a new compensation to the present state with the recordings, then with live samples.
 
-A restart with another configuration or model begins with one, and a model that is adopted.
+It is used at a restart with another configuration or model, and when a model is adopted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from compensator.service.replay import FreeRun, RecordedStep, opening_of, steps_
 from compensator.service.state import decode_state
 from compensator.service.status import Zero
 
-#: Longest warm-up, in slowest time constants: 0.03 % of the influence of earlier samples is left.
+#: Longest warm-up, in slowest time constants: 0.03 % of the influence of earlier samples remains.
 WARM_UP = 8.0
 
 
@@ -37,29 +37,29 @@ class ModelCandidate:
     Parameters
     ----------
     compensation : Compensation
-        Its state after the last sample that it got.
+        The compensation in its state after the last sample.
     samples : int
-        Number of recorded samples that it was warmed up on.
+        Number of recorded samples of the warm-up.
     minutes : float
-        Time that they span, min.
+        Their time span, min.
     """
 
     compensation: Compensation
     samples: int = 0
     minutes: float = 0.0
-    #: Whether the recordings determine its state: they begin at a zero at rest, or reach back far enough.
+    #: Whether the recordings determine its state: they start at a zero at rest, or are long enough.
     is_known: bool = field(init=False)
 
     def __post_init__(self) -> None:
         self.is_known = self.compensation.status.is_known
 
     def update(self, outcome: Outcome) -> None:
-        """Process a live sample, with the zero that was set with it; one from the recordings is left out."""
+        """Process a live sample, with the zero that was set with it; a sample of the recordings is skipped."""
         sample, last = outcome.sample, self.compensation.status.seq
         if sample.seq <= last:
             return
         if last >= 0:
-            # The numbers in between were not on disk in time for the warm-up.
+            # The samples in between were not on disk in time for the warm-up.
             self.compensation.pause(sample.seq - last - 1)
         for note in outcome.notes:
             if note.kind == EventKind.ZERO:
@@ -67,17 +67,17 @@ class ModelCandidate:
         self.compensation.process(sample)
 
     def figures(self) -> dict[str, Any]:
-        """Return the extent of its warm-up for events and answers."""
+        """Return the extent of its warm-up for events and replies."""
         return {"warm_up_min": self.minutes, "warm_up_samples": self.samples, "state_known": self.is_known}
 
 
 def warm_up(
     folder: Path, config: Config, model: ThermalModel, *, between_samples: Callable[[], None] = lambda: None
 ) -> ModelCandidate:
-    """Bring a new compensation to the end of the recordings, with the zero that is in force there.
+    """Run a new compensation up to the end of the recordings, with the zero that is current there.
 
-    It begins at the last zero at rest, or, where that is longer ago, `WARM_UP` of the model's slowest time constants
-    before the end (before the last zero on a warm machine, where there was one).
+    It starts at the last zero at rest, or, if that is longer ago, `WARM_UP` times the model's slowest time constant
+    before the end (or before the last zero on a warm machine, if there was one).
 
     Parameters
     ----------
@@ -88,12 +88,12 @@ def warm_up(
     model : ThermalModel
         The new model.
     between_samples : callable
-        Called after each sample, where a thread gives way to the service.
+        Called after each sample, so that a thread can yield to the service.
 
     Raises
     ------
     DataError
-        If there is no recording, or one of another sample period.
+        If there is no usable recording, or one has another sample period.
     """
     compensation = Compensation(config, model)
     compensation.begin(None)
@@ -117,7 +117,7 @@ def warm_up(
     if window.at_rest is not None:
         run(window.at_rest)
     elif zero.is_absolute and model.inputs == "changes":
-        raise DataError(f"{folder}: no zero on record, and the previous model used the temperatures as they are")
+        raise DataError(f"{folder}: no recorded zero, and the previous model used absolute temperatures")
     else:
         compensation.begin(zero)
     for path in window.files:
@@ -127,16 +127,16 @@ def warm_up(
                 run(step)
             between_samples()
     if not samples:
-        raise DataError(f"{folder}: no recorded sample to warm the model up with")
+        raise DataError(f"{folder}: no recorded samples for a warm-up")
     same = (zero.t_q_ref_degc, zero.at_ref_degc) == (newest.t_q_ref_degc, newest.at_ref_degc)
     if not same and model.inputs == "changes" and not zero.is_absolute:
-        raise DataError(f"{folder}: the recordings do not lead to the zero in force")
+        raise DataError(f"{folder}: the recordings do not contain the current zero")
     return ModelCandidate(compensation=compensation, samples=samples, minutes=(free.time_ns - first_ns) / (60.0 * NS))
 
 
 @dataclass(slots=True)
 class _Window:
-    """The part of the recordings that a warm-up uses, and the zero in force at their end."""
+    """The part of the recordings that a warm-up uses, and the current zero at their end."""
 
     zero: Zero
     files: list[Path]
@@ -145,11 +145,11 @@ class _Window:
 
 
 def _window(folder: Path, machine: str, slowest: float, between_samples: Callable[[], None]) -> _Window:
-    """Look for the zero in force and for how far back the warm-up must begin."""
+    """Find the current zero, and where the warm-up must start."""
     files = recordings(folder, machine)
     last = _last_estimate(files)
     if last is None or math.isnan((zero := Zero.of_estimate(last)).t_q_ref_degc):
-        raise DataError(f"{folder}: no zero on record")
+        raise DataError(f"{folder}: no recorded zero")
     span_ns = round(WARM_UP * slowest * 60 * NS)
     window = _Window(zero=zero, files=files, from_ns=last.time_utc_ns - span_ns)
     for path in reversed(files):
@@ -166,7 +166,7 @@ def _window(folder: Path, machine: str, slowest: float, between_samples: Callabl
                 window.at_rest = step
                 window.from_ns = max(window.from_ns, step.sample.time_utc_ns)
                 break
-            # The deformation counts from the model's prediction at this zero, so the state must be known there, too.
+            # The deformation is relative to the model's prediction at this zero, so the state must be known there too.
             window.from_ns = min(window.from_ns, step.sample.time_utc_ns - span_ns)
         if window.at_rest is not None:
             break
@@ -175,7 +175,7 @@ def _window(folder: Path, machine: str, slowest: float, between_samples: Callabl
 
 
 def _first_needed(files: list[Path], from_ns: int) -> int:
-    """Return the index of the last file that begins before a time."""
+    """Return the index of the last file that starts before a time."""
     for i in range(len(files) - 1, 0, -1):
         first = next((step.sample for step in steps_of(files[i]) if step.sample is not None), None)
         if first is not None and first.time_utc_ns <= from_ns:
@@ -193,7 +193,7 @@ def _last_estimate(files: list[Path]) -> EstimateMessage | None:
 
 
 def _opens_with(path: Path, zero: Zero) -> bool:
-    """Return whether a zero was in force already where a recording opens."""
+    """Return whether a zero was current at the start of a recording."""
     try:
         state = decode_state(opening_of(path).get("state.json", b""))
     except DataError:

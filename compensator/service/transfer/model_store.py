@@ -1,4 +1,4 @@
-"""The adopted models, stored with the recordings: which one is in use, and which came before.
+"""The adopted models, stored with the recordings: the one in use, and the previous ones.
 
 An adopted model is used until the configured model is changed: the configuration has precedence.
 """
@@ -23,7 +23,7 @@ _FILE = "adopted.json"
 
 
 class Adopted(msgspec.Struct, frozen=True, kw_only=True):
-    """One change of the model: hash and name of the file in use from then on, time, and the command."""
+    """A change of the model: hash and name of the model used from then on, time, and the command."""
 
     sha256: str
     name: str
@@ -46,14 +46,14 @@ class ModelStore:
     Parameters
     ----------
     folder : pathlib.Path
-        Made when the first model comes.
+        Created with the first model.
     configured : bytes
         The model file that the configuration names.
 
     Raises
     ------
     ServiceError
-        From any method, naming the file, when the folder cannot be used.
+        By any method, if the folder cannot be used; the message names the file.
     """
 
     def __init__(self, folder: Path, configured: bytes) -> None:
@@ -62,12 +62,12 @@ class ModelStore:
         self._configured_sha256 = sha256_of(configured)
 
     def in_use(self) -> bytes:
-        """Return the model file that the service is to use."""
+        """Return the model file in use."""
         adopted = self._read().in_use
         return self.load(adopted[-1].sha256) if adopted else self.configured
 
     def before(self) -> bytes | None:
-        """Return the model file that `back` leads to, None where no model is adopted."""
+        """Return the model file to which `back` returns; None if no model is adopted."""
         adopted = self._read().in_use
         if not adopted:
             return None
@@ -96,7 +96,7 @@ class ModelStore:
         self._write(contents)
 
     def back(self, *, name: str, time_utc_ns: int) -> None:
-        """Return to the model before; the file of the present one stays."""
+        """Return to the previous model; the file of the present one remains."""
         contents = self._read()
         if contents.in_use:
             contents.in_use.pop()
@@ -143,7 +143,7 @@ def check_model(config: Config, data: bytes, *, source: str) -> ThermalModel:
     Raises
     ------
     ModelError
-        One line that names what is wrong: the file, its dynamics, a channel that it needs, its period.
+        If the file, its dynamics, a channel that it needs, or its period is wrong; the message is one line.
     """
     model = parse_model(data, source=source)
     try:

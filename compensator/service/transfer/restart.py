@@ -1,8 +1,8 @@
-"""The start of the service: finds its last recording and brings the state to where that ended.
+"""The start of the service: finds the last recording and restores the state at its end.
 
-A clean stop, a kill and a power cut are the same here: whatever is complete on disk is used. The samples of the last
-file run from the state that it opens with, and give the state after the last of them, bit for bit. Where the
-configuration or the model has changed since, the recordings warm the new one up instead.
+A clean stop, a kill and a power cut are treated alike: everything that is complete on disk is used. The samples of the
+last file are replayed from the state at its start, which gives the state after the last of them, bit for bit. If the
+configuration or the model has changed since, a new compensation is warmed up on the recordings instead.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from compensator.service.transfer.candidate import warm_up
 
 @dataclass(slots=True)
 class Resumed:
-    """A compensation that continues where the last recording ends, with events that describe how."""
+    """A compensation that continues from the end of the last recording, with events that describe how."""
 
     compensation: Compensation
     notes: list[Note] = field(default_factory=list)
@@ -45,7 +45,7 @@ class Resumed:
 
 @dataclass(slots=True)
 class _LastFile:
-    """The last file with a sample or a state, and what is known at its end."""
+    """The last file with a sample or a state, and the values at its end."""
 
     path: Path
     opening: dict[str, bytes]
@@ -54,7 +54,7 @@ class _LastFile:
     handover: Handover = field(default_factory=Handover)
 
     def read_state(self, resumed: Resumed) -> None:
-        """Read the state that the file opens with; note where it cannot be used."""
+        """Read the state at the start of the file; add an event if it cannot be used."""
         try:
             state = decode_state(self.opening["state.json"])
         except DataError as error:
@@ -68,7 +68,7 @@ class _LastFile:
         )
 
     def add(self, step: RecordedStep) -> float:
-        """Follow one group; return the offset that was published with it, µm, NaN where none was."""
+        """Process one group; return the offset that was published with it, µm; NaN if there was none."""
         self.samples += step.sample is not None
         offset_um, held, failed = self.handover.offset_um, self.handover.operator_hold, self.handover.internal_error
         for event in step.events:
@@ -88,7 +88,7 @@ class _LastFile:
 
 
 def resume(loaded: LoadedConfig, model: ThermalModel, checkpointed: CheckpointedOffset | None = None) -> Resumed:
-    """Bring a compensation to where the last recording ends.
+    """Return a compensation in its state at the end of the last recording.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def resume(loaded: LoadedConfig, model: ThermalModel, checkpointed: Checkpointed
     Returns
     -------
     Resumed
-        The state before the pause since then; the first sample shows how long that is.
+        The state before the pause since then; the first sample shows its length.
     """
     resumed = _from_disk(loaded, model)
     if checkpointed is not None and checkpointed.seq > resumed.compensation.status.seq:
@@ -143,7 +143,7 @@ def _from_disk(loaded: LoadedConfig, model: ThermalModel) -> Resumed:
 def _changes(last: _LastFile, loaded: LoadedConfig, model: ThermalModel) -> list[str]:
     """Return why the state of the recording does not fit this configuration and model, as texts."""
     if last.state is None:
-        return ["the recording carries no state that can be used"]
+        return ["the recording contains no state that can be used"]
     changes = []
     if last.opening.get("config.toml") != loaded.data:
         changes.append("the configuration has changed")
@@ -153,14 +153,14 @@ def _changes(last: _LastFile, loaded: LoadedConfig, model: ThermalModel) -> list
 
 
 def _run_again(last: _LastFile, compensation: Compensation, *, restore: bool) -> tuple[int, str]:
-    """Read the last file through, with `restore` running it from its state.
+    """Read the last file; with `restore`, replay it from its state.
 
     Returns
     -------
     int
-        Number of offsets that do not come out as they were published.
+        Number of offsets that are not reproduced as published.
     str
-        Why it could not be run; empty where it could.
+        Why it could not be replayed; empty if it was.
     """
     differing, why = 0, ""
     try:
@@ -178,17 +178,17 @@ def _run_again(last: _LastFile, compensation: Compensation, *, restore: bool) ->
             why = str(error)
             continue
         if isinstance(result, Outcome) and "offset" in step.records:
-            # The daemon adds to the reasons when the disk fails; the numbers are the compensation's alone.
+            # The daemon adds reasons when the disk fails; only the numbers are the compensation's.
             computed = number(result.offset.y_offset_um)
             differing += computed != published and not (math.isnan(computed) and math.isnan(published))
     return differing, why
 
 
 def _continue(resumed: Resumed, last: _LastFile, compensation: Compensation, differing: int) -> None:
-    """Continue with a compensation that has run the last file."""
+    """Continue with a compensation that has replayed the last file."""
     if differing:
         resumed.note(
-            f"{differing} offset(s) of {last.path.name} do not come out as they were published: audit it",
+            f"{differing} offset(s) of {last.path.name} are not reproduced as published: audit it",
             file=last.path.name,
             differing=differing,
         )
@@ -207,19 +207,17 @@ def _continue(resumed: Resumed, last: _LastFile, compensation: Compensation, dif
 
 
 def _warm(resumed: Resumed, last: _LastFile, loaded: LoadedConfig, model: ThermalModel, why: str) -> None:
-    """Warm a new compensation up on the recordings; where that fails it begins as at a first start."""
+    """Warm up a new compensation on the recordings; if that fails it starts as at the first start."""
     config = loaded.config
     try:
         candidate = warm_up(loaded.resolve(config.recording.folder), config, model)
     except DataError as error:
-        resumed.note(
-            f"{why}; the state cannot be carried over ({error}): it begins as at a first start", begun_anew=True
-        )
+        resumed.note(f"{why}; the state cannot be restored ({error}): starting as at the first start", begun_anew=True)
     else:
         resumed.compensation = candidate.compensation
         resumed.note(
             f"{why}; warmed up on {candidate.samples} sample(s) of {candidate.minutes / 60.0:.1f} h"
-            + ("" if candidate.is_known else ", which is too short to know the state"),
+            + ("" if candidate.is_known else ", which is too short to determine the state"),
             samples=candidate.samples,
             warm_up_min=candidate.minutes,
             known=candidate.is_known,

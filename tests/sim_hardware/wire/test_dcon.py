@@ -183,5 +183,5 @@ def test_unplugged_and_back(line, wire, wires):
 
 
 def test_a_tcp_module_does_not_speak_dcon():
-    with pytest.raises(ValueError, match="adam-6018 does not speak DCON"):
+    with pytest.raises(ValueError, match="adam-6018 does not support DCON"):
         DconLine({1: Adam("adam-6018", sources={})})
