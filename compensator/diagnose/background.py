@@ -28,7 +28,9 @@ from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, 
 LAGS_MIN = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0)
 #: Standard deviation of the logarithm of a channel's size about their mean: nearly one size for all.
 ALIKE = 0.2
-#: The same of the mean size about a tenth of the deformation's spread, and of the base's own paths.
+#: Typical size of a channel, as a share of the deformation's spread.
+SIZE_SHARE = 0.1
+#: Standard deviation of the logarithm of the mean size about that, and of the sizes of the base's own paths.
 MEAN_FOLDS, PATH_FOLDS = 2.0, 1.0
 
 
@@ -86,7 +88,7 @@ class Background:
         self.groups = np.repeat(np.arange(len(inputs)), len(taus))
         self.inputs_of_base = len(base)
         # Where nothing is known of the base's paths, they are inputs like others.
-        self.is_path = (np.arange(len(inputs)) < len(base)) & (not evidence.free_paths)
+        self.is_path = np.arange(len(inputs)) < len(base)
 
     def fitted(self, points: Points, explained: Vector, start: Rest, steps: int = 40) -> Regressed:
         """Fit to what named effects leave.
@@ -115,7 +117,7 @@ class Background:
 
 
 class _Problem:
-    """The search of the sizes of all channels and of the rest."""
+    """The search of the rest and of the sizes of all channels: their logarithms, in this order."""
 
     def __init__(self, background: Background, points: Points, explained: Vector) -> None:
         self.background, self.points = background, points
@@ -125,59 +127,65 @@ class _Problem:
         self.table = table / self.scale
         self.target = points.residual - explained
         self.groups, self.is_path = background.groups, background.is_path
-        self.typical = np.log([0.1 * points.spread_um, points.own_um])
+        size, unknown = SIZE_SHARE * points.spread_um, points.evidence.free_paths
+        self.typical_size, self.typical_path = np.log([size, size if unknown else points.own_um]).tolist()
+        self.path_folds = MEAN_FOLDS if unknown else PATH_FOLDS
+        typical = points.typical_rest()
+        self.typical_rest = np.log([typical.slow_um, typical.tau_min, typical.start_um])
 
     def solved(self, start: Rest, steps: int) -> Regressed:
         """Return the regression with the most probable sizes."""
-        count = self.is_path.size
-        sizes = np.where(self.is_path, self.typical[1], self.typical[0] - 1.0)
-        begin = np.concatenate([np.log([start.slow_um, start.tau_min]), sizes])
-        bounds = [(np.log(1e-3), np.log(1e3)), (np.log(3.0), np.log(3e3)), *[(-12.0, 8.0)] * count]
+        sizes = np.where(self.is_path, self.typical_path, self.typical_size - 1.0)
+        begin = np.concatenate([np.log([start.slow_um, start.tau_min, start.start_um]), sizes])
+        bounds = [(np.log(1e-3), np.log(1e3)), (np.log(3.0), np.log(3e3)), *[(-12.0, 8.0)] * (sizes.size + 1)]
+        begin = np.clip(begin, *np.array(bounds).T)
         found = minimize(
             self._with_gradient, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxfun": steps}
         )
         return self._result(np.asarray(found.x), -float(found.fun))
 
     def _rest(self, x: Vector) -> Rest:
-        return dataclasses.replace(
-            self.points.typical_rest(), slow_um=float(np.exp(x[0])), tau_min=float(np.exp(x[1])), own_um=1e-6
-        )
+        slow_um, tau_min, start_um = np.exp(x[:3]).tolist()
+        typical = self.points.typical_rest()
+        return dataclasses.replace(typical, slow_um=slow_um, tau_min=tau_min, start_um=start_um, own_um=0.0)
 
     def _white(self, x: Vector) -> tuple[Matrix, float, int]:
-        nuisances = self.points.random(0.0)
-        whitening = Whitening(self.points, self._rest(x))
-        weights = np.exp(x[2:])[self.groups]
-        white = whitening.of(np.column_stack([self.target, nuisances, self.table]))
-        white[:, 1 + nuisances.shape[1] :] *= weights
-        return white, whitening.log_det, nuisances.shape[1]
+        """Return target, random columns and channels, whitened; the log determinant; how many are random."""
+        rest = self._rest(x)
+        random = self.points.random(rest)
+        whitening = Whitening(self.points, rest)
+        white = whitening.of(np.column_stack([self.target, random, self.table]))
+        white[:, 1 + random.shape[1] :] *= np.exp(x[3:])[self.groups]
+        return white, whitening.log_det, random.shape[1]
 
     def _value(self, x: Vector) -> tuple[float, Vector]:
-        white, log_det, fixed = self._white(x)
+        """Return the logarithm of the evidence, and its slopes but for the first two."""
+        white, log_det, random = self._white(x)
         gram = white[:, 1:].T @ white
         factor = cho_factor(np.eye(gram.shape[0]) + gram[:, 1:], lower=True, check_finite=False)
         mean = cho_solve(factor, gram[:, 0], check_finite=False)
         surprise = white[:, 0] @ white[:, 0] - gram[:, 0] @ mean + log_det + 2.0 * np.log(np.diag(factor[0])).sum()
-        variance = np.diag(cho_solve(factor, np.eye(mean.size), check_finite=False))
-        slopes = (variance - 1.0 + mean**2)[fixed:]
-        by_size = np.bincount(self.groups, weights=slopes, minlength=self.is_path.size)
-        return -0.5 * float(surprise), np.asarray(by_size, dtype=np.float64)
+        slopes = np.diag(cho_solve(factor, np.eye(mean.size), check_finite=False)) - 1.0 + mean**2
+        zeros = self.points.zeros.shape[1]
+        starts = slopes[zeros : zeros + self.points.starts_of_modes.shape[1]].sum()
+        by_size = np.bincount(self.groups, weights=slopes[random:], minlength=self.is_path.size)
+        return -0.5 * float(surprise), np.array([starts, *by_size.tolist()])
 
     def _prior(self, x: Vector) -> tuple[float, Vector]:
-        sizes, channels = x[2:], ~self.is_path
-        slopes = np.zeros(x.size)
-        value = 0.0
-        logs = np.log([self.points.typical_rest().slow_um, self.points.typical_rest().tau_min])
-        value -= 0.5 * float(np.sum((x[:2] - logs) ** 2))
-        slopes[:2] -= x[:2] - logs
+        sizes, channels, slopes = x[3:], ~self.is_path, np.zeros(x.size)
+        folds = np.array([1.0, 1.0, MEAN_FOLDS])
+        off = (x[:3] - self.typical_rest) / folds
+        value = -0.5 * float(off @ off)
+        slopes[:3] -= off / folds
         if channels.any():
             mean = sizes[channels].mean()
             apart = sizes[channels] - mean
-            off = mean - self.typical[0]
-            value -= 0.5 * float(np.sum(apart**2)) / ALIKE**2 + 0.5 * (off / MEAN_FOLDS) ** 2
-            slopes[2:][channels] -= apart / ALIKE**2 + off / MEAN_FOLDS**2 / channels.sum()
-        path = (sizes[self.is_path] - self.typical[1]) / PATH_FOLDS
-        value -= 0.5 * float(np.sum(path**2))
-        slopes[2:][self.is_path] -= path / PATH_FOLDS
+            far = (mean - self.typical_size) / MEAN_FOLDS
+            value -= 0.5 * float(np.sum(apart**2)) / ALIKE**2 + 0.5 * far**2
+            slopes[3:][channels] -= apart / ALIKE**2 + far / MEAN_FOLDS / channels.sum()
+        path = (sizes[self.is_path] - self.typical_path) / self.path_folds
+        value -= 0.5 * float(path @ path)
+        slopes[3:][self.is_path] -= path / self.path_folds
         return value, slopes
 
     def _with_gradient(self, x: Vector) -> tuple[float, Vector]:
@@ -192,7 +200,7 @@ class _Problem:
     def _result(self, x: Vector, log_evidence: float) -> Regressed:
         white, _, fixed = self._white(x)
         gram = np.eye(white.shape[1] - 1) + white[:, 1:].T @ white[:, 1:]
-        weights = np.exp(x[2:])[self.groups] / self.scale
+        weights = np.exp(x[3:])[self.groups] / self.scale
         covariance = np.linalg.inv(gram)[fixed:, fixed:]
         gains = (np.linalg.solve(gram, white[:, 1:].T @ white[:, 0])[fixed:]) * weights
         root = np.linalg.cholesky(covariance + 1e-12 * np.eye(gains.size)) * weights[:, None]

@@ -157,6 +157,7 @@ def _effects(found: Findings) -> tuple[FoundEffect, ...]:
                 rms_after_um=after,
                 signal=signal,
                 rivals=rivals_of(term, ((c.term, c.rms_um) for c in rivals), searched),
+                replaced=not found.explains,
             )
         )
     return tuple(sorted(effects, key=lambda effect: -effect.rms_before_um))
@@ -169,20 +170,16 @@ def _extended(
     evidence = found.search.evidence
     deployed: list[Effect] = [effect.effect for effect in effects if effect.deployable]
     remarks: tuple[Remark, ...] = ()
-    base = model
-    if found.remainder is not None:
-        rest = dataclasses.replace(found.remainder.effect)
-        if evidence.free_paths:
-            base, remainder = with_paths(model, rest)
-            base = dataclasses.replace(base, held_out_rms_um=None)
-            remarks = (Remark(ModelWarning.FITTED_ANEW, _refitted(model, base)),)
-        else:
-            remainder = rest
-        if remainder is not None:
-            deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(float(np.std(found.whole)))))
+    base, remainder = model, found.remainder.effect if found.remainder else None
+    if found.refitted:
+        base, remainder = with_paths(model, remainder or found.refitted.effect)
+        base = dataclasses.replace(base, held_out_rms_um=None)
+        remarks = (Remark(ModelWarning.FITTED_ANEW, _refitted(model, base)),)
+    if remainder is not None:
+        deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(float(np.std(found.whole)))))
     if not deployed and base is model:
         return model, ()
-    kept_out = [effect.signal[evidence.used] for effect in effects if not effect.deployable]
+    kept_out = [effect.signal[evidence.used] for effect in effects if not effect.effect.deployable]
     left = found.rest_um**2 + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
     extended = dataclasses.replace(base, effects=(*model.effects, *deployed), sha256="")
     # The engine states by itself what it cannot know of a late T_Q.

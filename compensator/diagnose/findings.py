@@ -10,7 +10,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Term, as_deployed, late_term
+from compensator.diagnose.fit import Fit, Term, as_deployed, late_term
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.search import MARGIN, Search, Selection
 from compensator.model.effects.blocks import Lag
@@ -39,12 +39,15 @@ class Findings:
         What each adds to y on every sample, µm.
     remainder : Regressed or None
         What the channels explain beyond them, where that is worth deploying.
+    explains : bool
+        Whether the named effects are deployed. Where all channels together explain the data clearly better without
+        them, their names say what resembles it most, and the remainder is deployed in their place.
     ceiling : numpy.ndarray, shape (n,)
         What all channels together would explain without any named effect, µm.
     paths : numpy.ndarray, shape (n,)
         What the base's paths alone would explain, where nothing was known of them; 0 elsewhere, µm.
-    own_paths : numpy.ndarray, shape (n,)
-        What they explain together with effects and remainder; 0 where the base's paths are kept, µm.
+    refitted : Regressed or None
+        The base's paths fitted together with the named effects, where nothing was known of them.
     """
 
     search: Search
@@ -52,19 +55,23 @@ class Findings:
     terms: tuple[Term, ...]
     responses: tuple[Vector, ...]
     remainder: Regressed | None
+    explains: bool
     ceiling: Vector
     paths: Vector
-    own_paths: Vector
+    refitted: Regressed | None
 
     @property
     def named(self) -> Vector:
         """What the named effects add, µm; with the paths, where nothing was known of them."""
-        return np.asarray(sum(self.responses, self.own_paths))
+        paths = self.refitted.added if self.refitted else np.zeros(self.ceiling.size)
+        return np.asarray(sum(self.responses, paths))
 
     @property
     def whole(self) -> Vector:
         """What effects and remainder add, µm."""
-        return self.named if self.remainder is None else self.named + self.remainder.added - self.own_paths
+        if self.remainder is None:
+            return self.named
+        return np.asarray(sum(self.responses if self.explains else (), self.remainder.added))
 
     @property
     def rest_um(self) -> float:
@@ -89,33 +96,59 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True) -> Findings:
     selection = search.run(unobserved=unobserved)
     fit, points = selection.fit, search.points
     terms, responses = as_deployed(fit)
-    background = Background(evidence)
     nothing = np.zeros(points.used.size)
+    background = Background(evidence)
     ceiling = background.fitted(points, nothing, selection.before.rest)
-    remainder: Regressed | None = None
-    paths = own_paths = np.zeros(evidence.used.size)
-    if late_term(fit) is None:
-        found = background.fitted(points, fit.added, fit.rest)
-        without = Likelihood(points, fit.rest)
-        target = without.projected((points.residual - fit.added)[:, None])[:, 0]
-        known = without.log_prior - 0.5 * (float(target @ target) + without.log_det)
-        size = float(np.std(found.added[evidence.used]))
-        least = LEAST * np.hypot(evidence.noise.noise_um, evidence.noise.own_error_um)
-        if evidence.free_paths or (found.log_evidence > known + WORTH and size > least):
-            remainder = found
-    if evidence.free_paths and remainder is not None:
-        own_paths = background.response_of_base(remainder.effect)
-        paths = Background(evidence, channels=False).fitted(points, nothing, selection.before.rest).added
+    paths = Background(evidence, channels=False) if evidence.free_paths else None
+    refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
+    remainder, explains = (None, True) if late_term(fit) else _remainder(fit, background, refitted, ceiling)
     return Findings(
         search=search,
         selection=selection,
         terms=terms,
         responses=tuple(responses),
         remainder=remainder,
+        explains=explains,
         ceiling=ceiling.added,
-        paths=paths,
-        own_paths=own_paths,
+        paths=paths.fitted(points, nothing, selection.before.rest).added if paths else np.zeros(evidence.used.size),
+        refitted=refitted,
     )
+
+
+def _remainder(
+    fit: Fit, background: Background, refitted: Regressed | None, ceiling: Regressed
+) -> tuple[Regressed | None, bool]:
+    """Choose what is deployed beside named effects by the evidence, and whether they are deployed themselves.
+
+    Parameters
+    ----------
+    fit : Fit
+        The named effects.
+    background : Background
+        All channels and the base's paths.
+    refitted : Regressed or None
+        The base's paths fitted together with them, where nothing was known of those.
+    ceiling : Regressed
+        All channels without the named effects.
+    """
+    points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
+    beside = background.fitted(points, fit.added, fit.rest) if fit.terms else ceiling
+    known = refitted.log_evidence if refitted else _log_evidence(fit)
+    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) + MARGIN:
+        return ceiling, False
+    size = float(np.std(beside.added[evidence.used]))
+    least = LEAST * np.hypot(evidence.noise.noise_um, evidence.noise.own_error_um)
+    if beside.log_evidence > known + WORTH and size > least:
+        return beside, True
+    return None, True
+
+
+def _log_evidence(fit: Fit) -> float:
+    """Return the logarithm of the probability of the data with a fit's effects as they are."""
+    points = fit.likelihood.points
+    likelihood = Likelihood(points, fit.rest)
+    target = likelihood.projected((points.residual - fit.added)[:, None])[:, 0]
+    return likelihood.log_prior - 0.5 * (float(target @ target) + likelihood.log_det)
 
 
 def with_paths(model: ThermalModel, found: Regression) -> tuple[ThermalModel, Regression | None]:

@@ -37,12 +37,15 @@ DISTINCT = 3e-3
 EXACT_OWN = 0.3
 #: Effects have their form only to this share of their size: where forms are exact, and on a real machine.
 FORM_ERROR = (0.02, 0.1)
-#: The zero is free; an initial state moves y by about the spread of the deformation.
+#: The zero of a run is free: this many times the spread of the deformation.
 ZERO_TIMES = 100.0
+#: Typical size of an initial state, as a share of the spread of the deformation.
+START_SHARE = 0.1
 #: Typical slow rest where nothing is known of the paths, as a share of the spread of the deformation.
 SLOW_SHARE = 0.03
-#: Typical time constant of the slow rest, min, and how far (in e-folds) the rest may be from what is typical.
-REST_MIN, REST_FOLDS = 60.0, (0.4, 1.0, 1.0)
+#: Typical time constant of the slow rest, min, and how far (in e-folds) noise, slow rest, its time constant and the
+#: initial state may be from what is typical.
+REST_MIN, REST_FOLDS = 60.0, (0.4, 1.0, 1.0, 2.0)
 #: Furthest that the search of the rest goes, in e-folds.
 FURTHEST = 6.0
 
@@ -57,6 +60,8 @@ class Rest:
         White noise of one point, µm.
     slow_um, tau_min : float
         Standard deviation, µm, and time constant, min, of the slow rest.
+    start_um : float
+        What the unknown initial state of a run moves, µm.
     own_um : float
         Error of the base's paths, µm.
     """
@@ -64,6 +69,7 @@ class Rest:
     noise_um: float
     slow_um: float
     tau_min: float
+    start_um: float
     own_um: float
 
 
@@ -106,11 +112,11 @@ class Points:
             # What a calibration missed is no slow process: it is largest right after the heat is switched.
             point_noise = math.hypot(point_noise, self.own_um)
         slow = SLOW_SHARE * self.spread_um if evidence.free_paths else self.own_um
-        self._typical = np.log([max(point_noise, 1e-3), slow, REST_MIN])
+        self._typical = np.log([max(point_noise, 1e-3), slow, REST_MIN, START_SHARE * self.spread_um])
         self._own = self._own_columns()
-        scale = np.full(evidence.nuisances.shape[1], self.spread_um)
-        scale[:: evidence.nuisances.shape[1] // len(evidence.signals)] *= ZERO_TIMES
-        self._nuisances = self.averaged(evidence.nuisances * scale)
+        nuisances = self.averaged(evidence.nuisances)
+        is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
+        self.zeros, self.starts_of_modes = ZERO_TIMES * self.spread_um * nuisances[:, is_zero], nuisances[:, ~is_zero]
 
     def averaged(self, table: Matrix) -> Matrix:
         """Return the means of columns over the samples used of each point, shape (points, columns)."""
@@ -133,9 +139,9 @@ class Points:
         """Return the paths' own error, and that of the form of effects of a size, µm."""
         return math.hypot(self.own_um, FORM_ERROR[not self.is_exact] * effects_um)
 
-    def random(self, own_um: float) -> Matrix:
-        """Return columns whose weights are unknown with standard deviation 1: nuisances and own error."""
-        return np.concatenate([self._nuisances, own_um * self._own], axis=1)
+    def random(self, rest: Rest) -> Matrix:
+        """Return columns whose weights are unknown with standard deviation 1: zeros, initial states and own error."""
+        return np.concatenate([self.zeros, rest.start_um * self.starts_of_modes, rest.own_um * self._own], axis=1)
 
     def log_prior(self, rest: Rest) -> float:
         """Return the logarithm of the prior of a rest."""
@@ -155,14 +161,18 @@ class Points:
         steps : int
             Most evaluations of the gradient.
         """
-        table = np.column_stack([self.residual - fixed, self.random(start.own_um), columns])
-        searched = np.array([0, 1, 2] if self.is_exact else [1, 2])
+        unit = dataclasses.replace(start, start_um=1.0)
+        table = np.column_stack([self.residual - fixed, self.random(unit), columns])
+        first = 1 + self.zeros.shape[1]
+        of_start = slice(first, first + self.starts_of_modes.shape[1])
+        searched = np.array([0, 1, 2, 3] if self.is_exact else [1, 2, 3])
         at = np.clip(_logs(start), self._typical - FURTHEST, self._typical + FURTHEST)
 
         def value(logs: Vector) -> float:
             rest = self._rest(logs, start.own_um)
             whitening = Whitening(self, rest)
             white = whitening.of(table)
+            white[:, of_start] *= rest.start_um
             gram = white[:, 1:].T @ white
             factor = cho_factor(np.eye(gram.shape[0]) + gram[:, 1:], lower=True, check_finite=False)
             explained = gram[:, 0] @ cho_solve(factor, gram[:, 0], check_finite=False)
@@ -186,8 +196,8 @@ class Points:
         return self._rest(at, start.own_um)
 
     def _rest(self, logs: Vector, own_um: float) -> Rest:
-        noise_um, slow_um, tau_min = np.exp(logs).tolist()
-        return Rest(noise_um=noise_um, slow_um=slow_um, tau_min=tau_min, own_um=own_um)
+        noise_um, slow_um, tau_min, start_um = np.exp(logs).tolist()
+        return Rest(noise_um=noise_um, slow_um=slow_um, tau_min=tau_min, start_um=start_um, own_um=own_um)
 
     def _own_columns(self) -> Matrix:
         """Return responses of any linear paths to heat and ambient temperature, fast and slow ones of size 1 each."""
@@ -272,7 +282,7 @@ class Likelihood:
     def __init__(self, points: Points, rest: Rest) -> None:
         self.points, self.rest = points, rest
         self._whitening = Whitening(points, rest)
-        self._random = self._whitening.of(points.random(rest.own_um))
+        self._random = self._whitening.of(points.random(rest))
         self._factor = cho_factor(np.eye(self._random.shape[1]) + self._random.T @ self._random, lower=True)
         self.log_det = self._whitening.log_det + _log_det(self._factor)
         self.log_prior = points.log_prior(rest)
@@ -296,7 +306,7 @@ def with_own_error(rest: Rest, own_um: float) -> Rest:
 
 
 def _logs(rest: Rest) -> Vector:
-    return np.log([rest.noise_um, rest.slow_um, rest.tau_min])
+    return np.log([rest.noise_um, rest.slow_um, rest.tau_min, rest.start_um])
 
 
 def _log_det(factor: tuple[Matrix, bool]) -> float:

@@ -25,6 +25,7 @@ HELD_OUT = (
     f"each of {FOLDS} blocks of time predicted after choosing and fitting on the others; zero and initial state also "
     "from the others"
 )
+REPLACED = " All channels together explain the data better, so the remainder is deployed in its place."
 #: Another explanation is a rival while it leaves no more than this many times as much.
 RIVAL_TIMES = 1.2
 
@@ -45,6 +46,8 @@ class FoundEffect:
         What it adds to y, µm, all runs one after another.
     rivals : tuple of Rival
         What explains it nearly as well.
+    replaced : bool
+        Whether the remainder is deployed in its place, since it explains the data better.
     """
 
     term: Term = field(repr=False)
@@ -53,6 +56,7 @@ class FoundEffect:
     rms_after_um: float
     signal: Vector = field(repr=False)
     rivals: tuple[Rival, ...] = field(repr=False)
+    replaced: bool = False
 
     def __getitem__(self, key: str) -> Any:
         return getattr(self, key)
@@ -100,12 +104,12 @@ class FoundEffect:
     @property
     def explanation(self) -> str:
         """For an engineer."""
-        return self.effect.explanation
+        return self.effect.explanation + (REPLACED if self.replaced else "")
 
     @property
     def deployable(self) -> bool:
         """Whether the service can run it."""
-        return self.effect.deployable
+        return self.effect.deployable and not self.replaced
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
