@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Likelihood, Points, Rest
+from compensator.diagnose.likelihood import Likelihood, Points, Rest, without_own_error
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis
 
@@ -257,11 +257,16 @@ def _fitted(problem: _Problem, x: Vector, solved: tuple[Vector, Vector, Matrix],
 
 
 def settled(fit: Fit) -> Fit:
-    """Return a fit with the rest that fits its effects best, and the own error that effects of their size have."""
+    """Return a fit with the rest that fits its effects best, and errors of form as effects of their size have."""
     points = fit.likelihood.points
-    own = points.own_error_with(fit.size_um)
-    start = dataclasses.replace(fit.rest, own_um=own)
-    rest = points.settled(fit.columns, fit.fixed, start)
+    sizes: dict[str, float] = {}
+    for term in fit.terms:
+        _, path, channel = term.hypothesis.place
+        if path or channel:
+            of = "" if path else channel
+            added = response(points.evidence, term)[points.evidence.used]
+            sizes[of] = math.hypot(sizes.get(of, 0.0), float(np.std(added)))
+    rest = points.settled(fit.columns, fit.fixed, points.with_forms_of(fit.rest, sizes))
     return fit_terms(Likelihood(points, rest), fit.starts())
 
 
@@ -277,19 +282,23 @@ def from_search(free: Free, x: float) -> float:
 
 
 def standard_errors(fit: Fit) -> list[dict[str, float]]:
-    """Return the standard error of everything that each effect is named by."""
+    """Return the standard error of everything that each effect is named by.
+
+    Where the calibration states no error of the base's paths, none is counted.
+    """
     natural = np.array([v for term in fit.terms for v in (*term.values, *term.amplitudes)])
     if natural.size == 0:
         return []
-    likelihood = fit.likelihood
+    points, rest = fit.likelihood.points, fit.rest
+    likelihood = Likelihood(points, without_own_error(rest)) if points.is_exact else fit.likelihood
 
     def moved(values: Vector) -> list[Term]:
-        rest = iter(values.tolist())
+        one = iter(values.tolist())
         return [
             dataclasses.replace(
                 term,
-                values=tuple(itertools.islice(rest, len(term.values))),
-                amplitudes=tuple(itertools.islice(rest, len(term.amplitudes))),
+                values=tuple(itertools.islice(one, len(term.values))),
+                amplitudes=tuple(itertools.islice(one, len(term.amplitudes))),
             )
             for term in fit.terms
         ]

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,14 +44,14 @@ ZERO_TIMES = 100.0
 START_SHARE = 0.1
 #: Typical slow rest where nothing is known of the paths, as a share of the spread of the deformation.
 SLOW_SHARE = 0.03
-#: Typical time constant of the slow rest, min, and how far (in e-folds) noise, slow rest, its time constant and the
-#: initial state may be from what is typical.
-REST_MIN, REST_FOLDS = 60.0, (0.4, 1.0, 1.0, 2.0)
+#: Typical time constant of the slow rest, min, and how far (in e-folds) noise, slow rest, its time constant, the
+#: initial state and the paths' fast error may be from what is typical.
+REST_MIN, REST_FOLDS = 60.0, (0.4, 1.0, 1.0, 2.0, 0.5)
 #: Furthest that the search of the rest goes, in e-folds.
 FURTHEST = 6.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Rest:
     """What no effect explains.
 
@@ -62,15 +63,19 @@ class Rest:
         Standard deviation, µm, and time constant, min, of the slow rest.
     start_um : float
         What the unknown initial state of a run moves, µm.
-    own_um : float
-        Error of the base's paths, µm.
+    fast_um, own_um : float
+        Fast and slow error of the base's paths, µm.
+    forms : tuple of (str, float)
+        Error of the form in which channels act, µm.
     """
 
     noise_um: float
     slow_um: float
     tau_min: float
     start_um: float
+    fast_um: float
     own_um: float
+    forms: tuple[tuple[str, float], ...] = ()
 
 
 class Points:
@@ -112,8 +117,9 @@ class Points:
             # What a calibration missed is no slow process: it is largest right after the heat is switched.
             point_noise = math.hypot(point_noise, self.own_um)
         slow = SLOW_SHARE * self.spread_um if evidence.free_paths else self.own_um
-        self._typical = np.log([max(point_noise, 1e-3), slow, REST_MIN, START_SHARE * self.spread_um])
-        self._own = self._own_columns()
+        self._typical = np.log([max(point_noise, 1e-3), slow, REST_MIN, START_SHARE * self.spread_um, self.own_um])
+        self.fast, self.slow = self._own_columns()
+        self._forms: dict[str, Matrix] = {}
         nuisances = self.averaged(evidence.nuisances)
         is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
         self.zeros, self.starts_of_modes = ZERO_TIMES * self.spread_um * nuisances[:, is_zero], nuisances[:, ~is_zero]
@@ -133,15 +139,35 @@ class Points:
 
     def typical_rest(self) -> Rest:
         """Return a rest as it is expected before the data are seen."""
-        return self._rest(self._typical, self.own_um)
+        return self._rest(self._typical, Rest(0.0, 0.0, 0.0, 0.0, 0.0, self.own_um))
 
-    def own_error_with(self, effects_um: float) -> float:
-        """Return the paths' own error, and that of the form of effects of a size, µm."""
-        return math.hypot(self.own_um, FORM_ERROR[not self.is_exact] * effects_um)
+    def with_forms_of(self, rest: Rest, sizes_um: Mapping[str, float]) -> Rest:
+        """Return a rest with the errors that effects have whose form is not quite theirs.
+
+        Parameters
+        ----------
+        rest : Rest
+            Where the other values come from.
+        sizes_um : mapping of str to float
+            Standard deviation of what each channel adds by effects, µm; of the base's paths under an empty name.
+        """
+        share = FORM_ERROR[not self.is_exact]
+        forms = tuple((channel, share * size) for channel, size in sizes_um.items() if channel)
+        return dataclasses.replace(rest, own_um=math.hypot(self.own_um, share * sizes_um.get("", 0.0)), forms=forms)
 
     def random(self, rest: Rest) -> Matrix:
-        """Return columns whose weights are unknown with standard deviation 1: zeros, initial states and own error."""
-        return np.concatenate([self.zeros, rest.start_um * self.starts_of_modes, rest.own_um * self._own], axis=1)
+        """Return columns whose weights are unknown with standard deviation 1.
+
+        Zeros, initial states, fast and slow own error, errors of form.
+        """
+        starts, forms = rest.start_um * self.starts_of_modes, [size * self.form(name) for name, size in rest.forms]
+        return np.concatenate([self.zeros, starts, rest.fast_um * self.fast, rest.own_um * self.slow, *forms], axis=1)
+
+    def form(self, channel: str) -> Matrix:
+        """Return responses of any linear path from a channel, of size 1 together."""
+        if channel not in self._forms:
+            self._forms[channel] = self._responses([record.channels[channel] for record in self.evidence.signals])[2]
+        return self._forms[channel]
 
     def log_prior(self, rest: Rest) -> float:
         """Return the logarithm of the prior of a rest."""
@@ -161,58 +187,72 @@ class Points:
         steps : int
             Most evaluations of the gradient.
         """
-        unit = dataclasses.replace(start, start_um=1.0)
+        unit = dataclasses.replace(start, start_um=1.0, fast_um=1.0)
         table = np.column_stack([self.residual - fixed, self.random(unit), columns])
-        first = 1 + self.zeros.shape[1]
-        of_start = slice(first, first + self.starts_of_modes.shape[1])
-        searched = np.array([0, 1, 2, 3] if self.is_exact else [1, 2, 3])
+        ends = np.cumsum([self.zeros.shape[1], self.starts_of_modes.shape[1], self.fast.shape[1]]).tolist()
+        sized = [slice(ends[0], ends[1]), slice(ends[1], ends[2])]
+        searched = np.arange(0 if self.is_exact else 1, 5)
         at = np.clip(_logs(start), self._typical - FURTHEST, self._typical + FURTHEST)
 
-        def value(logs: Vector) -> float:
-            rest = self._rest(logs, start.own_um)
+        def value(logs: Vector) -> tuple[float, Vector]:
+            rest = self._rest(logs, start)
             whitening = Whitening(self, rest)
             white = whitening.of(table)
-            white[:, of_start] *= rest.start_um
+            for where, size in zip(sized, (rest.start_um, rest.fast_um), strict=True):
+                white[:, 1:][:, where] *= size
             gram = white[:, 1:].T @ white
             factor = cho_factor(np.eye(gram.shape[0]) + gram[:, 1:], lower=True, check_finite=False)
-            explained = gram[:, 0] @ cho_solve(factor, gram[:, 0], check_finite=False)
-            surprise = white[:, 0] @ white[:, 0] - explained + whitening.log_det + _log_det(factor)
-            return 0.5 * float(surprise) - self.log_prior(rest)
+            mean = cho_solve(factor, gram[:, 0], check_finite=False)
+            surprise = white[:, 0] @ white[:, 0] - gram[:, 0] @ mean + whitening.log_det + _log_det(factor)
+            # How the evidence changes with the size of a group of random columns: by what the data say of each.
+            known = np.diag(cho_solve(factor, np.eye(mean.size)[:, : ends[2]], check_finite=False))
+            surplus = mean[: ends[2]] ** 2 + known - 1.0
+            return 0.5 * float(surprise), -np.array([surplus[where].sum() for where in sized])
 
         def with_gradient(some: Vector) -> tuple[float, Vector]:
             logs = at.copy()
             logs[searched] = some
-            here, slopes = value(logs), []
-            for i in searched.tolist():
+            (here, by_size), slopes = value(logs), np.zeros(5)
+            slopes[3:] = by_size
+            for i in searched[searched < 3].tolist():
                 moved = logs.copy()
                 moved[i] += 1e-3
-                slopes.append((value(moved) - here) / 1e-3)
-            return here, np.array(slopes)
+                slopes[i] = (value(moved)[0] - here) / 1e-3
+            off = (logs - self._typical) / REST_FOLDS
+            return here + 0.5 * float(off @ off), (slopes + off / REST_FOLDS)[searched]
 
         bounds = [(t - FURTHEST, t + FURTHEST) for t in self._typical[searched].tolist()]
         options = {"maxfun": steps, "ftol": 1e-5}
         found = minimize(with_gradient, at[searched], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         at[searched] = found.x
-        return self._rest(at, start.own_um)
+        return self._rest(at, start)
 
-    def _rest(self, logs: Vector, own_um: float) -> Rest:
-        noise_um, slow_um, tau_min, start_um = np.exp(logs).tolist()
-        return Rest(noise_um=noise_um, slow_um=slow_um, tau_min=tau_min, start_um=start_um, own_um=own_um)
+    def _rest(self, logs: Vector, other: Rest) -> Rest:
+        noise_um, slow_um, tau_min, start_um, fast_um = np.exp(logs).tolist()
+        return Rest(noise_um, slow_um, tau_min, start_um, fast_um, other.own_um, other.forms)
 
-    def _own_columns(self) -> Matrix:
-        """Return responses of any linear paths to heat and ambient temperature, fast and slow ones of size 1 each."""
-        context, records = self.evidence.context, self.evidence.signals
+    def _own_columns(self) -> tuple[Matrix, Matrix]:
+        """Return fast and slow responses of any linear paths to heat and ambient temperature, of size 1 each."""
+        records = self.evidence.signals
+        both = [self._responses([record.source(path) for record in records]) for path in self.evidence.context.paths]
+        fast, slow, _ = zip(*both, strict=True)
+        return np.concatenate(fast, axis=1), np.concatenate(slow, axis=1)
+
+    def _responses(self, drives: Sequence[Vector]) -> tuple[Matrix, Matrix, Matrix]:
+        """Return fast, slow, and all responses to a drive."""
+        context = self.evidence.context
         longest = min(600.0, max(context.minutes / 3.0, 20.0 * context.period_min))
         taus = np.array([0.0, *np.geomspace(context.period_min, longest, OWN_LAGS)])
         bank = FilterBank(taus.tolist(), [(1.0,) * taus.size], context.period_min)
-        groups = [np.zeros((self.used.size, 0))]
-        for path in context.paths:
-            table = self.averaged(np.concatenate([bank.columns(record.source(path)) for record in records]))
-            groups += [self._orthogonal(table[:, some]) for some in (taus < FAST_MIN, taus >= FAST_MIN) if some.any()]
-        return np.concatenate(groups, axis=1)
+        table = self.averaged(np.concatenate([bank.columns(drive) for drive in drives]))
+        which = (taus < FAST_MIN, taus >= FAST_MIN, taus >= 0.0)
+        fast, slow, both = (self._orthogonal(table[:, some]) for some in which)
+        return fast, slow, both
 
     def _orthogonal(self, table: Matrix) -> Matrix:
         """Return combinations of columns that are orthogonal on the points used and together of size 1."""
+        if not table.shape[1]:
+            return table
         table = table / np.maximum(np.std(table[self.used], axis=0), 1e-12)
         _, sizes, directions = np.linalg.svd(table[self.used] - table[self.used].mean(axis=0), full_matrices=False)
         kept = sizes > DISTINCT * sizes[0]
@@ -300,13 +340,13 @@ def dense(likelihood: Likelihood) -> Matrix:
     return likelihood.projected(np.eye(likelihood.points.used.size))
 
 
-def with_own_error(rest: Rest, own_um: float) -> Rest:
-    """Return a rest with another own error of the base."""
-    return dataclasses.replace(rest, own_um=own_um)
+def without_own_error(rest: Rest) -> Rest:
+    """Return a rest for a base whose paths are exact."""
+    return dataclasses.replace(rest, fast_um=0.0, own_um=0.0, forms=())
 
 
 def _logs(rest: Rest) -> Vector:
-    return np.log([rest.noise_um, rest.slow_um, rest.tau_min, rest.start_um])
+    return np.log([rest.noise_um, rest.slow_um, rest.tau_min, rest.start_um, max(rest.fast_um, 1e-9)])
 
 
 def _log_det(factor: tuple[Matrix, bool]) -> float:

@@ -23,6 +23,10 @@ LONGEST_SHARE = 0.15
 SEEN_SHARE = 0.05
 #: Points of time that are tried in a record.
 POINTS = 240
+#: A source does not begin within this share of a record: what moves there is the initial state.
+START_SHARE = 0.03
+#: What is switched once and acts within this many samples is a step.
+AT_ONCE = 5.0
 
 
 def switchings(rest: Rest, fit: Fit) -> Start | None:
@@ -71,7 +75,7 @@ class _Pursuit:
         self._grid: list[Time] = [
             (record.number, float(k * record.period_min))
             for record in points.evidence.signals
-            for k in range(2, record.size - 2, _stride(record.size))
+            for k in range(max(2, round(START_SHARE * record.size)), record.size - 2, _stride(record.size))
         ]
 
     def found(self) -> Start | None:
@@ -86,6 +90,8 @@ class _Pursuit:
         if best is None:
             return None
         _, times, lag = best
+        if len(times) == 1 and lag < AT_ONCE * self._period:
+            return None
         hypothesis = Hypothesis(
             effect=Unobserved(times=tuple(sorted(times)), sizes_um=(1.0,) * len(times)),
             form="switched",
@@ -188,7 +194,8 @@ class _Pursuit:
             size = self._evidence.signals[record].size
             reach, last = _stride(size), (size - 3) * self._period
             moves = np.arange(-reach, reach + 0.25, max(0.5, reach / 12.0))
-            near = [(record, min(max(at + d * self._period, 2 * self._period), last)) for d in moves]
+            first = max(2, round(START_SHARE * size)) * self._period
+            near = [(record, min(max(at + d * self._period, first), last)) for d in moves]
             q = np.linalg.qr(self._steps(times[:k] + times[k + 1 :], lag))[0]
             trial = self._steps(near, lag)
             trial = trial - q @ (q.T @ trial)
