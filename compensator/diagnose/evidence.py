@@ -33,6 +33,8 @@ from compensator.model.transfer_function import SampledTransferFunction
 
 #: An initial state moves y by no more than about this many times its spread, with the weight of one sample.
 STATE_PRIOR = 1e-3
+#: Fastest decay of an initial state, samples, and the largest ratio of neighbouring decays.
+FASTEST, DECAY_RATIO = 2.0, 3.5
 #: Least noise of Y: a reading has digits.
 LEAST_NOISE_UM = 1e-3
 #: A displacement is an effect, never a cause: another probe follows Y whatever moves it.
@@ -277,11 +279,10 @@ def _basis(nuisances: Matrix, used: Mask) -> Matrix:
 
 
 def _nuisances(record: RecordSignals, context: Context) -> Matrix:
-    """Return a constant and the decay of every mode, each of size 1."""
-    taus: list[float] = []
-    for tau in sorted({round(t, 1) for values in context.taus_min.values() for t in values}):
-        if tau > 3.0 * record.period_min and (not taus or tau > 1.3 * taus[-1]):
-            taus.append(tau)
+    """Return a constant and decays from the fastest that can be seen to the base's slowest mode, each of size 1."""
+    fastest = FASTEST * record.period_min
+    slowest = max([3.0 * fastest, *(t for values in context.taus_min.values() for t in values)])
+    taus = np.geomspace(fastest, slowest, 1 + math.ceil(math.log(slowest / fastest, DECAY_RATIO))).tolist()
     return np.column_stack([np.ones(record.size), *(np.exp(-record.minutes / tau) for tau in taus)])
 
 

@@ -245,9 +245,10 @@ class Points:
         taus = np.array([0.0, *np.geomspace(context.period_min, longest, OWN_LAGS)])
         bank = FilterBank(taus.tolist(), [(1.0,) * taus.size], context.period_min)
         table = self.averaged(np.concatenate([bank.columns(drive) for drive in drives]))
-        which = (taus < FAST_MIN, taus >= FAST_MIN, taus >= 0.0)
-        fast, slow, both = (self._orthogonal(table[:, some]) for some in which)
-        return fast, slow, both
+        slow = table[:, taus >= FAST_MIN]
+        # Without a gain at rest, a fast response is one of timing.
+        fast = table[:, taus < FAST_MIN] - slow[:, :1]
+        return self._orthogonal(fast), self._orthogonal(slow), self._orthogonal(table)
 
     def _orthogonal(self, table: Matrix) -> Matrix:
         """Return combinations of columns that are orthogonal on the points used and together of size 1."""
