@@ -23,6 +23,7 @@ from compensator.messages import Offset, number
 from compensator.model.effects import effect_from
 from compensator.model.effects.base import filters, forms
 from compensator.model.effects.blocks import ChangeSeen
+from compensator.model.effects.seen import Range, Seen
 from compensator.model.effects.hypothesis import Context, proposals
 from compensator.model.effects.regression import MOST_CHANNELS, MOST_LAGS, MOST_ROWS, Regression
 from compensator.model.effects.signals import RecordSignals
@@ -217,7 +218,7 @@ def test_a_change_over_gaps_streams_as_it_filters_and_is_never_0_for_missing() -
 
 
 def test_the_model_file_holds_it_to_the_bit_and_says_what_it_is(tmp_path: Path) -> None:
-    explained = dataclasses.replace(REMAINDER, explanation=REMAINDER.explain(0.9))
+    explained = dataclasses.replace(REMAINDER, explanation=REMAINDER.explain(Seen(rms_um=0.9, added_um=Range(-1.2, 2.4))))
     written = write_model(tmp_path / "model.toml", dataclasses.replace(QUILL, effects=(explained,)))
     assert written.effects == (explained,)
     assert "# The remainder: a regularised linear response of several channels." in dump_model(written)
