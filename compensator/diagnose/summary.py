@@ -25,6 +25,13 @@ _DOES_NOT_HOLD = (
     "left unchanged."
 )
 
+#: Named effects that explain less than this of what the channels explain fall short of it, %. It is what an engineer
+#: would act on, and no bound of statistics.
+SHORT_PCT = 80.0
+#: Channels that remove less than this share of the mean square explain next to nothing.
+_LITTLE = 0.1
+#: Channels of the remainder that are named.
+_NAMED = 6
 #: Parameters of an effect that are shown unfolded.
 SHOWN = 6
 #: Units in the names of parameters, and on the page.
@@ -101,12 +108,87 @@ def verdict(found: Mapping[str, Any]) -> str:
     if ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
     before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
+    remainder, share = found.get("remainder"), explained(found)
+    share = f" {share}" if share else ""
+    with_remainder = f", {after:.2f} with the remainder" if remainder else ""
     if not found["effects"]:
-        return f"{words} Residual {before:.2f} µm rms, sensor noise {noise:.2f}."
+        return f"{words} Residual {before:.2f} µm rms{with_remainder}, sensor noise {noise:.2f}.{share}"
     return (
         f"{words} {_names(found['effects'])}. On held-out data the residual was {before:.2f} µm rms without and is "
-        f"{after:.2f} µm rms with them (sensor noise {noise:.2f})."
+        f"{_named_rms(found):.2f} µm rms with them{with_remainder} (sensor noise {noise:.2f}).{share}"
     )
+
+
+def _named_rms(found: Mapping[str, Any]) -> float:
+    """Return the error on held-out data with the named effects alone, µm rms."""
+    return float((found.get("remainder") or {}).get("rms_before_um", found["after"]["rms_um"]))
+
+
+def _can_explain(found: Mapping[str, Any]) -> float:
+    """Return what share of the mean square on held-out data the channels remove."""
+    ceiling, before = found.get("ceiling"), found["before"]["rms_um"]
+    return 1.0 - (ceiling["rms_um"] / before) ** 2 if ceiling and before else 0.0
+
+
+def explained(found: Mapping[str, Any]) -> str:
+    """Return how much of what the channels can explain the named effects do, in a sentence.
+
+    Empty where the channels explain next to nothing.
+
+    Examples
+    --------
+    >>> found = {"effects": [{}], "before": {"rms_um": 4.0}, "ceiling": {"rms_um": 1.0, "explained_pct": 83.0}}
+    >>> explained(found)
+    'The named effects explain 83 % of what the channels can explain.'
+    """
+    if _can_explain(found) < _LITTLE:
+        return ""
+    share = found["ceiling"]["explained_pct"]
+    if not found["effects"]:
+        return "No named effect explains what the channels can explain."
+    how_much = "all" if share > 99.5 else "nothing" if share < 0.5 else f"{share:.0f} %"
+    return f"The named effects explain {how_much} of what the channels can explain."
+
+
+def falls_short(found: Mapping[str, Any]) -> bool:
+    """Whether the named effects explain clearly less than the channels can."""
+    return _can_explain(found) >= _LITTLE and bool(found["ceiling"]["explained_pct"] < SHORT_PCT)
+
+
+def ceiling_words(found: Mapping[str, Any]) -> list[str]:
+    """Return what all channels could explain, and whether the named effects fall short of it, as sentences."""
+    if (ceiling := found.get("ceiling")) is None:
+        return ["No linear use of the logged channels leaves less on held-out data than the base model does."]
+    lines = [
+        f"The best linear use of all logged channels leaves {ceiling['rms_um']:.2f} µm rms on held-out data, the base "
+        f"model {found['before']['rms_um']:.2f}."
+    ]
+    if not (share := explained(found)):
+        return [*lines, "The channels can explain next to nothing."]
+    lines.append(share)
+    if falls_short(found):
+        rest = "the remainder corrects some of the rest" if found.get("remainder") else "no remainder was added"
+        lines.append(
+            "They fall clearly short: the channels show more than the effects that have a name, and " + rest + "."
+            if found["effects"]
+            else f"The channels show something that has no name here; {rest}."
+        )
+    return lines
+
+
+def remainder_words(found: Mapping[str, Any]) -> list[str]:
+    """Return what the remainder is and does, as sentences; empty where there is none."""
+    if (remainder := found.get("remainder")) is None:
+        return []
+    channels = remainder["channels"]
+    more = f" and {len(channels) - _NAMED} more" if len(channels) > _NAMED else ""
+    deployed = "Deployed in the extended model." if remainder["deployed"] else "Not deployed in the extended model."
+    return [
+        f"A regularised linear response of {', '.join(channels[:_NAMED])}{more}: a correction that explains nothing.",
+        f"It takes the error on held-out data from {remainder['rms_before_um']:.2f} to {remainder['rms_after_um']:.2f} "
+        "µm rms.",
+        deployed,
+    ]
 
 
 def _names(effects: Sequence[Mapping[str, Any]]) -> str:
@@ -132,22 +214,24 @@ def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | 
         yield explanation(effect)
         if effect.rivals:
             yield rivals(effect)
-    if beyond := beyond_effects(diagnosis):
-        yield Words(title="Remainder and ceiling", lines=beyond)
+    yield from beyond_effects(diagnosis)
     yield from warnings_of(diagnosis.warnings)
     yield from warnings_of(remarks, "Remarks on the data")
 
 
 def error_table(diagnosis: Diagnosis) -> Table:
-    """Return the errors on held-out data of the base model and of the extended model."""
+    """Return the errors on held-out data before and after, and what they are compared with."""
+    rows = [["base model", *diagnosis.before.cells()]]
+    if diagnosis.effects:
+        rows.append(["with the named effects", *(diagnosis.named if diagnosis.remainder else diagnosis.after).cells()])
+    if diagnosis.remainder:
+        rows.append(["with the remainder", *diagnosis.after.cells()])
+    if diagnosis.ceiling:
+        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
     return Table(
         title="Errors on held-out data",
         head=["", *SCORE_HEAD],
-        rows=[
-            ["base model", *diagnosis.before.cells()],
-            ["extended model", *diagnosis.after.cells()],
-            ["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""],
-        ],
+        rows=[*rows, ["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""]],
         note=f"Held-out data: {diagnosis.held_out}.",
     )
 
@@ -190,19 +274,8 @@ def in_words(key: str) -> str:
     return f"{' '.join(words[:at]) or 'rate'}{', ' if unit else ''}{unit}"
 
 
-def beyond_effects(diagnosis: Diagnosis) -> list[str]:
-    """Return remainder and ceiling (what the channels explain beyond the named effects) as sentences."""
-    found = []
-    if (remainder := diagnosis.remainder) is not None:
-        deployed = "deployed in model.toml" if remainder.deployed else "not deployed"
-        found.append(
-            f"Remainder: a regularised linear response of {', '.join(remainder.channels)}, {deployed}. It reduces the "
-            f"error on held-out data from {remainder.rms_before_um:.2f} to {remainder.rms_after_um:.2f} µm rms, but "
-            "names no cause."
-        )
-    if (ceiling := diagnosis.ceiling) is not None:
-        found.append(
-            f"Ceiling: the best linear use of all channels leaves {ceiling.rms_um:.2f} µm rms on held-out data; the "
-            f"named effects achieve {ceiling.explained_pct:.0f} % of that reduction."
-        )
-    return found
+def beyond_effects(diagnosis: Diagnosis) -> list[Words]:
+    """Return ceiling and remainder: what the channels explain beyond the named effects."""
+    found = figures(diagnosis)
+    lists = [("Ceiling", ceiling_words(found)), ("Remainder", remainder_words(found))]
+    return [Words(title=title, lines=lines) for title, lines in lists if lines]

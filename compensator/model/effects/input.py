@@ -19,7 +19,7 @@ from compensator.arrays import Vector
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
 from compensator.model.effects.blocks import Block, Delay, FilterBank, FromStart, S
 from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, numbered, proposes
-from compensator.model.effects.seen import Seen, digits, quantity, rounded, signed
+from compensator.model.effects.seen import Seen, digits, quantity, signed
 from compensator.model.effects.signals import Signals
 
 #: Curves by name: of one sample, or of a record.
@@ -30,8 +30,6 @@ CURVES: Mapping[str, Callable[[Any], Any]] = {
     "power 5/3": lambda c: abs(c) ** (5.0 / 3.0),
 }
 _WORDS = {"linear": "", "square": ", squared", "abs": ", as a magnitude", "power 5/3": ", to the power 5/3"}
-#: The largest deformation in the data is given beside that at rest where they differ by more than this share.
-DIFFERS = 0.25
 _POWERS = {"linear": "", "square": "2", "abs": "", "power 5/3": "_5_3"}
 
 
@@ -58,8 +56,8 @@ class Input(BankEffect, Effect):
     def explain(self, seen: Seen) -> str:
         delay = f" and a dead time of {digits(self.delay_min)} min" if self.delay_min else ""
         return (
-            f"{self.size_words(seen)}. The base model lacks this input{_WORDS[self.curve]}, which acts with "
-            f"{self.lag_words()}{delay}; the extended model needs the channel."
+            f"{self.size_words(seen)}: the base model lacks this input{_WORDS[self.curve]}, which acts with "
+            f"{self.lag_words()}{delay}. The extended model needs the channel."
         )
 
     def lag_words(self) -> str:
@@ -68,16 +66,14 @@ class Input(BankEffect, Effect):
         return f"lags of {lags} min" if len(self.tau_min) > 1 else f"a lag of {lags} min"
 
     def size_words(self, seen: Seen) -> str:
-        """Return the response at rest to the channel's range in words, and what was seen of it if that was less."""
+        """Return the response at rest to the channel's range in words, and what was seen of it."""
         assert seen.channel is not None
         (low, high), curve = seen.channel.ends(self.channel), CURVES[self.curve]
         size_um = math.fsum(self.gain) * (curve(high) - curve(low))
         to = quantity(high, self.channel)
         at = f"at {to}" if low == 0.0 else f"from {quantity(low, self.channel)} to {to}"
-        size = f"{signed(size_um)} µm {at} of {self.channel}, half of it after {digits(self.half_time_min())} min"
-        added = max(seen.added_um.low, seen.added_um.high, key=abs)
-        differs = abs(added - size_um) > DIFFERS * abs(size_um)
-        return size + (f" ({seen.words.lower()} in the data)" if differs else f" ({rounded(seen.rms_um)} µm rms)")
+        half = digits(self.half_time_min())
+        return f"{signed(size_um)} µm {at} of {self.channel}, half of it after {half} min. In the data {seen.size}"
 
     def half_time_min(self) -> float:
         """Return the time to half of a step's response at rest, min."""

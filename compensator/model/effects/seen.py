@@ -103,10 +103,15 @@ class Seen:
         >>> Seen(rms_um=2.0, added_um=Range(-3.12, 8.3)).words
         '−3.1 to +8.3 µm (2.0 µm rms)'
         """
+        return f"{self.size[0].upper()}{self.size[1:]}"
+
+    @property
+    def size(self) -> str:
+        """The same within a sentence."""
         low, high = self.added_um.low, self.added_um.high
         most = max(low, high, key=abs)
         one_sided = low * high >= 0.0 or min(abs(low), abs(high)) < _NO_SIZE * abs(most)
-        size = f"Up to {signed(most)}" if one_sided else f"{signed(low)} to {signed(high)}"
+        size = f"up to {signed(most)}" if one_sided else f"{signed(low)} to {signed(high)}"
         return f"{size} µm ({rounded(self.rms_um)} µm rms)"
 
     @property
