@@ -8,17 +8,15 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.diagnose.ceiling import ceiling, falls_short, remainder
 from compensator.diagnose.outcome import Diagnosis, FoundEffect
 from compensator.diagnose.summary import (
     SHOWN,
-    ceiling_words,
     error_table,
     explanation,
-    falls_short,
     figures,
     name,
     parameter_table,
-    remainder_words,
     rivals,
     verdict,
 )
@@ -67,11 +65,10 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
     """
     time = TimeAxis.of(diagnosis)
     found = figures(diagnosis)
-    blocks: list[Block] = [waterfall(diagnosis), Words(title="Ceiling", lines=ceiling_words(found))]
+    blocks: list[Block] = [waterfall(diagnosis), ceiling(found)]
     blocks += [_before_and_after(time, diagnosis), error_table(diagnosis)]
     blocks += [_effect(time, diagnosis, effect) for effect in diagnosis.effects]
-    if lines := remainder_words(found):
-        blocks.append(Section(title="Remainder", blocks=[Words(title="What it is", lines=lines)]))
+    blocks += remainder(found)
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
@@ -98,7 +95,7 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
 
 
 def _effect(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Section:
-    blocks: list[Block] = [explanation(effect), _effect_figure(time, diagnosis, effect)]
+    blocks: list[Block] = [explanation(diagnosis, effect), _effect_figure(time, diagnosis, effect)]
     blocks.append(parameter_table(effect, count=SHOWN))
     count = len(effect.named)
     if count > SHOWN:

@@ -45,7 +45,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
     if _differs(named, bars[-1].last):
         add("other effects these searches found", named, _EFFECT)
     if len(bars) > 1:
-        bars.append(Bar("with the named effects", f"{named:.2f} µm", 0.0, named, _LEFT))
+        bars.append(Bar("with the effects", f"{named:.2f} µm", 0.0, named, _LEFT))
     if diagnosis.remainder is not None:
         add("remainder (explains nothing)", after, _REMAINDER, hatched=True)
         bars.append(Bar("with the remainder", f"{after:.2f} µm", 0.0, after, _LEFT))

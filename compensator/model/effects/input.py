@@ -71,7 +71,7 @@ class Input(BankEffect, Effect):
         (low, high), curve = seen.channel.ends(self.channel), CURVES[self.curve]
         size_um = math.fsum(self.gain) * (curve(high) - curve(low))
         to = quantity(high, self.channel)
-        at = f"at {to}" if low == 0.0 else f"from {quantity(low, self.channel)} to {to}"
+        at = f"at {to}" if low == 0.0 else f"from {digits(low)} to {to}"
         half = digits(self.half_time_min())
         return f"{signed(size_um)} µm {at} of {self.channel}, half of it after {half} min. In the data {seen.size}"
 

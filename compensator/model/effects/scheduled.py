@@ -55,7 +55,7 @@ class Scheduled(Effect):
         change = self.named({"change": getattr(self, "change", 0.0)})["change"] * (high - low) / self.span
         return (
             f"{seen.words}: the {self.what} of the {self.path}{seen.path_words} changes by {digits(100.0 * change)} % "
-            f"from {quantity(low, self.channel)} to {quantity(high, self.channel)} of {self.channel}. The channel "
+            f"from {digits(low)} to {quantity(high, self.channel)} of {self.channel}. The channel "
             "changes how much heat takes this path."
         )
 
