@@ -41,9 +41,9 @@ SEEN = Seen(rms_um=31.0, added_um=Range(-71.4, 0.2), channel=Range(2.0, 5000.0))
 
 def test_a_size_at_the_speed_that_was_seen_and_its_half_time() -> None:
     words = at_speed().explain(SEEN)
-    assert words.startswith("−84 µm at 5000 rpm of spindle_rpm, half of it after 114 min.")
+    assert words.startswith("−84 µm at 5000 rpm of spindle_rpm, half of it after 114 min; ")
     # A size at rest is more than the data showed where the speed did not last: both are given.
-    assert "In the data up to −71 µm (31 µm rms)" in words
+    assert "in the data up to −71 µm (31 µm rms)" in words
     assert words.index("a lag of 164 min") > words.index("−84 µm")
 
 

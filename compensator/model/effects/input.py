@@ -29,7 +29,7 @@ CURVES: Mapping[str, Callable[[Any], Any]] = {
     "abs": abs,
     "power 5/3": lambda c: abs(c) ** (5.0 / 3.0),
 }
-_WORDS = {"linear": "", "square": ", squared", "abs": ", as a magnitude", "power 5/3": ", to the power 5/3"}
+_WORDS = {"linear": "", "square": " by its square", "abs": " by its magnitude", "power 5/3": " by its power 5/3"}
 _POWERS = {"linear": "", "square": "2", "abs": "", "power 5/3": "_5_3"}
 
 
@@ -56,8 +56,8 @@ class Input(BankEffect, Effect):
     def explain(self, seen: Seen) -> str:
         delay = f" and a dead time of {digits(self.delay_min)} min" if self.delay_min else ""
         return (
-            f"{self.size_words(seen)}: the base model lacks this input{_WORDS[self.curve]}, which acts with "
-            f"{self.lag_words()}{delay}. The extended model needs the channel."
+            f"{self.size_words(seen)}. The base model lacks this input, which acts{_WORDS[self.curve]} with "
+            f"{self.lag_words()}{delay}; the extended model needs the channel."
         )
 
     def lag_words(self) -> str:
@@ -73,7 +73,7 @@ class Input(BankEffect, Effect):
         to = quantity(high, self.channel)
         at = f"at {to}" if low == 0.0 else f"from {digits(low)} to {to}"
         half = digits(self.half_time_min())
-        return f"{signed(size_um)} µm {at} of {self.channel}, half of it after {half} min. In the data {seen.size}"
+        return f"{signed(size_um)} µm {at} of {self.channel}, half of it after {half} min; in the data {seen.size}"
 
     def half_time_min(self) -> float:
         """Return the time to half of a step's response at rest, min."""
