@@ -70,7 +70,7 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
         return [*lines, "The channels can explain next to nothing."]
     lines.append(share)
     if found["effects"] and (named := named_rms(found)) < _LESS * best["rms_um"]:
-        lines.append(f"They leave less, {named:.2f} µm rms: an effect need not be linear in the channels.")
+        lines.append(f"They leave less, {named:.2f} µm rms: not every effect is a linear use of the channels.")
     if falls_short(found):
         rest = "the remainder corrects some of the rest" if found.get("remainder") else "no remainder was added"
         lines.append(

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from compensator.codes import ModelWarning, Remark
-from compensator.diagnose.ceiling import ceiling, explained, named_rms, remainder
+from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_rms, remainder
 from compensator.diagnose.fit import Term
 from compensator.diagnose.outcome import Ceiling, Diagnosis, FoundEffect, Remainder
 from compensator.display import Table, Words, warnings_of, with_std
@@ -25,6 +25,8 @@ _DOES_NOT_HOLD = (
     "The model lacks an effect; the best explanation found increases the error on held-out data, so the model was "
     "left unchanged."
 )
+#: The verdict if the effects found explain clearly less than the channels can, whatever a remainder corrects.
+_FALLS_SHORT = "Some of the missing effects were found; the channels show more than these explain."
 
 #: Parameters of an effect that are shown unfolded.
 SHOWN = 6
@@ -101,6 +103,8 @@ def verdict(found: Mapping[str, Any]) -> str:
     words = _VERDICTS[found["verdict"]]
     if ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
+    elif found["verdict"] == "explained" and falls_short(found):
+        words = _FALLS_SHORT
     before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
     share = f" {sentence}" if (sentence := explained(found)) else ""
     with_remainder = f", {after:.2f} with the remainder" if found.get("remainder") else ""
@@ -133,7 +137,7 @@ def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | 
     yield error_table(diagnosis)
     yield ceiling(found)
     for i, effect in enumerate(diagnosis.effects, start=1):
-        yield explanation(diagnosis, effect, title=f"{i}. {name(effect)}")
+        yield explanation(diagnosis, effect, title=f"{i}. {name(effect).replace(': ', ' ')}")
         yield parameter_table(effect, count=SHOWN)
         if effect.rivals:
             yield rivals(effect)

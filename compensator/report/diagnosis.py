@@ -115,7 +115,8 @@ def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) ->
             title="", x_label="time, h", y_label=unit, lines=(time.line(label, values),), edges=time.unnamed, height=1.9
         )
         below = (panel,)
-    note = "Residual of the fit to all data, with every other effect removed."
+    others = "every other effect and the remainder" if diagnosis.remainder else "every other effect"
+    note = f"Residual of the fit to all data, with {others} removed."
     return Figure(
         title=f"{name(effect)} in the residual",
         x_label="time, h",
