@@ -147,9 +147,7 @@ class _Problem:
     def _rest(self, x: Vector) -> Rest:
         slow_um, tau_min, start_um = np.exp(x[:3]).tolist()
         typical = self.points.typical_rest()
-        return dataclasses.replace(
-            without_own_error(typical), slow_um=slow_um, tau_min=tau_min, start_um=start_um
-        )
+        return dataclasses.replace(without_own_error(typical), slow_um=slow_um, tau_min=tau_min, start_um=start_um)
 
     def _white(self, x: Vector) -> tuple[Matrix, float, int]:
         """Return target, random columns and channels, whitened; the log determinant; how many are random."""

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import Indices, Vector
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.evidence import Evidence, evidence_of
@@ -25,10 +25,12 @@ from compensator.diagnose.outcome import (
     Diagnosis,
     FoundEffect,
     Remainder,
+    Step,
     Verdict,
     described,
     rivals_of,
     rms_of,
+    seen_of,
     warnings_of,
 )
 from compensator.model.effects import Effect
@@ -36,6 +38,8 @@ from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
 
+#: Kind, path and channel.
+Place = tuple[str, str, str]
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
 #: How the errors are measured where nothing was known of the paths.
@@ -69,7 +73,7 @@ def diagnose(
     progress(0, FOLDS + 1)
     found = findings_of(evidence)
     effects = _effects(found)
-    held_out = _held_out(found, progress, executor_map)
+    held_out = _held_out(found, [effect.place for effect in effects], progress, executor_map)
     # A base that is far off is replaced by the most probable one even where every block holds an event of its own.
     helps = evidence.free_paths or rms_of(held_out.whole) <= rms_of(held_out.nothing)
     extended, remarks = _extended(model, found, effects) if helps else (model, ())
@@ -91,9 +95,11 @@ def diagnose(
         residual_before=np.where(evidence.used, found.search.left(found.selection.before) - found.paths, np.nan),
         residual_after=np.where(evidence.used, left, np.nan),
         held_out_before=held_out.nothing,
+        held_out_named=held_out.named,
         held_out_after=held_out.whole,
         tried=_ranked(found),
         warnings=(*remarks, *warnings_of(effects, held_out.nothing, held_out.whole)),
+        steps=held_out.steps,
         remainder=remainder,
         ceiling=_ceiling(held_out),
     )
@@ -107,9 +113,10 @@ class _HeldOut:
     named: Vector
     whole: Vector
     ceiling: Vector
+    steps: tuple[Step, ...]
 
 
-def _held_out(found: Findings, progress: Progress, executor_map: ExecutorMap) -> _HeldOut:
+def _held_out(found: Findings, places: Sequence[Place], progress: Progress, executor_map: ExecutorMap) -> _HeldOut:
     """Repeat the search without each block; of two choices of nuisances, that which leaves less before."""
     evidence = found.search.evidence
     progress(1, FOLDS + 1)
@@ -118,21 +125,52 @@ def _held_out(found: Findings, progress: Progress, executor_map: ExecutorMap) ->
     timed = [t.effect for t in found.terms if not t.effect.deployable]
     only_unobserved = bool(found.terms) and not any(term.hypothesis.effect.observed for term in found.terms)
     unobserved = any(not effect.observed for effect in timed) and not only_unobserved
-    predicted = executor_map(partial(_predictions, unobserved=unobserved), views)
-    left = np.full((2, 4, evidence.used.size), np.nan)
+    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved), views)
+    left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
+    searches = np.zeros(len(places), dtype=int)
     for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
         progress(done, FOLDS + 1)
+        searches += several.has
         for choice in (0, 1):
-            for i, one in enumerate(several):
+            for i, one in enumerate(several.added):
                 left[choice, i, block] = seen.left(evidence.residual, one, at_rest=choice == 0)[block]
     best = min((0, 1), key=lambda choice: rms_of(left[choice, 0]))
-    return _HeldOut(nothing=left[best, 0], named=left[best, 1], whole=left[best, 2], ceiling=left[best, 3])
+    nothing, named, whole, ceiling, *steps = left[best]
+    return _HeldOut(
+        nothing=nothing,
+        named=named,
+        whole=whole,
+        ceiling=ceiling,
+        steps=tuple(Step(rms_um=rms_of(s), searches=n) for s, n in zip(steps, searches.tolist(), strict=True)),
+    )
 
 
-def _predictions(seen: Evidence, *, unobserved: bool) -> tuple[Vector, Vector, Vector, Vector]:
-    """Search in a part of the evidence; return what is predicted on every sample of all, µm."""
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class _Predictions:
+    """What a search in a part of the evidence predicts on every sample of all.
+
+    Parameters
+    ----------
+    added : tuple of numpy.ndarray, shape (n,)
+        Of nothing, the named effects, effects and remainder, all channels; of the first place, the first two, …, µm.
+    has : numpy.ndarray of int, shape (places,)
+        1 where it found an effect of that place.
+    """
+
+    added: tuple[Vector, ...]
+    has: Indices
+
+
+def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool) -> _Predictions:
     found = findings_of(seen, unobserved=unobserved)
-    return found.paths, found.named, found.whole, found.ceiling
+    steps, total = [], found.own_paths
+    for place in places:
+        total = sum(
+            (r for t, r in zip(found.terms, found.responses, strict=True) if t.hypothesis.place == place), total
+        )
+        steps.append(total)
+    has = np.array([any(term.hypothesis.place == place for term in found.terms) for place in places], dtype=int)
+    return _Predictions(added=(found.paths, found.named, found.whole, found.ceiling, *steps), has=has)
 
 
 def _effects(found: Findings) -> tuple[FoundEffect, ...]:
@@ -152,7 +190,7 @@ def _effects(found: Findings) -> tuple[FoundEffect, ...]:
         effects.append(
             FoundEffect(
                 term=term,
-                effect=described(term, std, signal[evidence.used]),
+                effect=described(term, std, signal, evidence),
                 rms_before_um=rms_without([*found.responses[:i], *found.responses[i + 1 :]]),
                 rms_after_um=after,
                 signal=signal,
@@ -176,7 +214,8 @@ def _extended(
         base = dataclasses.replace(base, held_out_rms_um=None)
         remarks = (Remark(ModelWarning.FITTED_ANEW, _refitted(model, base)),)
     if remainder is not None:
-        deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(float(np.std(found.whole)))))
+        seen = seen_of(remainder, found.whole - found.named, evidence)
+        deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(seen)))
     if not deployed and base is model:
         return model, ()
     kept_out = [effect.signal[evidence.used] for effect in effects if not effect.effect.deployable]

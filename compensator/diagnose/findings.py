@@ -63,8 +63,12 @@ class Findings:
     @property
     def named(self) -> Vector:
         """What the named effects add, µm; with the paths, where nothing was known of them."""
-        paths = self.refitted.added if self.refitted else np.zeros(self.ceiling.size)
-        return np.asarray(sum(self.responses, paths))
+        return np.asarray(sum(self.responses, self.own_paths))
+
+    @property
+    def own_paths(self) -> Vector:
+        """What the base's paths add, fitted together with the named effects; 0 where they are kept, µm."""
+        return self.refitted.added if self.refitted else np.zeros(self.ceiling.size)
 
     @property
     def whole(self) -> Vector:

@@ -14,6 +14,7 @@ from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
 from compensator.model.effects import Effect
+from compensator.model.effects.seen import Range, Seen
 from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import ThermalModel
 
@@ -163,6 +164,22 @@ class Ceiling:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """A step of the error on held-out data: what is left with an effect and those that remove more.
+
+    Parameters
+    ----------
+    rms_um : float
+        Residual on data that took no part, µm.
+    searches : int
+        How many of the searches without a block found the effect.
+    """
+
+    rms_um: float
+    searches: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnosis:
     """What a model lacks.
 
@@ -180,8 +197,10 @@ class Diagnosis:
         Residual and signals.
     residual_before, residual_after : numpy.ndarray, shape (n,)
         Of the fit to everything, nuisances projected out, µm; NaN where y is missing.
-    held_out_before, held_out_after : numpy.ndarray, shape (n,)
-        The same, each block by a search that did not see it.
+    held_out_before, held_out_named, held_out_after : numpy.ndarray, shape (n,)
+        Before, with the named effects, and with the remainder, too, each block by a search that did not see it.
+    steps : tuple of Step
+        The error on held-out data with the first effect, the first two, and so on.
     tried : tuple of (str, float)
         Explanations of the largest effect and the rms that each leaves, µm, best first.
     warnings : tuple of Remark
@@ -189,7 +208,7 @@ class Diagnosis:
     remainder : Remainder, optional
         What the channels explain and no named effect does; None where there is none.
     ceiling : Ceiling, optional
-        What all channels could explain; None where it was not computed.
+        What all channels could explain; None where no linear use of them leaves less than the base model.
     """
 
     verdict: Verdict
@@ -200,9 +219,11 @@ class Diagnosis:
     residual_before: Vector
     residual_after: Vector
     held_out_before: Vector
+    held_out_named: Vector
     held_out_after: Vector
     tried: tuple[tuple[str, float], ...]
     warnings: tuple[Remark, ...]
+    steps: tuple[Step, ...] = ()
     remainder: Remainder | None = None
     ceiling: Ceiling | None = None
 
@@ -212,8 +233,13 @@ class Diagnosis:
         return self._scores(self.held_out_before)
 
     @property
+    def named(self) -> Scores:
+        """The same with every named effect."""
+        return self._scores(self.held_out_named)
+
+    @property
     def after(self) -> Scores:
-        """The same with every effect."""
+        """The same with every effect and the remainder."""
         return self._scores(self.held_out_after)
 
     @property
@@ -231,10 +257,33 @@ def rms_of(values: Vector) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def described(term: Term, std: Mapping[str, float], signal: Vector) -> Effect:
-    """Return the effect of a term with its standard errors and, from what it adds to y, an explanation."""
-    effect = term.effect
-    return dataclasses.replace(effect, std=std, explanation=effect.explain(float(np.std(signal))))
+def described(term: Term, std: Mapping[str, float], signal: Vector, evidence: Evidence) -> Effect:
+    """Return the effect of a term with its standard errors and, from what was seen of it, an explanation.
+
+    Parameters
+    ----------
+    term : Term
+        Hypothesis and values.
+    std : mapping of str to float
+        Standard error of each parameter.
+    signal : numpy.ndarray, shape (n,)
+        What it adds to y, µm.
+    evidence : Evidence
+        Samples used, channels and paths.
+    """
+    effect = dataclasses.replace(term.effect, std=std)
+    return dataclasses.replace(effect, explanation=effect.explain(seen_of(effect, signal, evidence)))
+
+
+def seen_of(effect: Effect, signal: Vector, evidence: Evidence) -> Seen:
+    """Return the ranges of an effect, of the channel that it acts by and of the path that it acts on."""
+    records, used = evidence.signals, signal[evidence.used]
+    return Seen(
+        rms_um=float(np.std(used)),
+        added_um=Range(float(np.min(used)), float(np.max(used))),
+        channel=Range.of([record.channels[effect.channel] for record in records]) if effect.channel else None,
+        path_um=Range.of([record.share(effect.path) for record in records]) if effect.path else None,
+    )
 
 
 def rivals_of(term: Term, others: Iterable[tuple[Term, float]], after_um: float) -> tuple[Rival, ...]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from compensator.codes import ModelWarning, Remark
+from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_rms, remainder
 from compensator.diagnose.fit import Term
 from compensator.diagnose.outcome import Ceiling, Diagnosis, FoundEffect, Remainder
 from compensator.display import Table, Words, warnings_of, with_std
@@ -24,6 +25,8 @@ _DOES_NOT_HOLD = (
     "The model lacks an effect; the best explanation found increases the error on held-out data, so the model was "
     "left unchanged."
 )
+#: The verdict if the effects found explain clearly less than the channels can, whatever a remainder corrects.
+_FALLS_SHORT = "Some of the missing effects were found; the channels show more than these explain."
 
 #: Parameters of an effect that are shown unfolded.
 SHOWN = 6
@@ -100,12 +103,16 @@ def verdict(found: Mapping[str, Any]) -> str:
     words = _VERDICTS[found["verdict"]]
     if ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
+    elif found["verdict"] == "explained" and falls_short(found):
+        words = _FALLS_SHORT
     before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
+    share = f" {sentence}" if (sentence := explained(found)) else ""
+    with_remainder = f", {after:.2f} with the remainder" if found.get("remainder") else ""
     if not found["effects"]:
-        return f"{words} Residual {before:.2f} µm rms, sensor noise {noise:.2f}."
+        return f"{words} Residual {before:.2f} µm rms{with_remainder}, sensor noise {noise:.2f}.{share}"
     return (
         f"{words} {_names(found['effects'])}. On held-out data the residual was {before:.2f} µm rms without and is "
-        f"{after:.2f} µm rms with them (sensor noise {noise:.2f})."
+        f"{named_rms(found):.2f} µm rms with them{with_remainder} (sensor noise {noise:.2f}).{share}"
     )
 
 
@@ -125,47 +132,59 @@ def name(effect: FoundEffect) -> str:
 
 def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | Table | Words]:
     """Yield the content for terminal and notebook: verdict, tables, explanations, warnings and remarks."""
-    yield verdict(figures(diagnosis))
+    found = figures(diagnosis)
+    yield verdict(found)
     yield error_table(diagnosis)
+    yield ceiling(found)
     for i, effect in enumerate(diagnosis.effects, start=1):
-        yield parameter_table(effect, title=f"{i}. {name(effect)}", count=SHOWN)
-        yield explanation(effect)
+        yield explanation(diagnosis, effect, title=f"{i}. {name(effect).replace(': ', ' ')}")
+        yield parameter_table(effect, count=SHOWN)
         if effect.rivals:
             yield rivals(effect)
-    if beyond := beyond_effects(diagnosis):
-        yield Words(title="Remainder and ceiling", lines=beyond)
+    yield from remainder(found)
     yield from warnings_of(diagnosis.warnings)
     yield from warnings_of(remarks, "Remarks on the data")
 
 
 def error_table(diagnosis: Diagnosis) -> Table:
-    """Return the errors on held-out data of the base model and of the extended model."""
+    """Return the errors on held-out data before and after, and what they are compared with."""
+    rows = [["base model", *diagnosis.before.cells()]]
+    if len(diagnosis.effects) > 1:
+        pairs = zip(diagnosis.effects, diagnosis.steps, strict=False)
+        rows += [[f"+ {name(effect)}", f"{step.rms_um:.2f}", "", ""] for effect, step in pairs]
+    if diagnosis.effects:
+        rows.append(["with the effects", *(diagnosis.named if diagnosis.remainder else diagnosis.after).cells()])
+    if diagnosis.remainder:
+        rows.append(["with the remainder", *diagnosis.after.cells()])
+    if diagnosis.ceiling:
+        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
     return Table(
         title="Errors on held-out data",
         head=["", *SCORE_HEAD],
-        rows=[
-            ["base model", *diagnosis.before.cells()],
-            ["extended model", *diagnosis.after.cells()],
-            ["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""],
-        ],
+        rows=[*rows, ["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""]],
         note=f"Held-out data: {diagnosis.held_out}.",
     )
 
 
-def parameter_table(effect: FoundEffect, *, title: str = "", count: int | None = None) -> Table:
+def parameter_table(effect: FoundEffect, *, count: int | None = None) -> Table:
     """Return the parameters of an effect, or the first of them, with their standard errors."""
     rows = [[in_words(key), with_std(value, effect.std[key])] for key, value in effect.named.items()]
     if count is not None:
         rows = rows[:count]
         rows.append(["residual of the fit without the effect, µm rms", f"{effect.rms_before_um:.2f}"])
         rows.append(["residual of the fit with the effect, µm rms", f"{effect.rms_after_um:.2f}"])
-    return Table(title=title, head=["parameter", "value ± standard error"], rows=rows)
+    return Table(head=["parameter", "value ± standard error"], rows=rows)
 
 
-def explanation(effect: FoundEffect) -> Words:
-    """Return the explanation of an effect, and whether the model compensates it."""
-    deploy = "Deployed in the extended model." if effect.deployable else "Not deployable, so not in the extended model."
-    return Words(title="Explanation", lines=[effect.explanation, deploy])
+def explanation(diagnosis: Diagnosis, effect: FoundEffect, *, title: str = "Explanation") -> Words:
+    """Return the explanation of an effect, and whether the extended model has it."""
+    if effect.effect in diagnosis.model.effects:
+        deploy = "Deployed in the extended model."
+    elif effect.deployable:
+        deploy = "Not deployed: the model was left unchanged."
+    else:
+        deploy = "Not deployable, so not in the extended model."
+    return Words(title=title, lines=[effect.explanation, deploy])
 
 
 def rivals(effect: FoundEffect) -> Words:
@@ -188,21 +207,3 @@ def in_words(key: str) -> str:
         at -= 1
     unit = "".join("/" if word == "per" else _UNITS[word.rstrip("2")] + "²" * word.endswith("2") for word in words[at:])
     return f"{' '.join(words[:at]) or 'rate'}{', ' if unit else ''}{unit}"
-
-
-def beyond_effects(diagnosis: Diagnosis) -> list[str]:
-    """Return remainder and ceiling (what the channels explain beyond the named effects) as sentences."""
-    found = []
-    if (remainder := diagnosis.remainder) is not None:
-        deployed = "deployed in model.toml" if remainder.deployed else "not deployed"
-        found.append(
-            f"Remainder: a regularised linear response of {', '.join(remainder.channels)}, {deployed}. It reduces the "
-            f"error on held-out data from {remainder.rms_before_um:.2f} to {remainder.rms_after_um:.2f} µm rms, but "
-            "names no cause."
-        )
-    if (ceiling := diagnosis.ceiling) is not None:
-        found.append(
-            f"Ceiling: the best linear use of all channels leaves {ceiling.rms_um:.2f} µm rms on held-out data; the "
-            f"named effects achieve {ceiling.explained_pct:.0f} % of that reduction."
-        )
-    return found

@@ -1,12 +1,14 @@
-"""The page of a diagnosis: what the model lacks, and the error before and after."""
+"""The page of a diagnosis: what the model lacks, what each effect removes, and what the channels could explain."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.diagnose.ceiling import ceiling, falls_short, remainder
 from compensator.diagnose.outcome import Diagnosis, FoundEffect
 from compensator.diagnose.summary import (
     SHOWN,
@@ -18,12 +20,13 @@ from compensator.diagnose.summary import (
     rivals,
     verdict,
 )
+from compensator.model.effects.seen import unit_of_channel
 from compensator.model.thermal_model import ThermalModel
+from compensator.report.held_out import TimeAxis, waterfall
 from compensator.report.page import (
     Block,
     Details,
     Figure,
-    Line,
     Page,
     Section,
     Table,
@@ -34,6 +37,18 @@ from compensator.report.page import (
 
 #: Tone of each verdict.
 TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
+
+
+def tone_of(found: Mapping[str, Any]) -> Tone:
+    """Return the tone of a diagnosis: that of its verdict, and no good one where the named effects fall short.
+
+    Parameters
+    ----------
+    found : mapping
+        Content of `diagnosis.json`.
+    """
+    tone = TONES[found["verdict"]]
+    return "warn" if tone == "good" and found["effects"] and falls_short(found) else tone
 
 
 def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Page:
@@ -48,56 +63,85 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
     remarks : sequence of str
         Remarks on the data.
     """
-    t = _hours(diagnosis)
-    blocks: list[Block] = [_before_and_after(t, diagnosis), error_table(diagnosis)]
-    blocks += [_effect(t, effect) for effect in diagnosis.effects]
+    time = TimeAxis.of(diagnosis)
+    found = figures(diagnosis)
+    blocks: list[Block] = [waterfall(diagnosis), ceiling(found)]
+    blocks += [_before_and_after(time, diagnosis), error_table(diagnosis)]
+    blocks += [_effect(time, diagnosis, effect) for effect in diagnosis.effects]
+    blocks += remainder(found)
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
-    blocks.append(_details(t, diagnosis, model, remarks))
+    blocks.append(_details(time, diagnosis, model, remarks))
     title = f"Diagnosis: what {model.name} lacks"
-    return Page(title=title, verdict=verdict(figures(diagnosis)), blocks=blocks, tone=TONES[diagnosis.verdict])
+    return Page(title=title, verdict=verdict(found), blocks=blocks, tone=tone_of(found))
 
 
-def _hours(diagnosis: Diagnosis) -> Vector:
-    """Return a time axis in hours, the runs one after another."""
-    period_h = diagnosis.model.period_s / 3600.0
-    return np.asarray(np.arange(diagnosis.residual_before.size) * period_h)
-
-
-def _before_and_after(t: Vector, diagnosis: Diagnosis) -> Figure:
+def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
     count = len(diagnosis.effects)
-    found = name(diagnosis.effects[0]) if count == 1 else f"all {count} effects" if count else "nothing to add"
+    parts = [name(diagnosis.effects[0]) if count == 1 else f"all {count} effects"] if count else []
+    parts += ["the remainder"] if diagnosis.remainder else []
+    lines = [time.line("before" if parts else "base model", diagnosis.held_out_before)]
+    if parts:
+        lines.append(time.line(f"after: {' and '.join(parts)}", diagnosis.held_out_after))
     return Figure(
-        title="Residual before and after the extension",
+        title=f"Residual{' before and after the extension' if parts else ''} on held-out data",
         x_label="time, h",
         y_label="residual, µm",
-        lines=(
-            Line("before", t, diagnosis.held_out_before),
-            Line(f"after: {found}", t, diagnosis.held_out_after),
-        ),
-        note="Measured − predicted on held-out data: each block was left out of the search that predicts it.",
+        lines=tuple(lines),
+        edges=time.edges,
+        note="Measured − predicted: each block was left out of the search that predicts it." + time.note,
     )
 
 
-def _effect(t: Vector, effect: FoundEffect) -> Section:
-    blocks: list[Block] = [
-        explanation(effect),
-        Figure(
-            title=f"Contribution: {name(effect)}",
-            x_label="time, h",
-            y_label="Y, µm",
-            lines=(Line("effect", t, effect.signal),),
-            height=2.6,
-        ),
-        parameter_table(effect, count=SHOWN),
-    ]
+def _effect(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Section:
+    blocks: list[Block] = [explanation(diagnosis, effect), _effect_figure(time, diagnosis, effect)]
+    blocks.append(parameter_table(effect, count=SHOWN))
     count = len(effect.named)
     if count > SHOWN:
         blocks.append(Details(title=f"All {count} parameters", blocks=[parameter_table(effect)]))
     if effect.rivals:
         blocks.append(rivals(effect))
     return Section(title=name(effect), blocks=blocks)
+
+
+def _effect_figure(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Figure:
+    """Show the residual without the effect, the effect over it, and below it what it acts by."""
+    cause = _cause(diagnosis, effect)
+    below: tuple[Figure, ...] = ()
+    if cause is not None:
+        label, unit, values = cause
+        panel = Figure(
+            title="", x_label="time, h", y_label=unit, lines=(time.line(label, values),), edges=time.unnamed, height=1.9
+        )
+        below = (panel,)
+    others = "every other effect and the remainder" if diagnosis.remainder else "every other effect"
+    note = f"Residual of the fit to all data, with {others} removed."
+    return Figure(
+        title=f"{name(effect)} in the residual",
+        x_label="time, h",
+        y_label="Y, µm",
+        lines=(
+            time.line("residual without it", diagnosis.residual_after + effect.signal, weight=0.9),
+            time.line("effect", effect.signal, weight=2.2),
+        ),
+        edges=time.edges,
+        below=below,
+        note=f"{note} {'' if cause else 'No channel shows its cause.'}{time.note}".strip(),
+    )
+
+
+def _cause(diagnosis: Diagnosis, effect: FoundEffect) -> tuple[str, str, Vector] | None:
+    """Return what an effect acts by, its unit and its course: its channel, or what drives its path."""
+    records = diagnosis.evidence.signals
+    if (channel := effect.channel) is not None:
+        return channel, unit_of_channel(channel), np.concatenate([record.channels[channel] for record in records])
+    if (path := effect.path) is None:
+        return None
+    source = np.concatenate([record.source(path) for record in records])
+    if path == "TDTF":
+        return "AT, change from the start", "K", source
+    return ("heat, estimated", "W", source) if diagnosis.model.ttf else ("T_Q − AT", "K", source)
 
 
 def _ranking(diagnosis: Diagnosis) -> Details:
@@ -110,7 +154,7 @@ def _ranking(diagnosis: Diagnosis) -> Details:
     )
 
 
-def _details(t: Vector, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Details:
+def _details(time: TimeAxis, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Details:
     rows = [["extended model, SHA-256", model.sha256]]
     rows += [
         [f"data: {d.get('file') or d['table']}", d["sha256"]]
@@ -120,7 +164,8 @@ def _details(t: Vector, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequ
         title="Residual of the fit to all data",
         x_label="time, h",
         y_label="residual, µm",
-        lines=(Line("before", t, diagnosis.residual_before), Line("after", t, diagnosis.residual_after)),
+        lines=(time.line("before", diagnosis.residual_before), time.line("after", diagnosis.residual_after)),
+        edges=time.runs,
         height=2.6,
     )
     blocks: list[Block] = [figure, Table(head=["", ""], rows=rows)]

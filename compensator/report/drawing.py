@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from compensator.report.figure import Figure, Line, described, thinned
+from compensator.report.figure import Bar, Edges, Figure, Line, described, thinned
 
 #: Placeholder colours of text and axes, of grid and spans, and of curves; the page's CSS variables replace them.
 INK, GRID = "#010101", "#020202"
@@ -39,6 +39,8 @@ _DASHES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)))
 _DAY_S = 86400.0
 #: Narrowest piece of a strip, as a share of the figure: an event of one minute in a year remains visible.
 _NARROWEST = 1.0 / 500.0
+#: Longest line of a bar's name, letters.
+_NAME_LETTERS = 34
 #: Width of a letter, of a legend's sample line, and of the margin left of the axes, inches.
 _LETTER_IN, _SAMPLE_IN, _LEFT_IN = 0.09, 0.65, 0.8
 
@@ -56,12 +58,19 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
         Width, inches; smaller for figures side by side, so that the text stays readable.
     """
     with mpl.rc_context(_STYLE | {"svg.hashsalt": figure.title}):
-        canvas = Canvas(figsize=(width, figure.height), layout="constrained")
-        axes = canvas.subplots()
-        _draw(axes, figure)
-        if figure.strips:
-            _strips(axes, figure)
-        _legend(axes, width)
+        panels = (figure, *figure.below)
+        heights = [panel.height for panel in panels]
+        canvas = Canvas(figsize=(width, figure.full_height), layout="constrained")
+        rows = canvas.subplots(len(panels), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+        drawn = 0
+        for axes, panel in zip(rows, panels, strict=True):
+            drawn = _draw(axes, panel, drawn)
+            axes.label_outer()
+            if panel.strips:
+                _strips(axes, panel)
+            if panel.bars:
+                _bars(axes, panel.bars)
+            _legend(axes, width)
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
@@ -75,7 +84,8 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
     return f"{opening}><desc>{html.escape(described(figure))}</desc>{rest}"
 
 
-def _draw(axes: Axes, figure: Figure) -> None:
+def _draw(axes: Axes, figure: Figure, drawn: int) -> int:
+    """Draw a panel below others with so many curves; return how many there are then."""
     named: set[str] = set()
     unit = _DAY_S if figure.clock else 1.0
     for span in figure.spans:
@@ -87,8 +97,8 @@ def _draw(axes: Axes, figure: Figure) -> None:
         axes.plot(np.cos(angle), np.sin(angle), color=INK, linewidth=0.8)
         axes.set_aspect("equal", adjustable="datalim")
     for i, line in enumerate(figure.lines):
-        _curve(axes, line, i, figure)
-    drawn = len(figure.lines)
+        _curve(axes, line, i, drawn + i, figure)
+    drawn += len(figure.lines)
     for marks in figure.marks:
         hollow: dict[str, Any] = {"markerfacecolor": "none"} if marks.marker == "o" else {}
         colour = LINES[drawn % len(LINES)]
@@ -102,12 +112,14 @@ def _draw(axes: Axes, figure: Figure) -> None:
         axes.axhline(0.0, color=INK, linewidth=0.8)
     for limit in figure.limits:
         axes.axhline(limit, color=INK, linewidth=0.8, linestyle="--")
+    _edges(axes, figure.edges, unit)
     # A logarithmic axis without a positive value cannot be drawn.
     if figure.x_log and np.isfinite(axes.dataLim.minposx):
         axes.set_xscale("log")
     if figure.y_log and np.isfinite(axes.dataLim.minposy):
         axes.set_yscale("log")
     _axes(axes, figure, unit)
+    return drawn
 
 
 def _axes(axes: Axes, figure: Figure, unit: float) -> None:
@@ -138,13 +150,41 @@ def _strips(axes: Axes, figure: Figure) -> None:
     axes.set_ylim(len(figure.strips) - 0.5, -0.5)
 
 
-def _curve(axes: Axes, line: Line, i: int, figure: Figure) -> None:
-    colour = LINES[i % len(LINES)]
+def _edges(axes: Axes, edges: tuple[Edges, ...], unit: float) -> None:
+    """Draw vertical lines; each kind has its own dash."""
+    for i, edge in enumerate(edges):
+        for k, x in enumerate(edge.at):
+            label = "" if k else _plain(edge.name)
+            axes.axvline(x / unit, color=INK, linewidth=1.0, linestyle=_DASHES[(i + 1) % len(_DASHES)], label=label)
+
+
+def _bars(axes: Axes, bars: tuple[Bar, ...]) -> None:
+    """Draw bars from top to bottom, names and values at the left, where nothing covers them on a small screen."""
+    for row, bar in enumerate(bars):
+        colour = LINES[bar.line % len(LINES)]
+        look: dict[str, Any] = {"facecolor": colour, "linewidth": 0}
+        if bar.hatched:
+            look = {"facecolor": "none", "edgecolor": colour, "hatch": "///", "linewidth": 1.5}
+        axes.broken_barh([(min(bar.first, bar.last), abs(bar.last - bar.first))], (row - 0.3, 0.6), **look)
+        if row + 1 < len(bars):
+            axes.vlines(bar.last, row - 0.3, row + 1.3, color=INK, linewidth=0.8)
+    names = [f"{textwrap.fill(_plain(bar.name), _NAME_LETTERS)}\n{_plain(bar.value)}" for bar in bars]
+    axes.set_yticks(range(len(bars)), names)
+    axes.set_ylim(len(bars) - 0.4, -0.6)
+    axes.set_xlim(left=0.0)
+    axes.grid(visible=False, axis="y")
+    axes.set_axisbelow(True)
+    axes.set_ylabel("")
+
+
+def _curve(axes: Axes, line: Line, i: int, number: int, figure: Figure) -> None:
+    """Draw the i-th curve of a panel with a dash of its own, in the colour of its number on the figure."""
+    colour = LINES[number % len(LINES)]
     # The sixth curve has the colour of the first, but another dash.
     dash = _DASHES[(i + i // len(LINES)) % len(_DASHES)]
     x = line.x / _DAY_S if figure.clock else line.x
     keep = thinned(line.x, line.y, x_log=figure.x_log)
-    axes.plot(x[keep], line.y[keep], linestyle=dash, color=colour, label=_plain(line.name), linewidth=1.5)
+    axes.plot(x[keep], line.y[keep], linestyle=dash, color=colour, label=_plain(line.name), linewidth=line.weight)
     if line.band is not None:
         edges = [thinned(line.x, edge, x_log=figure.x_log) for edge in line.band]
         keep = np.unique(np.concatenate([keep, *edges]))

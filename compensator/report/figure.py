@@ -27,12 +27,15 @@ class Line:
         Points; a value that is not finite leaves a gap.
     band : tuple of numpy.ndarray, optional
         Lower and upper limit of its uncertainty, each of shape (n,).
+    weight : float
+        Width of the line, points.
     """
 
     name: str
     x: Vector
     y: Vector
     band: tuple[Vector, Vector] | None = field(default=None, kw_only=True)
+    weight: float = field(default=1.5, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +85,38 @@ class Strip:
     line: int = 1
 
 
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Vertical lines that share an entry of the legend, such as the ends of blocks of time."""
+
+    name: str
+    at: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """A horizontal bar with its name and value at the left.
+
+    Parameters
+    ----------
+    name, value : str
+        Texts beside it, one below the other.
+    first, last : float
+        Where it begins and ends; the next bar is joined to where it ends.
+    line : int
+        Index of the line colour.
+    hatched : bool
+        Hatched instead of filled.
+    """
+
+    name: str
+    value: str
+    first: float
+    last: float
+    line: int = 0
+    hatched: bool = field(default=False, kw_only=True)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figure:
     """A figure with units on both axes.
@@ -90,8 +125,10 @@ class Figure:
     ----------
     title, x_label, y_label : str
         The labels name the unit.
-    lines, marks, stems, spans, strips : tuple
-        Content; strips are drawn alone.
+    lines, marks, stems, spans, strips, edges, bars : tuple
+        Content; strips are drawn alone, bars alone or with edges.
+    below : tuple of Figure
+        Panels below it on the same x axis, without titles and notes of their own.
     limits : tuple of float
         Dashed horizontal lines.
     x_log, y_log : bool
@@ -116,6 +153,9 @@ class Figure:
     stems: tuple[Stems, ...] = ()
     spans: tuple[Span, ...] = ()
     strips: tuple[Strip, ...] = ()
+    edges: tuple[Edges, ...] = ()
+    bars: tuple[Bar, ...] = ()
+    below: tuple[Figure, ...] = ()
     limits: tuple[float, ...] = ()
     x_log: bool = False
     y_log: bool = False
@@ -124,6 +164,11 @@ class Figure:
     x_limits: tuple[float, float] | None = None
     note: str = ""
     height: float = 3.4
+
+    @property
+    def full_height(self) -> float:
+        """Height with the panels below it, inches."""
+        return self.height + sum(panel.full_height for panel in self.below)
 
 
 def thinned(x: Vector, y: Vector, *, x_log: bool = False) -> Indices:
@@ -196,6 +241,8 @@ def described(figure: Figure) -> str:
         else:
             words.append(f"{line.name}: no values.")
     words += [f"{strip.name}: {len(strip.spans)} time(s)." for strip in figure.strips]
+    words += [f"{bar.name}: {bar.value}." for bar in figure.bars]
+    words += [f"Below: {described(panel)}" for panel in figure.below]
     return " ".join(words)
 
 

@@ -115,7 +115,7 @@ def write(path: Path, page: Page) -> Path:
         else:
             first = _first_figure(page)
             source.write_text(html_of(_excerpt(page, first)), encoding="utf-8")
-            height = _PNG_HEAD + round(_PNG_WIDTH / 9.0 * (first.height if first else 0.0))
+            height = _PNG_HEAD + round(_PNG_WIDTH / 9.0 * (first.full_height if first else 0.0))
             options = [f"--window-size={_PNG_WIDTH},{height}", f"--force-device-scale-factor={_PNG_SCALE}"]
             options += ["--hide-scrollbars", f"--screenshot={printed}"]
         _print(path, source, printed, options)

@@ -14,7 +14,7 @@ from urllib.parse import quote
 from compensator.diagnose.summary import verdict as diagnosis_verdict
 from compensator.identify.summary import verdict as calibration_verdict
 from compensator.model.model_file import HELD_OUT_KEY
-from compensator.report.diagnosis import TONES
+from compensator.report.diagnosis import tone_of as diagnosis_tone
 from compensator.report.identification import tone_of
 from compensator.report.page import Block, Cell, Link, Page, Table, Tone
 
@@ -39,7 +39,7 @@ def _diagnosis(page: Path) -> PageFile | None:
     """Return the page of a diagnosis, from its `diagnosis.json`."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         found = json.loads(page.with_name("diagnosis.json").read_text(encoding="utf-8"))
-        return PageFile(path=page, title="Diagnosis", verdict=diagnosis_verdict(found), tone=TONES[found["verdict"]])
+        return PageFile(path=page, title="Diagnosis", verdict=diagnosis_verdict(found), tone=diagnosis_tone(found))
     return None
 
 

@@ -16,8 +16,9 @@ from scipy import signal
 from compensator.audit.series import audit, summary
 from compensator.cli import main
 from compensator.demo.calibration import write_table
+from compensator.diagnose.ceiling import ceiling, remainder
 from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
-from compensator.diagnose.summary import beyond_effects, figures
+from compensator.diagnose.summary import figures, verdict
 from compensator.errors import ModelError, ServiceError
 from compensator.messages import Offset, number
 from compensator.model.effects import effect_from
@@ -25,6 +26,7 @@ from compensator.model.effects.base import filters, forms
 from compensator.model.effects.blocks import ChangeSeen
 from compensator.model.effects.hypothesis import Context, proposals
 from compensator.model.effects.regression import MOST_CHANNELS, MOST_LAGS, MOST_ROWS, Regression
+from compensator.model.effects.seen import Range, Seen
 from compensator.model.effects.signals import RecordSignals
 from compensator.model.engine import Engine, Estimate
 from compensator.model.model_file import load_model, parse_model
@@ -217,14 +219,16 @@ def test_a_change_over_gaps_streams_as_it_filters_and_is_never_0_for_missing() -
 
 
 def test_the_model_file_holds_it_to_the_bit_and_says_what_it_is(tmp_path: Path) -> None:
-    explained = dataclasses.replace(REMAINDER, explanation=REMAINDER.explain(0.9))
+    explained = dataclasses.replace(
+        REMAINDER, explanation=REMAINDER.explain(Seen(rms_um=0.9, added_um=Range(-1.2, 2.4)))
+    )
     written = write_model(tmp_path / "model.toml", dataclasses.replace(QUILL, effects=(explained,)))
     assert written.effects == (explained,)
     assert "# The remainder: a regularised linear response of several channels." in dump_model(written)
     silent = dataclasses.replace(REMAINDER, std_factor=())
     assert "std_factor" not in dump_model(with_remainder(silent)) and with_remainder(silent).effects == (silent,)
     assert explained.label == "regression of 4 channels"
-    for words in ("remainder", "coolant_degc", "0.9 µm rms", "a correction that explains nothing"):
+    for words in ("remainder", "coolant_degc", "0.90 µm rms", "−1.2 to +2.4 µm", "a correction that explains nothing"):
         assert words in explained.explanation
 
 
@@ -437,7 +441,9 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
 
     found: Any = Bare()
     assert figures(found)["remainder"] is None and figures(found)["ceiling"] is None
-    assert beyond_effects(found) == []
+    # Without a ceiling no linear use of the channels is better, and that is said; a remainder is not made up.
+    assert "No linear use" in ceiling(figures(found)).text() and remainder(figures(found)) == []
+    assert "remainder" not in verdict(figures(found))
     found.remainder = Remainder(deployed=True, channels=("t1_degc", "base_degc"), rms_before_um=1.4, rms_after_um=0.9)
     found.ceiling = Ceiling(rms_um=0.8, explained_pct=83.0)
     wanted = {
@@ -456,11 +462,13 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
         line for part in page.contents(found, ()) if isinstance(part, page.Words) for line in part.lines
     )
     for words in (
-        "t1_degc, base_degc, deployed in model.toml",
+        "response of t1_degc, base_degc: a correction that explains nothing.",
+        "Deployed in the extended model.",
         "from 1.40 to 0.90 µm",
-        "83 %",
-        "0.80 µm",
+        "leaves 0.80 µm rms",
+        "the base model 2.00",
     ):
         assert words in printed
+    assert "2.00 µm rms, 2.00 with the remainder" in verdict(in_file)
     defaults = {f.name: f.default for f in dataclasses.fields(Diagnosis)}
     assert defaults["remainder"] is None and defaults["ceiling"] is None

@@ -21,7 +21,7 @@ SCHEMES = [
 ]
 NAMES = ("demo", "identify", "diagnose", "replay", "replay-found", "replay-model", "report", "results")
 #: Axes that have no unit.
-NO_UNIT = {"correlation", "real part", "imaginary part", "state, reason", "outcome"}
+NO_UNIT = {"correlation", "model", "real part", "imaginary part", "state, reason", "outcome"}
 UNIT = re.compile(r", (h|UTC|µm|W|K|°C|samples|1/min|1/h|%)$|^(µm|K)/(W|K)( per sample)?$|^degrees$")
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from compensator.arrays import NAN, Matrix, Vector
 from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.lateness import Lateness
+from compensator.model.effects.seen import Seen
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import TomlTable
 
@@ -187,8 +188,8 @@ class Effect:
         """Return the parameters that people read, from all that are searched or linear."""
         return given
 
-    def explain(self, rms_um: float) -> str:
-        """Return one or two sentences for an engineer; `rms_um` is its share of y."""
+    def explain(self, seen: Seen) -> str:
+        """Return one or two sentences for an engineer: µm at the range that was seen, and then what acts."""
         raise NotImplementedError
 
     # ------------------------------------------------------------------ model file

@@ -13,8 +13,9 @@ import numpy as np
 from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Block, Delay, Lag, S, shifted
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, proposes
 from compensator.model.effects.lateness import Lateness
+from compensator.model.effects.seen import Seen, digits
 from compensator.model.effects.signals import RecordSignals, Signals
 
 DELAY = Free(name="delay_min", low=0.0, high=60.0, grid=(0.5, 1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 40.0), log=False)
@@ -39,8 +40,8 @@ class DelayedPath(Effect):
         moved = delay(share)
         return (lag(moved) if self.lag_min > 0.0 else moved) - share
 
-    def explain(self, rms_um: float) -> str:
-        return f"The response of the {self.path} is delayed by {self._times()} ({rms_um:.2g} µm rms)."
+    def explain(self, seen: Seen) -> str:
+        return f"{seen.words} after changes: the response of the {self.path} is late by {self._times()}."
 
     def _times(self) -> str:
         times = (("a dead time", self.delay_min), ("a lag", self.lag_min))
@@ -75,12 +76,12 @@ class DelayedSensor(DelayedPath):
         early = early + self.lag_min * np.gradient(early, period_min)
         return np.asarray(early - late)[:, None]
 
-    def explain(self, rms_um: float) -> str:
-        what = "The sensor T_Q is late" if self.form == "sensor" else "The heat reaches T_Q late,"
+    def explain(self, seen: Seen) -> str:
+        what = "the sensor T_Q is late" if self.form == "sensor" else "the heat reaches T_Q late,"
         return (
-            f"{what} by {self._times()}, so the model is wrong after each change of the heat ({rms_um:.2g} µm rms). "
-            "The extended model corrects this in real time, except for the first minutes after a change. Better: move "
-            "the sensor closer to the source, or mount it with better thermal contact."
+            f"{seen.words} after changes of the heat: {what} by {self._times()}. The extended model corrects this in "
+            "real time, except for the first minutes after a change. Better: move the sensor closer to the source, or "
+            "mount it with better thermal contact."
         )
 
 

@@ -15,7 +15,8 @@ from collections.abc import Iterator, Sequence
 
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, Lag, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered, proposes
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, numbered, proposes
+from compensator.model.effects.seen import Seen, digits
 from compensator.model.effects.signals import Signals
 
 
@@ -36,10 +37,11 @@ class MissingMode(Effect):
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         return self.gain * run[0](signals.source(self.path))
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         return (
-            f"The {self.path} lacks a mode with a time constant of {digits(self.tau_min)} min ({rms_um:.2g} µm rms): a "
-            "thermal mass that the calibration did not excite, or not for long enough."
+            f"{seen.words}: the {self.path}{seen.path_words} lacks a mode with a time constant of "
+            f"{digits(self.tau_min)} min. It is a thermal mass that the calibration did not excite, or not for long "
+            "enough."
         )
 
 
@@ -61,11 +63,11 @@ class MistimedMode(Effect):
         # (1 + τ₀ s) / (1 + τ s) − 1 = (τ₀/τ − 1) (1 − L(τ))
         return (self.instead_of_min / self.tau_min - 1.0) * (share - run[0](share))
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         return (
-            f"A mode of the {self.path} has a time constant of {digits(self.tau_min)} min instead of "
-            f"{digits(self.instead_of_min)} min ({rms_um:.2g} µm rms): heat is stored or lost differently than during "
-            "calibration."
+            f"{seen.words} after changes: a mode of the {self.path}{seen.path_words} has a time constant of "
+            f"{digits(self.tau_min)} min instead of {digits(self.instead_of_min)} min. Heat is stored or lost "
+            "differently than during calibration."
         )
 
 
@@ -97,10 +99,10 @@ class ChangedPaths(BankEffect, Effect):
         names = [name.rpartition("_")[0] for name in given]
         return {names[0]: math.fsum(self.gain), names[-1]: math.fsum(self.gain_ambient)}
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         return (
-            f"DTF and TDTF have other dynamics than during calibration ({rms_um:.2g} µm rms): a mass or a contact was "
-            "added, removed or altered."
+            f"{seen.words}: DTF and TDTF have other dynamics than during calibration. A mass or a contact was added, "
+            "removed or altered."
         )
 
 

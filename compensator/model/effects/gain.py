@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import S
-from compensator.model.effects.hypothesis import Context, Hypothesis, digits, proposes
+from compensator.model.effects.hypothesis import Context, Hypothesis, proposes
+from compensator.model.effects.seen import Seen, digits
 from compensator.model.effects.signals import Signals
 
 
@@ -23,11 +24,10 @@ class Gain(Effect):
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
         return self.change * signals.share(self.path)
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         return (
-            f"The gain of the {self.path} is {digits(abs(100.0 * self.change))} % too "
-            f"{'low' if self.change > 0 else 'high'} ({rms_um:.2g} µm rms): the machine responds differently than "
-            "during calibration."
+            f"{seen.words}: the gain of the {self.path}{seen.path_words} is {digits(abs(100.0 * self.change))} % too "
+            f"{'low' if self.change > 0 else 'high'}. The machine responds differently than during calibration."
         )
 
 

@@ -213,8 +213,3 @@ def proposals(context: Context, *, background: bool = False) -> list[Hypothesis]
 def numbered(name: str, count: int) -> tuple[str, ...]:
     """Return names of the gains of a filter bank."""
     return tuple(f"{name}_{i}" for i in range(1, count + 1))
-
-
-def digits(value: float) -> str:
-    """Return a number as an engineer writes it."""
-    return f"{value:.3g}"

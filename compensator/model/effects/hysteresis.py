@@ -13,7 +13,8 @@ import numpy as np
 
 from compensator.model.effects.base import Effect, Run, number, register, text
 from compensator.model.effects.blocks import Block, Play, S, Stick
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, proposes
+from compensator.model.effects.seen import Seen, digits
 from compensator.model.effects.signals import Signals
 
 FORMS = ("play", "stick")
@@ -35,11 +36,11 @@ class Hysteresis(Effect):
         share = signals.share(self.path)
         return run[0](share) - share
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         what = "deformation" if self.path == "all" else f"deformation from the {self.path}"
         return (
-            f"The {what} sticks and slips with a half-width of {digits(self.half_width_um)} µm ({rms_um:.2g} µm rms): "
-            "a joint or guideway with play or friction."
+            f"{seen.words}: the {what}{seen.path_words} sticks and slips with a half-width of "
+            f"{digits(self.half_width_um)} µm. A joint or guideway has play or friction."
         )
 
 

@@ -18,7 +18,8 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
 from compensator.model.effects.blocks import Block, Delay, FilterBank, FromStart, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, digits, numbered, proposes
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, numbered, proposes
+from compensator.model.effects.seen import Seen, digits, quantity, signed
 from compensator.model.effects.signals import Signals
 
 #: Curves by name: of one sample, or of a record.
@@ -28,7 +29,7 @@ CURVES: Mapping[str, Callable[[Any], Any]] = {
     "abs": abs,
     "power 5/3": lambda c: abs(c) ** (5.0 / 3.0),
 }
-_WORDS = {"linear": "", "square": " squared", "abs": " (magnitude)", "power 5/3": " to the power 5/3"}
+_WORDS = {"linear": "", "square": " by its square", "abs": " by its magnitude", "power 5/3": " by its power 5/3"}
 _POWERS = {"linear": "", "square": "2", "abs": "", "power 5/3": "_5_3"}
 
 
@@ -52,13 +53,40 @@ class Input(BankEffect, Effect):
         from_start, delay, _ = run
         return (delay(from_start(CURVES[self.curve](signals.channels[self.channel]))),)
 
-    def explain(self, rms_um: float) -> str:
-        lags = ("lags of " if len(self.tau_min) > 1 else "a lag of ") + " and ".join(map(digits, self.tau_min))
+    def explain(self, seen: Seen) -> str:
         delay = f" and a dead time of {digits(self.delay_min)} min" if self.delay_min else ""
         return (
-            f"The channel {self.channel}{_WORDS[self.curve]} moves Y by {rms_um:.2g} µm rms with {lags} min{delay}. "
-            "The base model lacks this input; the extended model needs the channel."
+            f"{self.size_words(seen)}. The base model lacks this input, which acts{_WORDS[self.curve]} with "
+            f"{self.lag_words()}{delay}; the extended model needs the channel."
         )
+
+    def lag_words(self) -> str:
+        """Return the lags in words."""
+        lags = " and ".join(map(digits, self.tau_min))
+        return f"lags of {lags} min" if len(self.tau_min) > 1 else f"a lag of {lags} min"
+
+    def size_words(self, seen: Seen) -> str:
+        """Return the response at rest to the channel's range in words, and what was seen of it."""
+        assert seen.channel is not None
+        (low, high), curve = seen.channel.ends(self.channel), CURVES[self.curve]
+        size_um = math.fsum(self.gain) * (curve(high) - curve(low))
+        to = quantity(high, self.channel)
+        at = f"at {to}" if low == 0.0 else f"from {digits(low)} to {to}"
+        half = digits(self.half_time_min())
+        return f"{signed(size_um)} µm {at} of {self.channel}, half of it after {half} min; in the data {seen.size}"
+
+    def half_time_min(self) -> float:
+        """Return the time to half of a step's response at rest, min."""
+        t = np.geomspace(0.1, 10.0 * max(*self.tau_min, 1.0), 400)
+        part: Vector = (1.0 - np.exp(-t[:, None] / np.maximum(self.tau_min, 1e-3))) @ np.array(self.gain)
+        part = part / (math.fsum(self.gain) or 1.0)
+        if not (part >= 0.5).any():
+            return self.delay_min + float(t[-1])
+        there = int(np.argmax(part >= 0.5))
+        if there == 0:
+            return self.delay_min + float(t[0])
+        near = slice(there - 1, there + 1)
+        return self.delay_min + float(np.exp(np.interp(0.5, part[near], np.log(t[near]))))
 
 
 @register
@@ -73,25 +101,10 @@ class InputBank(Input):
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the gain at rest of all lags together, and the time to half of a step's response."""
         name = f"gain_um_per_{unit_of(self.channel)}{_POWERS[self.curve]}"
-        return {name: math.fsum(self.gain), "half_time_min": self._half_time()}
+        return {name: math.fsum(self.gain), "half_time_min": self.half_time_min()}
 
-    def explain(self, rms_um: float) -> str:
-        return (
-            f"The channel {self.channel}{_WORDS[self.curve]} moves Y by {rms_um:.2g} µm rms; half of the response to a "
-            f"step is reached after {digits(self._half_time())} min. The base model lacks this input; the extended "
-            "model needs the channel."
-        )
-
-    def _half_time(self) -> float:
-        t = np.geomspace(0.1, 10.0 * max(self.tau_min), 400)
-        part: Vector = (1.0 - np.exp(-t[:, None] / np.array(self.tau_min))) @ np.array(self.gain)
-        part = part / math.fsum(self.gain)
-        if not (part >= 0.5).any():
-            return float(t[-1])
-        there = int(np.argmax(part >= 0.5))
-        if there == 0:
-            return float(t[0])
-        return float(np.exp(np.interp(0.5, part[there - 1 : there + 1], np.log(t[there - 1 : there + 1]))))
+    def lag_words(self) -> str:
+        return "several lags"
 
 
 @proposes

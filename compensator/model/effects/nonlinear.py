@@ -13,7 +13,8 @@ from collections.abc import Iterator, Sequence
 
 from compensator.model.effects.base import Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, Function, S
-from compensator.model.effects.hypothesis import Context, Hypothesis, digits, proposes
+from compensator.model.effects.hypothesis import Context, Hypothesis, proposes
+from compensator.model.effects.seen import Seen, digits
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -37,11 +38,11 @@ class Nonlinear(Effect):
             return self.change * (share * part * part)
         return self.change * (share * (part if self.form == "square" else abs(part)))
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         per = "100 W or K of its input" if self.form == "drive" else "100 µm"
         return (
-            f"The gain of the {self.path} changes with its own size, by {digits(100.0 * self.change)} % per {per} "
-            f"({rms_um:.2g} µm rms): a joint that yields, or surfaces that lose more heat when hot."
+            f"{seen.words}: the gain of the {self.path}{seen.path_words} changes with its own size, by "
+            f"{digits(100.0 * self.change)} % per {per}. A joint yields, or surfaces lose more heat when hot."
         )
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from compensator.arrays import Matrix, Vector
 from compensator.model.effects.base import Effect, register
 from compensator.model.effects.blocks import Block
-from compensator.model.effects.hypothesis import Context, Free, Hypothesis, digits, proposes
+from compensator.model.effects.hypothesis import Context, Free, Hypothesis, proposes
+from compensator.model.effects.seen import Seen, digits, rounded, signed
 from compensator.model.effects.signals import RecordSignals
 
 
@@ -44,10 +45,10 @@ class Drift(TimeOnly):
     def course(self, record: RecordSignals) -> Vector:
         return self.um_per_h * (record.minutes / 60.0)
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         return (
-            f"Y drifts by {digits(self.um_per_h)} µm per hour ({rms_um:.2g} µm rms) whatever the inputs do: a creeping "
-            "probe mount is no error of the machine. Check the mount and measure against a fixed reference."
+            f"{seen.words}: Y drifts by {digits(self.um_per_h)} µm per hour whatever the inputs do. A creeping probe "
+            "mount is no error of the machine: check the mount and measure against a fixed reference."
         )
 
 
@@ -63,11 +64,11 @@ class Settling(TimeOnly):
     def course(self, record: RecordSignals) -> Vector:
         return self.size_um * (1.0 - np.exp(-record.minutes / self.tau_min))
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         return (
-            f"Y drifts by {digits(self.size_um)} µm with a time constant of {digits(self.tau_min)} min ({rms_um:.2g} "
-            "µm rms) whatever the inputs do: a mount or joint that settles is no error of the machine. Check the mount "
-            "and measure against a fixed reference."
+            f"{seen.words}: Y drifts whatever the inputs do, by {signed(self.size_um)} µm in the end, with a time "
+            f"constant of {digits(self.tau_min)} min. A mount or joint that settles is no error of the machine: check "
+            "the mount and measure against a fixed reference."
         )
 
 
@@ -83,10 +84,10 @@ class Jump(TimeOnly):
     def course(self, record: RecordSignals) -> Vector:
         return self.jump_um * np.clip((record.minutes - self.at_min) / record.period_min + 1.0, 0.0, 1.0)
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         return (
-            f"Y jumps by {digits(self.jump_um)} µm at {self.at_min / 60.0:.2f} h ({rms_um:.2g} µm rms) and stays: "
-            "something was knocked or slipped. Check the probe mount and the clamping, then zero again."
+            f"{signed(self.jump_um)} µm from {self.at_min / 60.0:.2f} h on ({rounded(seen.rms_um)} µm rms): Y jumps "
+            "and stays. Something was knocked or slipped: check the probe mount and the clamping, then zero again."
         )
 
 
@@ -104,11 +105,12 @@ class Periodic(TimeOnly):
         angle = 2.0 * np.pi * record.minutes / self.period_min
         return np.column_stack((np.sin(angle), np.cos(angle)))
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         size = float(np.hypot(self.sine_um, self.cosine_um))
         return (
-            f"Y oscillates by ±{digits(size)} µm with a period of {digits(self.period_min)} min that no channel shows "
-            f"({rms_um:.2g} µm rms): air conditioning, lubrication, a cabinet cooler. Log a channel of it."
+            f"±{rounded(size)} µm ({rounded(seen.rms_um)} µm rms): Y oscillates with a period of "
+            f"{digits(self.period_min)} min that no channel shows. It may be air conditioning, lubrication or a "
+            "cabinet cooler: log a channel of it."
         )
 
 

@@ -26,6 +26,7 @@ from compensator.model.effects.base import (
     texts,
 )
 from compensator.model.effects.blocks import Block, ChangeSeen, FilterBank, S, lag_or_none
+from compensator.model.effects.seen import Seen
 from compensator.model.effects.signals import Signals
 from compensator.model.table import shown
 
@@ -150,12 +151,12 @@ class Regression(BankEffect, Effect):
                 expected = f"{DRIVE[kind]!r}, the drive of a model of kind {kind!r}"
                 raise ModelError(f"effect regression: channels = {name!r}, expected {expected}")
 
-    def explain(self, rms_um: float) -> str:
+    def explain(self, seen: Seen) -> str:
         names = list(dict.fromkeys(self.channels))
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         return (
-            f"The remainder: a regularised linear response of several channels, {', '.join(names[:_NAMED])}{more} "
-            f"({rms_um:.2g} µm rms); a correction that explains nothing."
+            f"{seen.words}: the remainder, a regularised linear response of {', '.join(names[:_NAMED])}{more}. It is a "
+            "correction that explains nothing."
         )
 
     def to_table(self) -> dict[str, Any]:

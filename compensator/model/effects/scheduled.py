@@ -20,7 +20,8 @@ from typing import Any, ClassVar
 from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, digits, numbered, proposes
+from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, numbered, proposes
+from compensator.model.effects.seen import Seen, digits, quantity
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
 
@@ -48,11 +49,14 @@ class Scheduled(Effect):
         """Return the channel in units of its span."""
         return run[0](signals.channels[self.channel]) / self.span
 
-    def explain(self, rms_um: float) -> str:
-        change = self.named({"change": getattr(self, "change", 0.0)})["change"]
+    def explain(self, seen: Seen) -> str:
+        assert seen.channel is not None
+        low, high = seen.channel.ends(self.channel)
+        change = self.named({"change": getattr(self, "change", 0.0)})["change"] * (high - low) / self.span
         return (
-            f"The {self.what} of the {self.path} changes with {self.channel}, by {digits(100.0 * change)} % over the "
-            f"channel's span of {digits(self.span)} ({rms_um:.2g} µm rms): it changes how much heat takes this path."
+            f"{seen.words}: the {self.what} of the {self.path}{seen.path_words} changes by {digits(100.0 * change)} % "
+            f"from {digits(low)} to {quantity(high, self.channel)} of {self.channel}. The channel "
+            "changes how much heat takes this path."
         )
 
 

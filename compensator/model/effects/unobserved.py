@@ -15,7 +15,7 @@ import numpy as np
 from compensator.arrays import Matrix
 from compensator.model.effects.base import Effect, register
 from compensator.model.effects.blocks import Block, Lag
-from compensator.model.effects.hypothesis import digits
+from compensator.model.effects.seen import Seen, digits
 from compensator.model.effects.signals import RecordSignals
 
 
@@ -53,11 +53,10 @@ class Unobserved(Effect):
     def effective_parameters(self, count: int) -> int:
         return count + len(self.times)
 
-    def explain(self, rms_um: float) -> str:
-        first = min(at for _, at in self.times) / 60.0
-        largest = max(abs(size) for size in self.sizes_um)
+    def explain(self, seen: Seen) -> str:
+        first, count = min(at for _, at in self.times) / 60.0, len(self.times)
         return (
-            f"Something acts that no channel shows: switched {len(self.times)} times from {first:.1f} h on, it moves Y "
-            f"by up to {digits(largest)} µm with a lag of {digits(self.tau_min)} min ({rms_um:.2g} µm rms). Find what "
-            "runs then (pump, cooler, drive, sun) and log a channel of it."
+            f"{seen.words}: something acts that no channel shows, switched {count} time{'s' * (count > 1)} from "
+            f"{first:.1f} h on, with a lag of {digits(self.tau_min)} min. Find what runs then (pump, cooler, drive, "
+            "sun) and log a channel of it."
         )

@@ -1,0 +1,148 @@
+"""Held-out data on the page of a diagnosis: the waterfall of the error, and a time axis with blocks and runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from compensator.arrays import NAN, Indices, Vector
+from compensator.diagnose.outcome import FOLDS, Diagnosis, FoundEffect, rms_of
+from compensator.diagnose.summary import name
+from compensator.report.figure import Bar, Edges, Figure, Line
+
+#: A gap between measured values is drawn as one if it is longer than this many usual intervals between them.
+_GAP = 3.0
+#: Line colours of what is left, of what an effect removes, and of the remainder.
+_LEFT, _EFFECT, _REMAINDER = 1, 2, 3
+_NOTE = (
+    "Each bar ends at the error with everything down to it, by searches that did not see the block they predict. Mean "
+    "squares add, rms values do not: the percentages are shares of the mean square without any effect. Effects that "
+    "overlap share what they remove; the upper one shows it."
+)
+
+
+def waterfall(diagnosis: Diagnosis) -> Figure:
+    """Return the error on held-out data as a waterfall: before, what each effect and the remainder remove, after.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        The diagnosis.
+    """
+    before, after = rms_of(diagnosis.held_out_before), rms_of(diagnosis.held_out_after)
+    bars = [Bar("base model", f"{before:.2f} µm", 0.0, before, _LEFT)]
+
+    def add(label: str, last: float, line: int, *, hatched: bool = False) -> None:
+        first = bars[-1].last
+        share = _percent((last**2 - first**2) / before**2 if before else 0.0)
+        bars.append(Bar(label, f"{last:.2f} µm ({share})", first, last, line, hatched=hatched))
+
+    for effect, step in zip(diagnosis.effects, diagnosis.steps, strict=False):
+        add(_found_in(effect, step.searches), step.rms_um, _EFFECT)
+    named = rms_of(diagnosis.held_out_named) if diagnosis.remainder else after
+    if _differs(named, bars[-1].last):
+        add("other effects these searches found", named, _EFFECT)
+    if len(bars) > 1:
+        bars.append(Bar("with the effects", f"{named:.2f} µm", 0.0, named, _LEFT))
+    if diagnosis.remainder is not None:
+        add("remainder (explains nothing)", after, _REMAINDER, hatched=True)
+        bars.append(Bar("with the remainder", f"{after:.2f} µm", 0.0, after, _LEFT))
+    edges = [Edges(f"sensor noise, {diagnosis.noise_floor_um:.2f} µm", (diagnosis.noise_floor_um,))]
+    if (ceiling := diagnosis.ceiling) is not None:
+        edges.append(Edges(f"ceiling of all channels, {ceiling.rms_um:.2f} µm", (ceiling.rms_um,)))
+    return Figure(
+        title="Error on held-out data" + (", and what each effect removes" if len(bars) > 1 else ""),
+        x_label="rms error on held-out data, µm",
+        y_label="model",
+        bars=tuple(bars),
+        edges=tuple(edges),
+        note=_NOTE if diagnosis.effects or diagnosis.remainder else "",
+        height=1.1 + 0.5 * len(bars),
+    )
+
+
+def _found_in(effect: FoundEffect, searches: int) -> str:
+    if not effect.effect.observed and searches == 0:
+        return f"{name(effect)} (cannot be predicted)"
+    return name(effect) if searches == FOLDS else f"{name(effect)} (found in {searches} of {FOLDS} searches)"
+
+
+def _percent(share: float) -> str:
+    """Return a change in percent with its sign; what is left of nearly everything is not rounded away."""
+    text = f"{100.0 * share:+.{1 if 0.99 < abs(share) < 1.0 else 0}f}"
+    return "0 %" if text[1:] == "0" else f"{text.replace('-', '−')} %"
+
+
+def _differs(one: float, other: float) -> bool:
+    return abs(one - other) > 0.01 * max(one, other)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeAxis:
+    """Time over all runs, one after another, with the edges of blocks and runs.
+
+    Parameters
+    ----------
+    hours : numpy.ndarray, shape (n,)
+        Time, h.
+    run : numpy.ndarray of int, shape (n,)
+        Number of the run.
+    blocks, runs : tuple of Edges
+        Edges of held-out blocks, and starts of runs after the first; empty where there are none.
+    """
+
+    hours: Vector
+    run: Indices
+    blocks: tuple[Edges, ...]
+    runs: tuple[Edges, ...]
+
+    @classmethod
+    def of(cls, diagnosis: Diagnosis) -> Self:
+        """Return the time axis of a diagnosis."""
+        sizes = [record.size for record in diagnosis.evidence.signals]
+        run = np.repeat(np.arange(len(sizes)), sizes)
+        hours = np.arange(run.size) * (diagnosis.model.period_s / 3600.0)
+        starts = np.cumsum(sizes)[:-1]
+        block = np.full(run.size, -1)
+        for number, mask in enumerate(diagnosis.evidence.blocks(FOLDS)):
+            block[mask] = number
+        used = np.flatnonzero(block >= 0)
+        changes = used[1:][np.diff(block[used]) != 0]
+        # Where whole runs are held out, their starts are the edges.
+        changes = changes[~np.isin(changes, starts)]
+        return cls(
+            hours=np.asarray(hours),
+            run=run,
+            blocks=_edges(f"edge between the {FOLDS} held-out blocks", hours[changes]),
+            runs=_edges("start of the next run", hours[starts]),
+        )
+
+    @property
+    def edges(self) -> tuple[Edges, ...]:
+        """Edges of blocks and runs."""
+        return (*self.blocks, *self.runs)
+
+    @property
+    def unnamed(self) -> tuple[Edges, ...]:
+        """The same without entries of the legend, for a panel below another."""
+        return tuple(replace(edge, name="") for edge in self.edges)
+
+    @property
+    def note(self) -> str:
+        """Words on several runs, for a note."""
+        return f" {int(self.run[-1]) + 1} runs, drawn one after another." if self.runs else ""
+
+    def line(self, name: str, values: Vector, *, weight: float = 1.5) -> Line:
+        """Return a curve with its gaps, broken between runs; values measured now and then are joined."""
+        known = np.flatnonzero(np.isfinite(values))
+        steps = np.diff(known)
+        apart = (np.diff(self.run[known]) != 0) | (steps > _GAP * np.median(steps) if steps.size else False)
+        at = np.flatnonzero(apart) + 1
+        hours = np.insert(self.hours[known], at, self.hours[known][at])
+        return Line(name, hours, np.insert(values[known], at, NAN), weight=weight)
+
+
+def _edges(name: str, at: Vector) -> tuple[Edges, ...]:
+    return (Edges(name, tuple(at.tolist())),) if at.size else ()

@@ -1,0 +1,330 @@
+"""The page of a diagnosis: waterfall, effects over their residuals, ceiling and remainder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import compensator as tc
+from compensator.diagnose import diagnosis as diagnosis_module
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Step, rms_of
+from compensator.diagnose.summary import contents, error_table, figures, verdict
+from compensator.display import text_of_all
+from compensator.model.model_file import load_model
+from compensator.report.diagnosis import page_of, tone_of
+from compensator.report.drawing import svg
+from compensator.report.figure import Bar, Edges, Figure, Line
+from compensator.report.held_out import TimeAxis, waterfall
+from compensator.report.page import Page, Section, html_of
+from compensator.report.results import pages_in
+from tests.diagnose.scenarios import draw, record
+from tests.identify.quill_runs import runs_from
+
+QUILL = load_model("quill")
+REMAINDER = Remainder(deployed=True, channels=("t1_degc", "base_degc"), rms_before_um=1.4, rms_after_um=0.9)
+
+
+@pytest.fixture(scope="module")
+def found() -> Diagnosis:
+    """A coolant and a step, in 10 h."""
+    columns, _, _ = record([draw("input", 21), draw("step", 21)], 1121, 10.0)
+    diagnosis = tc.diagnose("quill", {"t_s": 60.0 * np.arange(600), **columns}).diagnosis
+    assert len(diagnosis.effects) >= 1
+    return diagnosis
+
+
+def page(diagnosis: Diagnosis) -> Page:
+    return page_of(diagnosis, diagnosis.model, ())
+
+
+def text(diagnosis: Diagnosis) -> str:
+    return html_of(page(diagnosis))
+
+
+def sections(diagnosis: Diagnosis) -> list[Section]:
+    return [block for block in page(diagnosis).blocks if isinstance(block, Section)]
+
+
+# ---------------------------------------------------------------------------- waterfall
+
+
+def made(found: Diagnosis, before: float, named: float, after: float, steps: tuple[Step, ...], **changes: Any) -> Any:
+    """A diagnosis with errors of these sizes."""
+    one = np.ones(found.held_out_before.size)
+    return dataclasses.replace(
+        found,
+        held_out_before=before * one,
+        held_out_named=named * one,
+        held_out_after=after * one,
+        steps=steps,
+        effects=tuple(found.effects[:1] * len(steps)),
+        **changes,
+    )
+
+
+STEPS = (Step(rms_um=3.0, searches=FOLDS), Step(rms_um=1.0, searches=2))
+
+
+def test_each_bar_begins_where_the_one_above_ends_and_shares_of_the_squares_add_up(found: Diagnosis) -> None:
+    ceiling = Ceiling(rms_um=0.8, explained_pct=83.0)
+    picture = waterfall(made(found, 5.0, 1.0, 0.5, STEPS, remainder=REMAINDER, ceiling=ceiling))
+    before, first, second, named, rest, after = picture.bars
+    assert [b.last for b in (before, named, after)] == pytest.approx([5.0, 1.0, 0.5])
+    assert {b.first for b in (before, named, after)} == {0.0}
+    assert [b.first for b in (first, second, rest)] == pytest.approx([5.0, 3.0, 1.0])
+    assert [b.last for b in (first, second, rest)] == pytest.approx([3.0, 1.0, 0.5])
+    # 25 − 9, 9 − 1 and 1 − 0.25 of 25 µm².
+    assert [b.value for b in (first, second, rest)] == ["3.00 µm (−64 %)", "1.00 µm (−32 %)", "0.50 µm (−3 %)"]
+    assert "found in 2 of 3 searches" in second.name and "found in" not in first.name
+    assert rest.hatched and "explains nothing" in rest.name
+    assert {edge.at for edge in picture.edges} == {(found.noise_floor_um,), (0.8,)}
+
+
+def test_what_only_the_searches_found_is_a_bar_of_its_own(found: Diagnosis) -> None:
+    picture = waterfall(made(found, 5.0, 2.0, 2.0, STEPS, remainder=None, ceiling=None))
+    assert [bar.last for bar in picture.bars] == pytest.approx([5.0, 3.0, 1.0, 2.0, 2.0])
+    assert picture.bars[3].value == "2.00 µm (+12 %)" and "these searches" in picture.bars[3].name
+    assert len(picture.edges) == 1
+
+
+def test_nothing_found_is_one_bar(found: Diagnosis) -> None:
+    picture = waterfall(made(found, 0.3, 0.3, 0.3, (), remainder=None, ceiling=None))
+    assert [bar.name for bar in picture.bars] == ["base model"] and picture.note == ""
+
+
+def test_the_waterfall_of_a_diagnosis_ends_at_its_errors(found: Diagnosis) -> None:
+    picture = waterfall(found)
+    assert picture.bars[0].last == pytest.approx(found.before.rms_um, rel=0.02)
+    assert picture.bars[-1].last == pytest.approx(rms_of(found.held_out_after))
+    assert len(found.steps) == len(found.effects)
+    assert found.steps[0].rms_um < 0.8 * found.before.rms_um
+
+
+def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two effects of known size: one that every search finds, one that only the searches with the first block find."""
+    columns, _, _ = record([], 5, 12.0)
+    evidence = evidence_of(QUILL, runs_from(columns))
+    rng = np.random.default_rng(0)
+    large, small = 5.0 * rng.normal(size=evidence.used.size), rng.normal(size=evidence.used.size)
+    residual = np.where(evidence.used, large + small, 0.0)
+    evidence = dataclasses.replace(evidence, residual=residual)
+    places = [("gain", "DTF", ""), ("input", "", "coolant_degc")]
+    terms = [SimpleNamespace(hypothesis=SimpleNamespace(place=place), effect=QUILL) for place in places]
+    nothing = np.zeros(evidence.used.size)
+
+    def findings_of(seen: Any, **_: Any) -> Any:
+        count = 2 if seen.used[:200].all() else 1
+        assert seen.used.sum() < evidence.used.sum()
+        return SimpleNamespace(
+            terms=terms[:count],
+            responses=[large, small][:count],
+            own_paths=nothing,
+            paths=nothing,
+            named=large + (count - 1) * small,
+            whole=large + (count - 1) * small,
+            ceiling=nothing,
+        )
+
+    monkeypatch.setattr(diagnosis_module, "findings_of", findings_of)
+    all_of = SimpleNamespace(search=SimpleNamespace(evidence=evidence), terms=())
+    held_out = diagnosis_module._held_out(all_of, places, lambda done, of: None, map)
+    first, second = held_out.steps
+    assert (first.searches, second.searches) == (3, 2)
+    assert first.rms_um == pytest.approx(1.0, rel=0.15)
+    assert second.rms_um == pytest.approx(math.sqrt(1.0 / 3.0), rel=0.15)
+    assert second.rms_um == pytest.approx(rms_of(held_out.named))
+
+
+# ---------------------------------------------------------------------------- effects
+
+
+def test_an_effect_lies_over_its_residual_and_its_channel_below_it(found: Diagnosis) -> None:
+    effect = next(e for e in found.effects if e.channel)
+    section = sections(found)[found.effects.index(effect)]
+    picture = next(block for block in section.blocks if isinstance(block, Figure))
+    without, alone = picture.lines
+    used = np.isfinite(found.residual_after)
+    # What is left with every effect is what stands between the two curves.
+    between = without.y - np.interp(without.x, alone.x, alone.y)
+    assert between[np.isfinite(between)] == pytest.approx(found.residual_after[used], abs=1e-9)
+    assert np.std(alone.y) > 3.0 * np.std(between)
+    [panel] = picture.below
+    [channel] = panel.lines
+    assert channel.name == effect.channel and panel.y_label == "°C"
+    assert channel.y == pytest.approx(found.evidence.signals[0].channels[effect.channel])
+    # The words with the size come before the figure, and the coefficients after it.
+    order = [type(block).__name__ for block in section.blocks[:3]]
+    assert order == ["Words", "Figure", "Table"]
+
+
+def test_what_no_channel_shows_has_no_channel_below(found: Diagnosis) -> None:
+    step = dataclasses.replace(found.effects[0], term=drawn_term("step"))
+    [section] = sections(dataclasses.replace(found, effects=(step,), steps=found.steps[:1]))
+    picture = next(block for block in section.blocks if isinstance(block, Figure))
+    assert picture.below == () and "No channel shows its cause." in picture.note
+
+
+def test_a_path_is_shown_with_what_drives_it(found: Diagnosis) -> None:
+    gain = dataclasses.replace(found.effects[0], term=drawn_term("gain"))
+    [section] = sections(dataclasses.replace(found, effects=(gain,), steps=found.steps[:1]))
+    picture = next(block for block in section.blocks if isinstance(block, Figure))
+    assert picture.below[0].y_label == "W"
+    assert picture.below[0].lines[0].y == pytest.approx(found.evidence.signals[0].drive)
+
+
+def drawn_term(kind: str) -> Any:
+    places = {"step": ("step", "", ""), "gain": ("gain", "DTF", "")}
+    return SimpleNamespace(hypothesis=SimpleNamespace(place=places[kind], form=""), named={}, effect=None)
+
+
+def test_an_effect_that_was_not_deployed_does_not_claim_it(found: Diagnosis) -> None:
+    assert any(effect.effect in found.model.effects for effect in found.effects)
+    assert "Deployed in the extended model." in text(found)
+    unchanged = dataclasses.replace(found, model=QUILL)
+    assert "Deployed in the extended model." not in text(unchanged)
+    assert "Not deployed: the model was left unchanged." in text(unchanged)
+
+
+# ---------------------------------------------------------------------------- time axis
+
+
+def axis(*records: dict[str, np.ndarray]) -> TimeAxis:
+    runs = [run for columns in records for run in runs_from(columns)]
+    evidence = evidence_of(QUILL, runs)
+    return TimeAxis.of(SimpleNamespace(evidence=evidence, model=QUILL))  # type: ignore[arg-type]
+
+
+def test_edges_of_blocks_and_runs_are_marked_and_no_curve_crosses_from_run_to_run() -> None:
+    (first, _, _), (second, _, _) = record([], 5, 6.0), record([], 6, 4.5)
+    time = axis(first, second)
+    [blocks], [runs] = time.blocks, time.runs
+    assert blocks.at == pytest.approx((3.5, 7.0)) and runs.at == pytest.approx((6.0,))
+    line = time.line("y", np.arange(630.0))
+    assert np.isnan(line.y).sum() == 1 and line.x[np.isnan(line.y)][0] == pytest.approx(6.0)
+    assert "2 runs" in time.note and axis(first).note == ""
+    assert {edge.name for edge in time.unnamed} == {""} and len(time.unnamed) == 2
+    # An edge that is the start of a run is marked once.
+    shorter = axis(first, {name: values[:180] for name, values in second.items()})
+    assert shorter.blocks[0].at == pytest.approx((3.0,)) and shorter.runs[0].at == pytest.approx((6.0,))
+
+
+def test_a_gap_is_left_open_and_values_now_and_then_are_joined() -> None:
+    columns, _, _ = record([], 5, 6.0)
+    time = axis(columns)
+    y = np.arange(360.0)
+    y[100:200] = np.nan
+    y[250] = np.nan  # one lost sample is no gap
+    line = time.line("y", y)
+    assert np.isnan(line.y).sum() == 1 and line.y.size == 360 - 101 + 1
+    probed = np.full(360, np.nan)
+    probed[::15] = 1.0
+    assert np.isfinite(time.line("y", probed).y).all()
+    probed[120:240] = np.nan
+    assert np.isnan(time.line("y", probed).y).sum() == 1
+    assert time.line("y", np.full(360, np.nan)).y.size == 0
+
+
+# ---------------------------------------------------------------------------- ceiling and remainder
+
+
+def with_ceiling(found: Diagnosis, share: float, **changes: Any) -> Diagnosis:
+    ceiling = Ceiling(rms_um=0.2 * found.before.rms_um, explained_pct=share)
+    return dataclasses.replace(found, ceiling=ceiling, verdict="explained", **changes)
+
+
+def test_the_share_of_the_ceiling_is_said_everywhere(found: Diagnosis, tmp_path: Path) -> None:
+    explained = with_ceiling(found, 83.0)
+    sentence = "The named effects explain 83 % of what the channels can explain."
+    printed = text_of_all(contents(explained, ()))
+    assert sentence in text(explained) and sentence in printed and sentence in verdict(figures(explained))
+    assert "fall clearly short" not in text(explained) + printed
+    assert tone_of(figures(explained)) == "good"
+
+
+def test_where_the_effects_fall_short_it_is_said_and_not_passed(found: Diagnosis, tmp_path: Path) -> None:
+    short = with_ceiling(found, 40.0)
+    assert "They fall clearly short" in text(short) and "no remainder was added" in text(short)
+    assert page(short).tone == "warn" and "The missing effects were found" not in page(short).verdict
+    # The overview of the folder says the same.
+    (tmp_path / "diagnosis.json").write_text(json.dumps(figures(short)), encoding="utf-8")
+    (tmp_path / "report.html").write_text(text(short), encoding="utf-8")
+    [overview] = pages_in(tmp_path)
+    assert overview.tone == "warn" and overview.verdict == page(short).verdict and "40 %" in overview.verdict
+
+
+def test_channels_that_explain_next_to_nothing_make_no_share(found: Diagnosis) -> None:
+    ceiling = Ceiling(rms_um=0.99 * found.before.rms_um, explained_pct=0.0)
+    adequate = dataclasses.replace(found, ceiling=ceiling, verdict="explained")
+    assert "explain next to nothing" in text(adequate) and "fall clearly short" not in text(adequate)
+    assert page(adequate).tone == "good"
+
+
+def test_the_remainder_is_named_as_what_it_is(found: Diagnosis) -> None:
+    with_it = with_ceiling(found, 40.0, remainder=REMAINDER)
+    printed = text_of_all(contents(with_it, ()))
+    for where in (text(with_it), printed):
+        assert "t1_degc, base_degc: a correction that explains nothing." in where
+        assert "from 1.40 to 0.90 µm rms" in where and "the remainder corrects some of the rest" in where
+    # The effects are not credited with what the remainder does.
+    assert f"1.40 µm rms with them, {with_it.after.rms_um:.2f} with the remainder" in verdict(figures(with_it))
+    assert [row[0] for row in error_table(with_it).rows][-3:] == [
+        "with the remainder",
+        "best linear use of all channels",
+        "sensor noise alone",
+    ]
+    idle = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, deployed=False))
+    assert "Not deployed in the extended model." in text(idle)
+
+
+def test_without_effect_ceiling_and_remainder_the_page_says_so_and_claims_nothing(found: Diagnosis) -> None:
+    bare = dataclasses.replace(found, effects=(), steps=(), tried=(), ceiling=None, remainder=None, verdict="adequate")
+    words = text(bare)
+    assert "No linear use of the logged channels leaves less" in words
+    assert "before and after" not in words and "a correction that explains nothing" not in words
+    assert "explain" not in verdict(figures(bare))
+    assert not sections(bare)
+
+
+# ---------------------------------------------------------------------------- drawing
+
+
+def test_bars_have_their_names_and_values_beside_them() -> None:
+    bars = (
+        Bar("base $model", "4.05 µm", 0.0, 4.05),
+        Bar("a rather long name " * 3, "0.31 µm", 4.05, 0.31, hatched=True),
+    )
+    drawn = svg(Figure(title="t", x_label="rms, µm", y_label="model", bars=bars, edges=(Edges("noise", (0.3,)),)), "p")
+    for words in (">base $model<", ">4.05 µm<", ">0.31 µm<", ">noise<"):
+        assert words in drawn
+    assert "base $model: 4.05 µm." in drawn  # for those who do not see it
+
+
+def test_a_panel_below_shares_the_time_axis_and_the_legend_of_the_edges() -> None:
+    x = np.arange(30.0)
+    edges = (Edges("edge of a block", (10.0, 20.0)),)
+    below = Figure(
+        title="", x_label="time, h", y_label="°C", lines=(Line("coolant", x, x),), edges=(Edges("", (10.0,)),)
+    )
+    above = Figure(
+        title="t",
+        x_label="time, h",
+        y_label="Y, µm",
+        lines=(Line("y", x, -x),),
+        edges=edges,
+        below=(below,),
+        height=3.0,
+    )
+    drawn = svg(above, "p")
+    assert drawn.count(">time, h<") == 1 and drawn.count(">edge of a block<") == 1
+    assert ">°C<" in drawn and ">coolant<" in drawn and "Below: x: time, h; y: °C. coolant: 0 to 29" in drawn
+    assert above.full_height == pytest.approx(3.0 + below.height)
+    # Each curve of a figure has a colour of its own.
+    assert "var(--line-0)" in drawn and "var(--line-1)" in drawn
