@@ -12,6 +12,7 @@ from pymodbus.client.base import ModbusBaseClient
 from pymodbus.exceptions import ConnectionException
 from pymodbus.pdu import ModbusPDU
 
+from drivers.errors import failure_text
 from drivers.lines.settings import SerialLine, TcpLine
 from drivers.protocols.modbus import (
     READ_COILS,
@@ -73,7 +74,7 @@ class ModbusWire:
             try:
                 return await create()
             except (OSError, ValueError, termios.error) as error:
-                self._why = str(error) or type(error).__name__
+                self._why = failure_text(error)
                 raise OSError(self._why) from error
 
         self._client.ctx.call_create = explained

@@ -9,6 +9,7 @@ from collections import deque
 
 import serial
 
+from drivers.errors import failure_text
 from drivers.lines.settings import SerialLine
 from drivers.protocols.dcon import CR
 
@@ -47,7 +48,7 @@ class SerialPort:
                 exclusive=True,
             )
         except (OSError, ValueError, termios.error) as error:
-            raise PortLostError(str(error)) from None
+            raise PortLostError(failure_text(error)) from None
         self._lines: deque[bytes] = deque(maxlen=64)
         self._rest = bytearray()
         self._changed = asyncio.Event()
