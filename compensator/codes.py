@@ -198,6 +198,16 @@ class Reason(Code):
     )
 
 
+#: Reasons with a suffix after a colon, and the suffixes; none are listed where it is the name of any channel.
+SUFFIXES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        Reason.CHANNEL_MISSING: (),
+        Reason.OUTSIDE_VALIDITY: ("t_q_degc", "at_degc", "heat_w"),
+        Reason.IMPLAUSIBLE: ("t_q_degc", "at_degc", "y_um", "model"),
+    }
+)
+
+
 class SampleQuality(Code):
     """Quality of a channel's value in a sample, from the device, its errors or the checks of the service."""
 

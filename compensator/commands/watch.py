@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import logging
 import re
 import signal
@@ -29,6 +30,8 @@ log = logging.getLogger("compensator")
 
 #: Time between two updates of the view, s; ages increase even without messages.
 REFRESH_S = 1.0
+#: Time after which a watch without a terminal reports that nothing has been received, s; longer than a query takes.
+QUIET_S = 5.0
 
 
 def run(arguments: argparse.Namespace) -> Answer | None:
@@ -159,15 +162,35 @@ class _Watch:
         if terminal:
             return self._draw()
         written: dict[str, tuple[Any, ...]] = {}
-        while True:
-            for machine in self._shop.overview() if lines else ():
-                now = (machine["shown"], machine["seq"], machine["alive"], machine["malformed"])
-                if written.get(machine["prefix"]) != now and (machine["seq"] is not None or machine["malformed"]):
-                    written[machine["prefix"]] = now
-                    sys.stdout.write(line(machine) + "\n")
-                    sys.stdout.flush()
+        for turn in itertools.count():
+            if lines:
+                self._write_changes(written)
+            if turn * REFRESH_S / 2.0 == QUIET_S:
+                self._report_absence()
             if self._stopped.wait(REFRESH_S / 2.0):
                 return None
+
+    def _write_changes(self, written: dict[str, tuple[Any, ...]]) -> None:
+        """Write a line for each machine that has changed since it was written."""
+        for machine in self._shop.overview():
+            now = (machine["shown"], machine["seq"], machine["alive"], machine["malformed"])
+            if written.get(machine["prefix"]) != now and (machine["seq"] is not None or machine["malformed"]):
+                written[machine["prefix"]] = now
+                sys.stdout.write(line(machine) + "\n")
+                sys.stdout.flush()
+
+    def _report_absence(self) -> None:
+        """Log why nothing has been received, if so."""
+        machines = self._shop.overview()
+        if any(machine["seq"] is not None or machine["malformed"] for machine in machines):
+            return
+        where = self._source.where
+        absent = f"no connection to {where} yet"
+        if self._connected:
+            alive = any(machine["alive"] for machine in machines)
+            absent = "the service has published nothing yet" if alive else "no service is heard"
+            absent += f" below {self._source.prefix or 'any prefix'} at {where}"
+        log.info("compensator: %s; waiting", absent)
 
     def _draw(self) -> None:
         console = Console()
