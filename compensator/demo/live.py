@@ -36,6 +36,8 @@ Breakable = Mapping[str, tuple[Faults, int]]
 MACHINE, PREFIX = "vmc-07", "shop/vmc-07"
 #: Length of the duty cycle after the history, h; after that its last inputs remain.
 AFTER_H = 7 * 24.0
+#: Older messages of the simulated past are not published, s: to a receiver the service would appear to be silent.
+PRESENT_S = 120.0
 #: Plausibility checks, which detect the undeclared effect of this machine.
 CHECKS = """
 [plausibility]
@@ -132,7 +134,8 @@ async def _serve(
             for number in (signal.SIGTERM, signal.SIGINT):
                 loop.add_signal_handler(number, stop)
 
-        await run_service(load(str(config)), clock=clock, on_ready=ready)
+        setup = load(str(config))
+        await run_service(setup, clock=clock, on_ready=ready, publishes=lambda: clock.behind_s < PRESENT_S)
 
 
 def _explain(out: Path, config: Path, port: int) -> None:
