@@ -160,7 +160,8 @@ class _Watch:
     def show(self, *, terminal: bool, lines: bool) -> None:
         """Draw on the terminal, or write a line per change, until stopped."""
         if terminal:
-            return self._draw()
+            self._draw()
+            return
         written: dict[str, tuple[Any, ...]] = {}
         for turn in itertools.count():
             if lines:
@@ -168,7 +169,7 @@ class _Watch:
             if turn * REFRESH_S / 2.0 == QUIET_S:
                 self._report_absence()
             if self._stopped.wait(REFRESH_S / 2.0):
-                return None
+                return
 
     def _write_changes(self, written: dict[str, tuple[Any, ...]]) -> None:
         """Write a line for each machine that has changed since it was written."""

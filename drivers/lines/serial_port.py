@@ -53,7 +53,7 @@ class SerialPort:
         self._rest = bytearray()
         self._changed = asyncio.Event()
         self._lost = ""
-        self.heard_at_s = 0.0
+        self.received_at_s = 0.0
         self._loop.add_reader(self._serial.fileno(), self._readable)
 
     @property
@@ -118,7 +118,7 @@ class SerialPort:
             return
         if not data:
             return
-        self.heard_at_s = self._loop.time()
+        self.received_at_s = self._loop.time()
         *lines, rest = (bytes(self._rest) + data).split(CR)
         self._lines.extend(lines)
         self._rest[:] = rest[-_MOST_BYTES:]
