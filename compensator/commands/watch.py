@@ -6,11 +6,9 @@ import argparse
 import itertools
 import logging
 import re
-import signal
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import Any
 
 import msgspec
@@ -19,6 +17,7 @@ from rich.live import Live
 
 from compensator.clock import SystemClock
 from compensator.commands import Answer
+from compensator.commands.stopping import until_stopped
 from compensator.config import LoadedConfig, load_config
 from compensator.errors import ServiceError, UsageError
 from compensator.watch.listener import Listener, Sink, Source, of_endpoints, of_file, of_settings
@@ -119,18 +118,6 @@ def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
     machines = shop.overview()
     result = {"machines": machines, "headline": headline(machines), "ignored": shop.ignored}
     return Answer(result, captured.get().rstrip("\n"), 0 if machines else 1)
-
-
-@contextmanager
-def until_stopped() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C and SIGTERM set."""
-    stopped = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class _Watch:
