@@ -20,6 +20,7 @@ from compensator.commands import Answer
 from compensator.commands.stopping import until_stopped
 from compensator.config import LoadedConfig, load_config
 from compensator.errors import ServiceError, UsageError
+from compensator.service.session import services_text
 from compensator.watch.listener import Listener, Sink, Source, of_endpoints, of_file, of_settings
 from compensator.watch.past import last_day
 from compensator.watch.shop import Shop, headline
@@ -107,9 +108,8 @@ def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
             with until_stopped() as stopped:
                 stopped.wait(arguments.wait)
         if not shop.overview() and not arguments.json:
-            there = listener.elsewhere()
-            known = f"services there: {', '.join(there)}" if there else "no service is running there"
-            raise ServiceError(f"no messages below {source.prefix or 'any prefix'} at {source.where}; {known}")
+            there = services_text(listener.elsewhere())
+            raise ServiceError(f"no messages below {source.prefix or 'any prefix'} at {source.where}; {there}")
         console = Console(file=sys.stdout)
         with console.capture() as captured:
             console.print(
