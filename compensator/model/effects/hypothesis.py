@@ -23,6 +23,8 @@ from compensator.model.effects.signals import RecordSignals
 BANK, BANK_LONGEST_MIN = 6, 600.0
 #: Ridge weight on the gains of a filter bank.
 BANK_RIDGE = 1e-3
+#: End of the names of channels in °C, whose zero is arbitrary: the square of such a value means nothing.
+DEGC = "_degc"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +145,7 @@ class Context:
     spans : mapping of str to float
         Span of each channel that moves, in its unit.
     zeroed : frozenset of str
-        Channels with a zero of their own: they come near 0 and go far from it.
+        Channels with a zero of their own: they come near 0 and go far from it. No temperature in °C is one.
     functions : mapping of str to (tuple of float, tuple of float)
         Coefficients b and a of each path.
     approximate : bool
@@ -216,5 +218,12 @@ def numbered(name: str, count: int) -> tuple[str, ...]:
 
 
 def digits(value: float) -> str:
-    """Return a number as an engineer writes it."""
-    return f"{value:.3g}"
+    """Return a number with three significant digits, between 0.0001 and a million without an exponent.
+
+    Examples
+    --------
+    >>> digits(2996.0), digits(12345.0), digits(0.01234), digits(2.5e-7)
+    ('3000', '12300', '0.0123', '2.5e-07')
+    """
+    text = f"{value:.3g}"
+    return f"{float(text):.0f}" if 1000.0 <= abs(float(text)) < 1e6 else text
