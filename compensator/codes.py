@@ -198,6 +198,16 @@ class Reason(Code):
     )
 
 
+#: Reasons with a suffix after a colon, and the suffixes; none are listed where it is the name of any channel.
+SUFFIXES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        Reason.CHANNEL_MISSING: (),
+        Reason.OUTSIDE_VALIDITY: ("t_q_degc", "at_degc", "heat_w"),
+        Reason.IMPLAUSIBLE: ("t_q_degc", "at_degc", "y_um", "model"),
+    }
+)
+
+
 class SampleQuality(Code):
     """Quality of a channel's value in a sample, from the device, its errors or the checks of the service."""
 
@@ -460,17 +470,17 @@ class ServiceWarning(Code):
         "The connection to a router or another participant has ended; the service retries.",
         "Nothing if it was closed on purpose or returns; otherwise check the router and the network.",
     )
-    NOTE_NOT_KEPT = (
+    CHECKPOINT_NOT_KEPT = (
         "note_not_kept",
         "The last offset cannot be kept in memory while the disk is slow; if the service is killed now, it is lost.",
         "Check free space and permissions of /dev/shm.",
     )
-    NOTE_NOT_REMOVED = (
+    CHECKPOINT_NOT_REMOVED = (
         "note_not_removed",
         "The last offset kept in memory cannot be removed although everything is on disk.",
         "Check the permissions of /dev/shm; the next start ignores this offset if its sample is on disk.",
     )
-    NOTE_REFUSED = (
+    CHECKPOINT_REFUSED = (
         "note_refused",
         "The last offset found in /dev/shm was not written by this service; it is ignored.",
         "If other users can log in to this computer, find out who wrote it.",
@@ -562,7 +572,7 @@ class WatchWarning(Code):
 class AuditRemark(Code):
     """Remarks of an audit on recordings that are in order."""
 
-    NOT_WORKED_OUT = (
+    NOT_REPLAYED = (
         "not_worked_out",
         "Not every sample could be recomputed from the contents of the recording.",
         "Audit with the version that wrote it; the named part was not checked.",

@@ -57,7 +57,16 @@ class ChannelSample(msgspec.Struct, frozen=True, kw_only=True):
         return self.quality == SampleQuality.GOOD
 
 
-class Sample(msgspec.Struct, frozen=True, kw_only=True):
+class Message(msgspec.Struct, frozen=True, kw_only=True):
+    """A message of the service: version of its schema, machine, number of the sample, and time, ns since 1970 UTC."""
+
+    schema: int
+    machine: str
+    seq: int
+    time_utc_ns: int
+
+
+class Sample(Message, frozen=True, kw_only=True):
     """Every raw channel of one sample, `/sample` and `thermal/sample`.
 
     Parameters
@@ -72,15 +81,11 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
         By channel name, unit in the name.
     """
 
-    schema: int
-    machine: str
-    seq: int
-    time_utc_ns: int
     period_s: float
     channels: dict[str, ChannelSample]
 
 
-class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
+class EstimateMessage(Message, frozen=True, kw_only=True):
     """What the model makes of one sample, `/estimate` and `thermal/estimate`.
 
     Parameters
@@ -101,10 +106,6 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
         Measured deformation since the zero, and measured − predicted, µm.
     """
 
-    schema: int
-    machine: str
-    seq: int
-    time_utc_ns: int
     t_q_ref_degc: float | None
     at_ref_degc: float | None
     y_ref_um: float | None
@@ -121,7 +122,7 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
     residual_um: float | None
 
 
-class Offset(msgspec.Struct, frozen=True, kw_only=True):
+class Offset(Message, frozen=True, kw_only=True):
     """The correction, `/offset` and `thermal/y/offset`.
 
     Parameters
@@ -144,10 +145,6 @@ class Offset(msgspec.Struct, frozen=True, kw_only=True):
         Hash of the model file.
     """
 
-    schema: int
-    machine: str
-    seq: int
-    time_utc_ns: int
     valid_for_s: float
     y_offset_um: float | None
     y_offset_rate_um_per_min: float | None
@@ -157,7 +154,7 @@ class Offset(msgspec.Struct, frozen=True, kw_only=True):
     model_sha256: str
 
 
-class Event(msgspec.Struct, frozen=True, kw_only=True):
+class Event(Message, frozen=True, kw_only=True):
     """Something that happened, `/event` and `thermal/event`.
 
     Parameters
@@ -170,16 +167,12 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
         Numbers and names that belong to it.
     """
 
-    schema: int
-    machine: str
-    seq: int
-    time_utc_ns: int
     kind: str
     text: str
     data: dict[str, Any] = {}
 
 
-class Status(msgspec.Struct, frozen=True, kw_only=True):
+class Status(Message, frozen=True, kw_only=True):
     """How the service is, `thermal/status`.
 
     Parameters
@@ -190,10 +183,6 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
         Names of the model's effects, in the order of `y_effects_um`.
     """
 
-    schema: int
-    machine: str
-    seq: int
-    time_utc_ns: int
     state: State
     reasons: list[str]
     version: str

@@ -14,6 +14,9 @@ A faulty sensor of a working device is not an error: it gives a `Reading` with a
 
 from __future__ import annotations
 
+import errno
+import os
+
 
 class DriverError(Exception):
     """Base of all errors of the drivers.
@@ -62,3 +65,19 @@ class DeviceGarbled(DriverError):
     """The reply is not a valid frame."""
 
     code = "device_garbled"
+
+
+def failure_text(error: Exception) -> str:
+    """Return why a port or connection cannot be opened, without its name, which the caller gives.
+
+    Examples
+    --------
+    >>> failure_text(OSError(2, "could not open port /dev/ttyUSB0: [Errno 2] No such file or directory"))
+    'No such file or directory'
+    """
+    number = error.args[0] if error.args else None
+    if number == errno.EAGAIN:  # pyserial locks the port
+        return "in use by another program"
+    if isinstance(number, int) and number > 0:
+        return os.strerror(number)
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__

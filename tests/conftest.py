@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 from collections.abc import Iterator
 
 import pytest
@@ -11,6 +12,8 @@ from compensator.blas import one_thread_from_start
 
 # As the commands do, before a test loads numpy: the two processes of a test run share the cores.
 one_thread_from_start()
+# A shell starts what runs in the background with SIGINT ignored, and so would every program that a test starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)

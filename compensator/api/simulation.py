@@ -42,7 +42,7 @@ def simulate(
     -------
     SimulationResult or SimulationFrame
         One row for each sample of the model. For a DataFrame the result is a DataFrame with the same columns: its
-        `result` is the SimulationResult, and `plot` and `to_dict` are those of pandas.
+        `result` is the SimulationResult, `plot()` plots that, and `to_dict` is that of pandas.
 
     Raises
     ------

@@ -14,13 +14,25 @@ from compensator.data.frames import time_index
 from compensator.model.simulation import Scores
 
 
+class FramePlot(pandas.plotting.PlotAccessor):  # type: ignore[misc]
+    """Plots of a SimulationFrame: `plot()` is that of its result; arguments and methods are those of pandas."""
+
+    def __init__(self, frame: SimulationFrame) -> None:
+        super().__init__(frame)
+        self._result = frame.result
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """Plot measured and predicted deformation and the residual or, with arguments, what pandas would."""
+        return super().__call__(*arguments, **options) if arguments or options else self._result.plot()
+
+
 class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
     """A DataFrame of the columns, indexed by time if the data were; slices of it are plain DataFrames.
 
     Parameters
     ----------
     result : SimulationResult
-        The same columns as arrays, with its own `plot()` and `to_dict()` instead of those of pandas.
+        The same columns as arrays; its `to_dict()` returns the figures, that of the DataFrame the columns.
     """
 
     _metadata: ClassVar[list[str]] = ["result"]
@@ -36,6 +48,11 @@ class SimulationFrame(pandas.DataFrame):  # type: ignore[misc]
     @property
     def _constructor(self) -> Any:
         return pandas.DataFrame
+
+    @property
+    def plot(self) -> FramePlot:
+        """`plot()` plots measured and predicted deformation and the residual; else as in pandas."""
+        return FramePlot(self)
 
     @property
     def scores(self) -> Scores | None:

@@ -217,7 +217,7 @@ class ChainCheck:
             return True
         if first >= self._next:
             return False
-        fault = Fault.RECORDS_AGAIN
+        fault = Fault.RECORDS_REPEATED
         for start, (last, gap_time) in list(self._gaps.items()):
             if start <= first and sequence <= last:
                 del self._gaps[start]

@@ -42,7 +42,7 @@ class Fault(Enum):
     )
     RECORDS_MISSING = AuditFinding.REMOVED, "{numbers} missing before it"
     RECORDS_MOVED = AuditFinding.REORDERED, "{numbers} after later ones"
-    RECORDS_AGAIN = AuditFinding.INSERTED, "{numbers} repeated"
+    RECORDS_REPEATED = AuditFinding.INSERTED, "{numbers} repeated"
     NOT_LISTED = AuditFinding.INSERTED, "the chain does not list it"
     LISTED_MISSING = AuditFinding.REMOVED, "the chain lists it, but it is missing"
     EXCHANGED = AuditFinding.REORDERED, "is in the place of record {record}"
@@ -70,7 +70,7 @@ class Fault(Enum):
     FILE_MISSING = AuditFinding.MISSING_FILE, "the previous file, {previous}, is {lost}; it followed {before}"
     FILES_REORDERED = AuditFinding.REORDERED, "continues from {previous}, but {before} is between them"
     FILES_BROKEN = AuditFinding.BROKEN, "does not continue from the last value of {previous}: one of them was rewritten"
-    NUMBERS_AGAIN = AuditFinding.BROKEN, "sample numbers from {seq} on also occur in {previous}"
+    NUMBERS_REPEATED = AuditFinding.BROKEN, "sample numbers from {seq} on also occur in {previous}"
     OTHER_STATE = AuditFinding.STATE, "does not start with the state at the end of {previous}"
 
     def __init__(self, kind: AuditFinding, sentence: str) -> None:

@@ -226,7 +226,7 @@ class _Series:
         if file.original != name and _NAME.match(name):
             self._find(Fault.RENAMED, file, original=file.original)
         if file.not_replayed:
-            remark(Remark(AuditRemark.NOT_WORKED_OUT, f"{name}: not all samples were replayed: {file.not_replayed}."))
+            remark(Remark(AuditRemark.NOT_REPLAYED, f"{name}: not all samples were replayed: {file.not_replayed}."))
         if not file.last and file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):
             remark(Remark(RecordingEnd.TORN, f"{name}: ends before the first record."))
             return
@@ -310,7 +310,7 @@ class _Series:
     def _check_state(self, before: RecordingAudit, after: RecordingAudit) -> None:
         """Check that within one run a file starts with the state at the end of the previous one."""
         if after.first_seq >= 0 and 0 <= after.first_seq <= before.last_seq:
-            self._find(Fault.NUMBERS_AGAIN, after, seq=after.first_seq, previous=before.file)
+            self._find(Fault.NUMBERS_REPEATED, after, seq=after.first_seq, previous=before.file)
         whole = not (before.not_replayed or after.not_replayed or before.findings_count or before.differing)
         same_run = after.began == "day" and not after.restarted and after.identity == before.identity
         same_run = same_run and bool(after.state_before) and after.first_seq == before.last_seq + 1

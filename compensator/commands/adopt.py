@@ -53,10 +53,7 @@ def back(arguments: argparse.Namespace) -> Answer:
     reply = _ask(CommandName.BACK, {"force": arguments.force}, setup, arguments)
     if reply is not None:
         return _answered(reply, "", "")
-    before = setup.store.before()
-    if before is None:
-        raise ServiceError("back: the configured model is in use; there is no previous model")
-    model = check_model(setup.config, before, source="previous model")
+    model = check_model(setup.config, setup.store.before(), source="previous model")
     setup.store.back(name=model.name, time_utc_ns=SystemClock().utc_ns())
     return _answered(None, f"back to model {model.name} ({model.sha256[:12]}).", model.sha256)
 

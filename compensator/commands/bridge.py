@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import logging
-import signal
 
 from compensator.bridge.settings import OpcUa, load_bridge
 from compensator.commands import Answer
+from compensator.commands.stopping import on_stop
 from compensator.errors import ConfigError, UsageError
 from compensator.receiver import Receiver, ReceiverError, Settings
 
@@ -38,8 +38,7 @@ async def _serve(settings: Settings, opcua: OpcUa) -> None:
     except ModuleNotFoundError as error:
         raise UsageError(f"OPC UA needs {error.name}: pip install quill-compensator[opcua]") from error
     stop = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    on_stop(stop.set)
     # asyncua logs a traceback for every lost connection; the bridge logs one line.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
     with Receiver(settings, step_max_s=2.0 * opcua.cycle_s) as receiver:

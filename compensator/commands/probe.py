@@ -40,7 +40,17 @@ def run(arguments: argparse.Namespace) -> Answer:
         rows.append(row)
     good = all(row["quality"] == Quality.GOOD for row in rows)
     result = {"channels": rows, **warnings_as_json(warnings)}
-    return Answer(result, "\n".join(map(_line, rows)), 0 if good else 1)
+    return Answer(result, "\n".join(_lines(rows)), 0 if good else 1)
+
+
+def _lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Return a line for each channel; the error of a device stands in the line of its first channel only."""
+    lines, devices = [], set()
+    for row in rows:
+        failed = row["quality"].startswith("device_")
+        lines.append(_line(row | {"detail": "(as above)"} if failed and row["device"] in devices else row))
+        devices.add(row["device"])
+    return lines
 
 
 def _line(row: dict[str, Any]) -> str:

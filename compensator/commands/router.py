@@ -6,7 +6,6 @@ import argparse
 import asyncio
 import datetime
 import logging
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import zenoh
 from compensator.certificates import check_files, remarks
 from compensator.codes import Remark, ServiceWarning
 from compensator.commands import Answer, log_warnings
+from compensator.commands.stopping import on_stop
 from compensator.errors import ConfigError, ServiceError
 from compensator.service.session import ConfigFile, error_text, files_of, get, read_config_file, set_key
 
@@ -97,9 +97,8 @@ def _check_access(path: Path, config: zenoh.Config, endpoints: list[str]) -> Non
 
 
 async def _serve(path: Path, config: zenoh.Config, endpoints: list[str]) -> None:
-    loop, ended = asyncio.get_running_loop(), asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, ended.set)
+    ended = asyncio.Event()
+    on_stop(ended.set)
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:

@@ -7,13 +7,13 @@ import asyncio
 import faulthandler
 import logging
 import os
-import signal
 import sys
 from typing import Any
 
 import msgspec
 
 from compensator.codes import State
+from compensator.commands.stopping import on_stop
 from compensator.events import EventKind
 from compensator.messages import Event, Offset
 from compensator.service import systemd
@@ -121,7 +121,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 async def _serve(path: str, manager: ServiceManager) -> None:
-    loop = asyncio.get_running_loop()
     reporter = Reporter(manager)
     manager.status("starting: reading the last recording")
     setup = load(path)
@@ -131,8 +130,7 @@ async def _serve(path: str, manager: ServiceManager) -> None:
             manager.stopping()
             daemon.stop()
 
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, stop)
+        on_stop(stop)
         manager.watch(setup.config.sampling.poll_interval_s)
         manager.status("starting: waiting for the first poll")
         log.info("compensator: running")

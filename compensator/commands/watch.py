@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import logging
 import re
-import signal
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import Any
 
 import msgspec
@@ -18,8 +17,10 @@ from rich.live import Live
 
 from compensator.clock import SystemClock
 from compensator.commands import Answer
+from compensator.commands.stopping import until_stopped
 from compensator.config import LoadedConfig, load_config
 from compensator.errors import ServiceError, UsageError
+from compensator.service.session import services_text
 from compensator.watch.listener import Listener, Sink, Source, of_endpoints, of_file, of_settings
 from compensator.watch.past import last_day
 from compensator.watch.shop import Shop, headline
@@ -29,6 +30,8 @@ log = logging.getLogger("compensator")
 
 #: Time between two updates of the view, s; ages increase even without messages.
 REFRESH_S = 1.0
+#: Time after which a watch without a terminal reports that nothing has been received, s; longer than a query takes.
+QUIET_S = 5.0
 
 
 def run(arguments: argparse.Namespace) -> Answer | None:
@@ -105,9 +108,8 @@ def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
             with until_stopped() as stopped:
                 stopped.wait(arguments.wait)
         if not shop.overview() and not arguments.json:
-            there = listener.elsewhere()
-            known = f"services there: {', '.join(there)}" if there else "no service is running there"
-            raise ServiceError(f"no messages below {source.prefix or 'any prefix'} at {source.where}; {known}")
+            there = services_text(listener.elsewhere())
+            raise ServiceError(f"no messages below {source.prefix or 'any prefix'} at {source.where}; {there}")
         console = Console(file=sys.stdout)
         with console.capture() as captured:
             console.print(
@@ -116,18 +118,6 @@ def _once(arguments: argparse.Namespace, source: Source, shop: Shop) -> Answer:
     machines = shop.overview()
     result = {"machines": machines, "headline": headline(machines), "ignored": shop.ignored}
     return Answer(result, captured.get().rstrip("\n"), 0 if machines else 1)
-
-
-@contextmanager
-def until_stopped() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C and SIGTERM set."""
-    stopped = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class _Watch:
@@ -157,17 +147,38 @@ class _Watch:
     def show(self, *, terminal: bool, lines: bool) -> None:
         """Draw on the terminal, or write a line per change, until stopped."""
         if terminal:
-            return self._draw()
+            self._draw()
+            return
         written: dict[str, tuple[Any, ...]] = {}
-        while True:
-            for machine in self._shop.overview() if lines else ():
-                now = (machine["shown"], machine["seq"], machine["alive"], machine["malformed"])
-                if written.get(machine["prefix"]) != now and (machine["seq"] is not None or machine["malformed"]):
-                    written[machine["prefix"]] = now
-                    sys.stdout.write(line(machine) + "\n")
-                    sys.stdout.flush()
+        for turn in itertools.count():
+            if lines:
+                self._write_changes(written)
+            if turn * REFRESH_S / 2.0 == QUIET_S:
+                self._report_absence()
             if self._stopped.wait(REFRESH_S / 2.0):
-                return None
+                return
+
+    def _write_changes(self, written: dict[str, tuple[Any, ...]]) -> None:
+        """Write a line for each machine that has changed since it was written."""
+        for machine in self._shop.overview():
+            now = (machine["shown"], machine["seq"], machine["alive"], machine["malformed"])
+            if written.get(machine["prefix"]) != now and (machine["seq"] is not None or machine["malformed"]):
+                written[machine["prefix"]] = now
+                sys.stdout.write(line(machine) + "\n")
+                sys.stdout.flush()
+
+    def _report_absence(self) -> None:
+        """Log why nothing has been received, if so."""
+        machines = self._shop.overview()
+        if any(machine["seq"] is not None or machine["malformed"] for machine in machines):
+            return
+        where = self._source.where
+        absent = f"no connection to {where} yet"
+        if self._connected:
+            alive = any(machine["alive"] for machine in machines)
+            absent = "the service has published nothing yet" if alive else "no service is heard"
+            absent += f" below {self._source.prefix or 'any prefix'} at {where}"
+        log.info("compensator: %s; waiting", absent)
 
     def _draw(self) -> None:
         console = Console()

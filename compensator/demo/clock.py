@@ -50,6 +50,11 @@ class LateClock:
         """Return the time since the start, ns."""
         return (self._now_ns if self._late else self._wall.monotonic_ns()) - self._start_ns
 
+    @property
+    def behind_s(self) -> float:
+        """Time that it is behind the present, s; 0 once it has caught up."""
+        return (self._wall.monotonic_ns() - self._now_ns) / NS if self._late else 0.0
+
     def wake(self) -> None:
         """End the current sleep and every later one at once, to stop."""
         self._woken.set()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
@@ -18,6 +17,7 @@ from typing import IO
 from rich.console import Console
 from rich.progress import Progress
 
+from compensator.commands.stopping import on_stop
 from compensator.demo.calibration import calibrate
 from compensator.demo.clock import LateClock
 from compensator.demo.loop import EFFECT_UM
@@ -36,6 +36,8 @@ Breakable = Mapping[str, tuple[Faults, int]]
 MACHINE, PREFIX = "vmc-07", "shop/vmc-07"
 #: Length of the duty cycle after the history, h; after that its last inputs remain.
 AFTER_H = 7 * 24.0
+#: Older messages of the simulated past are not published, s: to a receiver the service would appear to be silent.
+PRESENT_S = 120.0
 #: Plausibility checks, which detect the undeclared effect of this machine.
 CHECKS = """
 [plausibility]
@@ -108,7 +110,6 @@ def _clear(recordings: Path) -> None:
 async def _serve(
     config: Path, world: World, devices: Hardware, hours: float, explain: Callable[[], None], typed: IO[str]
 ) -> None:
-    loop = asyncio.get_running_loop()
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
         bar = progress.add_task("simulated past", total=hours * 3600.0)
 
@@ -129,10 +130,10 @@ async def _serve(
                 daemon.stop()
                 clock.wake()
 
-            for number in (signal.SIGTERM, signal.SIGINT):
-                loop.add_signal_handler(number, stop)
+            on_stop(stop)
 
-        await run_service(load(str(config)), clock=clock, on_ready=ready)
+        setup = load(str(config))
+        await run_service(setup, clock=clock, on_ready=ready, publishes=lambda: clock.behind_s < PRESENT_S)
 
 
 def _explain(out: Path, config: Path, port: int) -> None:

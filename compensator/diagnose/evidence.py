@@ -24,7 +24,7 @@ from compensator.diagnose.smoothing import course
 from compensator.errors import DataError
 from compensator.identify.output_error import low_frequency_ratio
 from compensator.model.effects import Effect
-from compensator.model.effects.hypothesis import Context
+from compensator.model.effects.hypothesis import DEGC, Context
 from compensator.model.effects.signals import RecordSignals
 from compensator.model.engine import Engine
 from compensator.model.late_observer import observe
@@ -295,7 +295,7 @@ def _context(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordS
         values = np.concatenate([record.channels[name] for record in signals])
         if np.ptp(values) > MOVES * noise_std(values) and np.ptp(values) > 0.0:
             spans[name] = float(np.ptp(values))
-            if np.min(np.abs(values)) < 0.05 * np.ptp(values):
+            if np.min(np.abs(values)) < 0.05 * np.ptp(values) and not name.endswith(DEGC):
                 zeroed.add(name)
     paths = {name: path.sampled for name, path in (("DTF", model.dtf), ("TDTF", model.tdtf)) if path is not None}
     sizes = {name: max(float(np.ptp(record.share(name))) for record in signals) for name in ("DTF", "TDTF")}

@@ -22,6 +22,7 @@ from compensator.service.session import (
     get,
     local_endpoints,
     read_config_file,
+    services_text,
     set_key,
     try_once,
 )
@@ -154,5 +155,4 @@ def ask(
             f"{key}: the service is alive but does not answer; check that the router's access list permits "
             f"{operator.name or 'this command'}"
         )
-    there = f"services there: {', '.join(sorted(alive))}" if alive else "no service is running there"
-    raise NotReached(f"{unreached}: no service with that prefix at {where}; {there}")
+    raise NotReached(f"{unreached}: no service with that prefix at {where}; {services_text(alive)}")

@@ -50,6 +50,7 @@ async def run_service(
     on_sample: Callable[[Outcome], None] | None = None,
     on_poll: Callable[[], None] | None = None,
     on_publish: Callable[[str, bytes], None] | None = None,
+    publishes: Callable[[], bool] = lambda: True,
 ) -> Daemon:
     """Run the service of a configuration until it is stopped.
 
@@ -67,6 +68,8 @@ async def run_service(
         Called after each sample, with its outcome, and after each poll.
     on_publish : callable, optional
         Called with name and JSON of each message after it was published.
+    publishes : callable, optional
+        Whether messages are published now, or only recorded, as those of a simulated past.
     """
     loaded, config, folder = setup.loaded, setup.config, setup.recordings
     machine, clock = config.machine.name, clock or SystemClock()
@@ -83,6 +86,8 @@ async def run_service(
             return daemon.command(name, payload, sender)
 
         def publish(name: str, data: bytes) -> None:
+            if not publishes():
+                return
             publisher.publish(name, data)
             if on_publish is not None:
                 on_publish(name, data)

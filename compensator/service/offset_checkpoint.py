@@ -64,7 +64,7 @@ class OffsetCheckpoint:
         except OSError as error:
             if self._written:
                 figures = f"{self.path}: a kill now would lose the offset: {error}."
-                log.warning("%s", Remark(ServiceWarning.NOTE_NOT_KEPT, figures).marked)
+                log.warning("%s", Remark(ServiceWarning.CHECKPOINT_NOT_KEPT, figures).marked)
             self._written = False
         else:
             self._written = True
@@ -75,7 +75,7 @@ class OffsetCheckpoint:
             self.path.unlink(missing_ok=True)
         except OSError as error:
             figures = f"{self.path}: cannot be removed: {error}."
-            log.warning("%s", Remark(ServiceWarning.NOTE_NOT_REMOVED, figures).marked)
+            log.warning("%s", Remark(ServiceWarning.CHECKPOINT_NOT_REMOVED, figures).marked)
 
     def read(self, offset_max_um: float) -> CheckpointedOffset | None:
         """Return the offset; None if there is none, another user wrote it, or it is not a possible offset.
@@ -106,4 +106,4 @@ class OffsetCheckpoint:
         return checkpointed
 
     def _refuse(self, why: str) -> None:
-        log.warning("%s", Remark(ServiceWarning.NOTE_REFUSED, f"{self.path}: ignored: {why}.").marked)
+        log.warning("%s", Remark(ServiceWarning.CHECKPOINT_REFUSED, f"{self.path}: ignored: {why}.").marked)

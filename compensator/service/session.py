@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,6 +107,11 @@ def tokens(session: zenoh.Session, key: str, timeout_s: float) -> list[str]:
 def alive_services(session: zenoh.Session, timeout_s: float, key: str = f"**/{ALIVE}") -> list[str]:
     """Return the prefixes of the services that are alive: all, or those whose token matches `key`."""
     return [token.removesuffix(f"/{ALIVE}") for token in tokens(session, key, timeout_s)]
+
+
+def services_text(alive: Collection[str]) -> str:
+    """Return the prefixes of the services that are alive as text."""
+    return f"services there: {', '.join(sorted(alive))}" if alive else "no service is running there"
 
 
 def enlarge_queues(config: zenoh.Config) -> None:

@@ -12,8 +12,8 @@ import msgspec
 from drivers.errors import DeviceRefused
 from drivers.lines.capancdt_link import CapancdtLink
 from drivers.lines.dcon_line import DconLine
-from drivers.lines.modbus_line import Member, ModbusLine, ModbusRefused
-from drivers.lines.shared_line import Place
+from drivers.lines.modbus_line import ModbusLine, ModbusMember, ModbusRefused
+from drivers.lines.shared_line import LineMember
 from drivers.protocols.modbus import READ_COILS, Request, fence_for
 from drivers.reading import Device, Reading
 from drivers.settings import Name, Where
@@ -117,16 +117,16 @@ class Module(Generic[CheckT]):
         Of the device, in the configuration.
     units : Mapping
         Unit of each configured input.
-    place : Place
-        Its place on the line.
+    member : LineMember
+        The device on its line.
     checks : sequence
         Settings of the module that are verified after connecting.
     """
 
-    def __init__(self, name: str, units: Mapping[int, str], place: Place, checks: Sequence[CheckT]) -> None:
+    def __init__(self, name: str, units: Mapping[int, str], member: LineMember, checks: Sequence[CheckT]) -> None:
         self._name = name
         self._units = dict(units)
-        self._place = place
+        self._member = member
         self._checks = tuple(checks)
         self._to_check: list[CheckT] = []
         self._checked: tuple[int, int] | None = None
@@ -149,17 +149,17 @@ class Module(Generic[CheckT]):
         DriverError
             Naming the device, within about twice the line's `timeout_s` from when the device gets the line.
         """
-        return await self._place.serve(self._verify_and_poll)
+        return await self._member.serve(self._verify_and_poll)
 
     async def close(self) -> None:
         """Release the line; the last device closes it."""
-        await self._place.close()
+        await self._member.close()
 
     async def _verify_and_poll(self) -> dict[int, Reading]:
         """Verify once after each connection or timeout, continuing a verification that ran out of time; then poll."""
-        if self._checked != self._place.generation:
+        if self._checked != self._member.generation:
             self._to_check = list(self._checks)
-            self._checked = self._place.generation
+            self._checked = self._member.generation
         while self._to_check:
             more = await self._check(self._to_check[0])
             self._to_check.pop(0)
@@ -191,6 +191,8 @@ class ModbusDevice(Module[Check]):
         Compared after connecting.
     """
 
+    _member: ModbusMember
+
     def __init__(
         self,
         config: ModbusSettings,
@@ -203,8 +205,7 @@ class ModbusDevice(Module[Check]):
         checks = checks if config.verify else ()
         self._polls = tuple(polls)
         fence = fence_for((*self._polls, *(check.request for check in checks)))
-        self._member: Member = line.join(config.name, config.address, fence)
-        super().__init__(config.name, units, self._member, checks)
+        super().__init__(config.name, units, line.join(config.name, config.address, fence), checks)
 
     def readings(self, answers: Sequence[Sequence[int]]) -> dict[int, Reading]:
         """Convert the answers to the polls to readings."""

@@ -20,7 +20,7 @@ import msgspec
 from drivers.errors import DeviceGarbled, DeviceRefused
 from drivers.families.base import DeviceSettings, Family, Module
 from drivers.families.inputs import thermocouples
-from drivers.lines.dcon_line import DconLine
+from drivers.lines.dcon_line import DconLine, DconMember
 from drivers.protocols.dcon import BadTextError, split_values, thermocouple
 from drivers.protocols.thermocouples import ADVANTECH, ICPDAS, STANDARD, Span, type_of_code
 from drivers.reading import Quality, Reading
@@ -73,16 +73,18 @@ class DconSettings(DeviceSettings, frozen=True, kw_only=True, forbid_unknown_fie
 class DconModule(Module[str]):
     """A thermocouple module on a DCON line."""
 
+    _member: DconMember
+
     def __init__(self, config: DconSettings, line: DconLine, where: Where) -> None:
         if config.format != "engineering" and config.vendor is None:
             raise where.error(f"key 'vendor' is missing, format = \"{config.format}\" needs it: icpdas or advantech")
         self._table = _TABLES[config.vendor]
         self._types = thermocouples(config, self._table, config.channels, where, config.couple)
         self._config = config
-        self._member = line.join(config.name, config.address, with_checksum=config.checksum)
         self._type_for_all = False
         units = dict.fromkeys(self._types, "degc")
-        super().__init__(config.name, units, self._member, ("M", "2") if config.verify else ())
+        member = line.join(config.name, config.address, with_checksum=config.checksum)
+        super().__init__(config.name, units, member, ("M", "2") if config.verify else ())
 
     async def _poll(self) -> dict[int, Reading]:
         config = self._config

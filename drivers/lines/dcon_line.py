@@ -3,7 +3,7 @@
 Data replies contain no address, so a late one could be taken for another module's. They are distinguished as follows:
 
 - Before each command all received bytes are dropped, and only one command is sent at a time.
-- After a missing or broken data reply the module is *unsettled*. The line first waits until it is quiet,
+- After a missing or broken data reply the module is *out of sync*. The line first waits until it is quiet,
   and the module is asked for its name (`$AAM`) until it answers: name replies contain the address, and a module
   answers in order, so after its name no data reply of it is pending.
 - For `LOOSE_S` after a missing data reply the *other* modules' data are confirmed: each is asked for
@@ -18,15 +18,15 @@ import asyncio
 from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout
 from drivers.lines.serial_port import PortLostError, SerialPort
 from drivers.lines.settings import SerialLine
-from drivers.lines.shared_line import Place, SharedLine
+from drivers.lines.shared_line import LineMember, SharedLine
 from drivers.protocols.dcon import BadTextError, Reply, command, reply
 
 # Longer than any module or converter delays a reply, s.
 LOOSE_S = 10.0
 
 
-class DconMember(Place):
-    """One module's place on a line.
+class DconMember(LineMember):
+    """A module on a DCON line.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class DconLine(SharedLine[DconMember]):
     def join(self, name: str, address: int, *, with_checksum: bool) -> DconMember:
         """Add a module to the line."""
         member = DconMember(self, name, address, with_checksum=with_checksum)
-        self._places.append(member)
+        self._members.append(member)
         return member
 
     def close(self) -> None:
@@ -83,8 +83,8 @@ class DconLine(SharedLine[DconMember]):
             self._port.close()
             self._port = None
 
-    def _heard_at_s(self) -> float | None:
-        return self._port.heard_at_s if self._port is not None else None
+    def _received_at_s(self) -> float | None:
+        return self._port.received_at_s if self._port is not None else None
 
     async def _open(self, member: DconMember) -> None:
         if member.closed:
@@ -97,21 +97,21 @@ class DconLine(SharedLine[DconMember]):
             raise DeviceDisconnected(member.name, f"cannot open {self.config.port}: {error}") from None
         self.generation += 1
 
-    async def _settle(self, member: DconMember) -> None:
+    async def _resynchronise(self, member: DconMember) -> None:
         await self._be_quiet()
         await self.ask(member, f"${member.address:02X}M", "!")
-        member.unsettled = False
-        member.settlings += 1
+        member.out_of_sync = False
+        member.resynchronisations += 1
         self._loose_until_s.pop(member.address, None)
 
     async def data(self, member: DconMember, text: str) -> str:
         """Query data, and confirm their sender while another module's late data may still arrive."""
         now_s = asyncio.get_running_loop().time()
-        member.unsettled = True
+        member.out_of_sync = True
         try:
             body = await self.ask(member, text, ">")
         except DeviceRefused:
-            member.unsettled = False
+            member.out_of_sync = False
             raise
         except BaseException:
             self._loose_until_s[member.address] = now_s + LOOSE_S
@@ -120,7 +120,7 @@ class DconLine(SharedLine[DconMember]):
             await self.ask(member, f"${member.address:02X}M", "!", nothing_before=True)
         else:
             self._loose_until_s.clear()
-        member.unsettled = False
+        member.out_of_sync = False
         return body
 
     async def ask(self, member: DconMember, text: str, lead: str, *, nothing_before: bool = False) -> str:

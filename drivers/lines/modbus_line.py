@@ -3,7 +3,7 @@
 Faults, and how they are handled:
 
 - *Late answer (RTU).* An RTU frame does not say which request it answers. After a missing, broken or
-  refused answer the unit is *unsettled*: before its next request the line first waits until it is quiet,
+  refused answer the unit is *out of sync*: before its next request the line first waits until it is quiet,
   then sends a fence (`drivers.protocols.modbus.fence_for`), whose answer differs from all other answers of
   the unit. A device answers in order, so after the fence's answer no late answer is pending. Answers of other
   units differ by their unit id.
@@ -23,7 +23,7 @@ from drivers.errors import DeviceDisconnected, DeviceGarbled, DeviceRefused, Dev
 from drivers.lines.backoff import Backoff
 from drivers.lines.modbus_wire import LostError, ModbusWire, RefusalError
 from drivers.lines.settings import SerialLine, TcpLine
-from drivers.lines.shared_line import Place, SharedLine
+from drivers.lines.shared_line import LineMember, SharedLine
 from drivers.protocols.modbus import Request, WrongAnswerError, exception_text
 
 # Consecutive timeouts after which a TCP connection is reopened, because its peer may be gone.
@@ -38,8 +38,8 @@ class ModbusRefused(DeviceRefused):
         self.exception_code = exception_code
 
 
-class Member(Place):
-    """One device's place on a line.
+class ModbusMember(LineMember):
+    """A device on a Modbus line.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class Member(Place):
         return list(answer.bits[: request.count])
 
 
-class ModbusLine(SharedLine[Member]):
+class ModbusLine(SharedLine[ModbusMember]):
     """One Modbus connection and the devices on it.
 
     Parameters
@@ -94,10 +94,10 @@ class ModbusLine(SharedLine[Member]):
         self._no_host_since_s = 0.0
         self._timeouts = 0
 
-    def join(self, name: str, address: int, fence: Request) -> Member:
+    def join(self, name: str, address: int, fence: Request) -> ModbusMember:
         """Add a device to the line."""
-        member = Member(self, name, address, fence)
-        self._places.append(member)
+        member = ModbusMember(self, name, address, fence)
+        self._members.append(member)
         return member
 
     def close(self) -> None:
@@ -106,17 +106,17 @@ class ModbusLine(SharedLine[Member]):
             self._wire.close()
             self._wire = None
 
-    def _backoffs(self, member: Member) -> list[Backoff]:
+    def _backoffs(self, member: ModbusMember) -> list[Backoff]:
         return [member.backoff, self._backoff]
 
-    def _check_turn(self, member: Member, asked_at_s: float) -> None:
+    def _check_turn(self, member: ModbusMember, asked_at_s: float) -> None:
         if self._no_host_since_s > asked_at_s:
             raise DeviceTimeout(member.name, f"no connection to {self._where} within {self.timeout_s} s")
 
-    def _heard_at_s(self) -> float | None:
-        return self._wire.heard_at_s if self._wire is not None else None
+    def _received_at_s(self) -> float | None:
+        return self._wire.received_at_s if self._wire is not None else None
 
-    async def _open(self, member: Member) -> None:
+    async def _open(self, member: ModbusMember) -> None:
         if member.closed:
             raise DeviceDisconnected(member.name, "is closed")
         if self._wire is not None and self._wire.connected:
@@ -139,22 +139,22 @@ class ModbusLine(SharedLine[Member]):
         self._timeouts = 0
         self.generation += 1
 
-    async def _settle(self, member: Member) -> None:
+    async def _resynchronise(self, member: ModbusMember) -> None:
         if self._numbered:
             return
         await self._be_quiet()
         # A refusal is an answer as well. If it is the late one, the fence's data still come, and match no request.
         with contextlib.suppress(DeviceRefused):
             await self.ask(member, member.fence)
-        member.unsettled = False
-        member.settlings += 1
+        member.out_of_sync = False
+        member.resynchronisations += 1
 
-    async def ask(self, member: Member, request: Request) -> ModbusPDU:
+    async def ask(self, member: ModbusMember, request: Request) -> ModbusPDU:
         """Send one request and turn its failures into driver errors."""
         wire = self._wire
         if wire is None:
             raise DeviceDisconnected(member.name, "is closed")
-        settled, member.unsettled = member.unsettled, True
+        before, member.out_of_sync = member.out_of_sync, True
         try:
             answer = await wire.ask(member.address, request)
         except RefusalError as error:
@@ -175,7 +175,7 @@ class ModbusLine(SharedLine[Member]):
             text = f"no answer from unit {member.address} on {self._where} within {self.timeout_s} s"
             raise DeviceTimeout(member.name, text) from None
         self._timeouts = 0
-        member.unsettled = settled
+        member.out_of_sync = before
         return answer
 
     @property

@@ -12,6 +12,7 @@ from pymodbus.client.base import ModbusBaseClient
 from pymodbus.exceptions import ConnectionException
 from pymodbus.pdu import ModbusPDU
 
+from drivers.errors import failure_text
 from drivers.lines.settings import SerialLine, TcpLine
 from drivers.protocols.modbus import (
     READ_COILS,
@@ -32,7 +33,7 @@ if logging.getLogger("pymodbus").level == logging.NOTSET:
 
 # Far more than any frame with late ones before it, and small enough to search at every arrival.
 _MOST_BUFFERED = 8192
-_MOST_HEARD = 1024
+_MOST_RECEIVED = 1024
 
 
 class RefusalError(Exception):
@@ -62,8 +63,8 @@ class ModbusWire:
         self._unit = 0
         self._transaction = 0
         self._wrong: WrongAnswerError | None = None
-        self._heard = bytearray()
-        self.heard_at_s = 0.0
+        self._received = bytearray()
+        self.received_at_s = 0.0
         self._why = ""
         self._client = self._make(config)
         create = self._client.ctx.call_create
@@ -73,7 +74,7 @@ class ModbusWire:
             try:
                 return await create()
             except (OSError, ValueError, termios.error) as error:
-                self._why = str(error) or type(error).__name__
+                self._why = failure_text(error)
                 raise OSError(self._why) from error
 
         self._client.ctx.call_create = explained
@@ -151,7 +152,7 @@ class ModbusWire:
             The connection broke.
         """
         self._request, self._unit, self._wrong = request, unit, None
-        self._heard.clear()
+        self._received.clear()
         try:
             answer = await self._send(unit, request)
         except ConnectionException as error:
@@ -181,7 +182,7 @@ class ModbusWire:
         """Distinguish a silent device from one with a wrong answer."""
         if self._wrong is not None:
             return self._wrong
-        if not self._numbered and (why := describe_rtu(bytes(self._heard), unit, request)):
+        if not self._numbered and (why := describe_rtu(bytes(self._received), unit, request)):
             return WrongAnswerError(why)
         return TimeoutError()
 
@@ -190,7 +191,7 @@ class ModbusWire:
         if sending:
             self._transaction = int.from_bytes(data[:2], "big")
             return data
-        self.heard_at_s = asyncio.get_running_loop().time()
+        self.received_at_s = asyncio.get_running_loop().time()
         if self._request is None or self._wrong is not None:
             return b""
         if self._numbered:
@@ -201,7 +202,7 @@ class ModbusWire:
                 self._fail(ModbusException(str(error)))
                 return b""
         # pymodbus passes everything since the request, unless it has given up on it.
-        self._heard[:] = data[-_MOST_HEARD:]
+        self._received[:] = data[-_MOST_RECEIVED:]
         return find_rtu(data, self._unit, self._request) or b""
 
     def _trace_connect(self, connected: bool) -> None:

@@ -9,6 +9,7 @@ from collections import deque
 
 import serial
 
+from drivers.errors import failure_text
 from drivers.lines.settings import SerialLine
 from drivers.protocols.dcon import CR
 
@@ -47,12 +48,12 @@ class SerialPort:
                 exclusive=True,
             )
         except (OSError, ValueError, termios.error) as error:
-            raise PortLostError(str(error)) from None
+            raise PortLostError(failure_text(error)) from None
         self._lines: deque[bytes] = deque(maxlen=64)
         self._rest = bytearray()
         self._changed = asyncio.Event()
         self._lost = ""
-        self.heard_at_s = 0.0
+        self.received_at_s = 0.0
         self._loop.add_reader(self._serial.fileno(), self._readable)
 
     @property
@@ -117,7 +118,7 @@ class SerialPort:
             return
         if not data:
             return
-        self.heard_at_s = self._loop.time()
+        self.received_at_s = self._loop.time()
         *lines, rest = (bytes(self._rest) + data).split(CR)
         self._lines.extend(lines)
         self._rest[:] = rest[-_MOST_BYTES:]

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib import pyplot
+from matplotlib.axes import Axes
 from scipy.io import savemat
 
 import compensator as tc
@@ -242,3 +245,13 @@ def test_tables_of_results_are_dataframes_where_one_came_in(run: Path) -> None:
     assert isinstance(plain["y_pred_um"], np.ndarray)
     assert list(plain) == list(out.columns) and plain.scores == out.scores
     assert isinstance(tc.compare({"quill": "quill"}, frame(run)).table, pd.DataFrame)
+
+
+def test_the_plot_of_a_frame_is_that_of_the_result_and_with_arguments_that_of_pandas(run: Path) -> None:
+    matplotlib.use("Agg")
+    out = tc.simulate("quill", frame(run))
+    assert [axes.get_ylabel() for axes in out.plot().axes] == ["Y, µm", "residual, µm"]
+    for axes in (out.plot(y="y_pred_um", legend=False), out.plot.line(y="y_pred_um", legend=False)):
+        assert isinstance(axes, Axes) and len(axes.lines) == 1
+        pyplot.close(axes.figure)
+    assert type(out.head().plot).__module__.startswith("pandas"), "a slice is a plain DataFrame"

@@ -166,6 +166,17 @@ def test_probe_reads_every_device_once(tmp_path: Path, capsys: pytest.CaptureFix
     assert code == 1
 
 
+def test_probe_names_a_missing_port_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = {"rtu": "/dev/absent", "tcp": 1, "plc": 2, "dcon": "/dev/absent-too", "data": 3, "command": 4}
+    config = tmp_path / "machine.toml"
+    config.write_text(configuration("vmc-07", lines, 7447), encoding="utf-8")
+    assert main(["probe", "--config", str(config)]) == 1
+    out = capsys.readouterr().out
+    assert out.count("/dev/absent:") == 1
+    rpm, coolant = out.splitlines()[-2:]
+    assert "cannot open 127.0.0.1:2" in rpm and "cannot open" not in coolant and "device_disconnected" in coolant
+
+
 def test_simulate_scores_the_published_model_on_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_run(tmp_path / "run.csv")
     assert (

@@ -15,10 +15,15 @@ import pytest
 from mcap.reader import make_reader
 
 from compensator.cli import main
+from compensator.clock import SystemClock
+from compensator.commands.watch import _Watch
 from compensator.demo.machine import configuration, hardware
+from compensator.watch.listener import of_endpoints
+from compensator.watch.shop import Shop
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.cli.test_adopt import Receiver, free_port, service
 from tests.cli.test_commands import load_fast_model
+from tests.watch.heard import offset
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +82,42 @@ def test_one_look_for_people(running: tuple[Path, int], capsys: pytest.CaptureFi
     out = capsys.readouterr().out
     assert "vmc-07" in out and "offset" in out and "residual" in out and "\x1b" not in out
     assert all(len(line) <= 80 for line in out.splitlines())
+
+
+class Turns(threading.Event):
+    """A stop that comes after some turns, without waiting."""
+
+    turns = 20
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.turns -= 1
+        return self.turns < 0
+
+
+@pytest.mark.parametrize(
+    ("connected", "received", "expected"),
+    [
+        (False, "", "no connection to tcp/127.0.0.1:1 yet; waiting"),
+        (True, "", "no service is heard below shop at tcp/127.0.0.1:1; waiting"),
+        (True, "alive", "the service has published nothing yet below shop at tcp/127.0.0.1:1; waiting"),
+        (True, "offset", ""),
+    ],
+)
+def test_a_pipe_that_receives_nothing_says_so_once(
+    connected: bool, received: str, expected: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    shop = Shop(SystemClock())
+    shown = _Watch(shop, of_endpoints("shop", ["tcp/127.0.0.1:1"]), Turns())
+    if connected:
+        shown.connection(True)
+    if received == "alive":
+        shop.set_alive("shop/sim/thermal/alive", True)
+    if received == "offset":
+        shop.receive("shop/sim/thermal/y/offset", offset(1))
+    caplog.clear()
+    with caplog.at_level("INFO", logger="compensator"):
+        shown.show(terminal=False, lines=True)
+    assert [record.getMessage() for record in caplog.records] == ([f"compensator: {expected}"] if expected else [])
 
 
 def watch(*arguments: str) -> subprocess.Popen[str]:

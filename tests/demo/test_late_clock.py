@@ -37,14 +37,14 @@ def late(behind_s: float, wall: VirtualClock) -> tuple[LateClock, list[float], l
 async def test_it_leaps_up_to_now_and_then_waits_for_what_is_left() -> None:
     wall = Wall()
     clock, advanced, caught_up = late(25.0, wall)
-    assert clock.utc_ns() == START_NS - 25 * NS and clock.monotonic_ns() == 0
+    assert clock.utc_ns() == START_NS - 25 * NS and clock.monotonic_ns() == 0 and clock.behind_s == 25.0
     for _ in range(2):
         await clock.sleep(10.0)
     assert advanced == [10.0, 20.0] and not wall.waited and not caught_up
-    assert clock.utc_ns() == START_NS - 5 * NS
+    assert clock.utc_ns() == START_NS - 5 * NS and clock.behind_s == 5.0
     await clock.sleep(10.0)
     assert wall.waited == [5.0] and caught_up == [2] and advanced[-1] == 30.0
-    assert clock.utc_ns() == wall.utc_ns() == START_NS + 5 * NS
+    assert clock.utc_ns() == wall.utc_ns() == START_NS + 5 * NS and clock.behind_s == 0.0
     await clock.sleep(10.0)
     assert wall.waited == [5.0, 10.0] and caught_up == [2] and clock.monotonic_ns() == 40 * NS
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import itertools
 import json
 import shutil
@@ -20,12 +21,13 @@ import pytest
 
 from compensator.cli import main
 from compensator.clock import NS
-from compensator.demo.live import apply_fault
+from compensator.demo.live import apply_fault, run_live
 from compensator.demo.machine import CapaNcdt, configuration, hardware
 from compensator.messages import Offset
 from compensator.recording.reading import read_messages, recordings
 from compensator.service.composition import read_once
 from compensator.service.loading import load
+from compensator.service.publisher import Publisher
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from sim_hardware.wire import Faults
 from tests.cli.test_adopt import free_port
@@ -96,6 +98,27 @@ def test_what_is_mistyped_is_answered_with_what_can_be_typed(line: str) -> None:
     faults = {name: (Faults(), 0) for name in ("t_q", "at", "y")}
     assert apply_fault(line, faults).endswith("expected one of break, freeze, unplug with one of t_q, at, y; or mend")
     assert not any(fault.of_input(0) for fault, _ in faults.values())
+
+
+def test_messages_of_the_simulated_past_are_recorded_and_not_published(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A watch that listens meanwhile would take them for those of a service that has fallen silent."""
+    calibrated = tmp_path / "conduction/calibration"
+    calibrated.mkdir(parents=True)
+    shutil.copy(QUILL, calibrated / "model.toml")
+    ages_s: list[float] = []
+
+    def publish(_: object, name: str, data: bytes) -> None:
+        if name == "offset":
+            ages_s.append((time.time_ns() - json.loads(data)["time_utc_ns"]) / NS)
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Publisher, "publish", publish)
+    folder = run_live(tmp_path, hours=1.0, seed=1, port=free_port(), typed=io.StringIO())
+    recorded = [record for path in recordings(folder, "vmc-07") for record in read_messages(path, ("offset",))]
+    assert len(recorded) >= 58
+    assert 1 <= len(ages_s) <= 3 and max(ages_s) < 150.0
 
 
 def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -69,6 +69,20 @@ def test_every_form_streams_what_it_says_of_a_whole_record(day, evidence):
     assert seen == set(kinds()) - {"regression"}
 
 
+@pytest.mark.parametrize("approximate", [True, False])
+def test_no_temperature_in_degrees_celsius_is_squared(approximate):
+    """Its zero is arbitrary, also on a winter day on which it comes near 0; that of a speed is not."""
+    columns, _, _ = record([], 5, 12.0)
+    columns["coolant_degc"] = columns["coolant_degc"] - np.mean(columns["coolant_degc"])
+    context = dataclasses.replace(evidence_of(QUILL, runs_from(columns)).context, approximate=approximate)
+    curves = {}
+    for hypothesis in proposals(context):
+        if hypothesis.effect.kind == "input":
+            curves.setdefault(hypothesis.effect.channel, set()).add(hypothesis.effect.curve)
+    assert curves["coolant_degc"] == {"linear"} and "square" in curves["spindle_rpm"]
+    assert "coolant_degc" not in context.zeroed
+
+
 def test_a_restart_in_between_changes_no_bit(day, evidence):
     run = day[0]
     for hypothesis in forms(evidence):

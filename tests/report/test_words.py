@@ -10,7 +10,9 @@ import pytest
 
 import compensator
 from compensator.cli import main
-from compensator.codes import DOMAINS, WORDS, Code, ModelWarning, Remark
+from compensator.codes import DOMAINS, SUFFIXES, WORDS, Code, ModelWarning, Remark
+from compensator.model.model_file import load_model
+from compensator.service.plausibility.isolation import FaultIsolation
 
 PACKAGE = Path(compensator.__file__).parent
 
@@ -79,6 +81,29 @@ def test_explain_says_the_same(code: str, capsys: pytest.CaptureFixture[str]) ->
     assert main(["explain", code, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["means"], said["do"]) == WORDS[code]
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("implausible:foo", "expected implausible, implausible:t_q_degc, implausible:at_degc, implausible:y_um, "),
+        ("outside_validity:model", "outside_validity:heat_w"),
+        ("channel_missing:", "expected channel_missing, channel_missing:CHANNEL"),
+        ("hold:t_q_degc", "unknown suffix 't_q_degc', expected hold"),
+    ],
+)
+def test_a_suffix_that_no_reason_has_is_refused(code: str, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", code]) == 2
+    assert expected in capsys.readouterr().err
+    assert main(["explain", "channel_missing:oil_degc"]) == 0, "any channel of a configuration"
+
+
+def test_every_suspect_can_be_explained() -> None:
+    model = load_model("quill")
+    suspects = {shape.suspect for shape in FaultIsolation(model, 10, 4, 0.5)._shapes} | {"model"}
+    assert suspects == set(SUFFIXES["implausible"])
+    for code, suffixes in SUFFIXES.items():
+        assert all(main(["explain", f"{code}:{suffix}"]) == 0 for suffix in suffixes)
 
 
 def test_no_code_has_two_meanings() -> None:

@@ -274,7 +274,8 @@ async def test_models_that_cannot_be_run_are_refused_and_nothing_changes(tmp_pat
         assert not one.answer["ok"] and expected in one.answer["text"] and "\n" not in one.answer["text"]
     assert {o.offset.model_sha256 for o in machine.outcomes} == {sha256_of(QUILL)}
     assert {o.offset.state for o in machine.outcomes} == {"ok"}
-    assert machine.store.before() is None
+    with pytest.raises(ServiceError, match="no previous model"):
+        machine.store.before()
     assert len(recordings(machine.recordings, MACHINE)) == 1
 
 
@@ -327,7 +328,9 @@ async def test_before_the_first_zero_there_is_nothing_to_warm_up(tmp_path: Path)
 
 def test_the_store_keeps_the_history_and_the_configuration_has_the_last_word(tmp_path: Path) -> None:
     store = ModelStore(tmp_path / "models", QUILL)
-    assert store.in_use() == QUILL and store.before() is None and store.before() is None
+    assert store.in_use() == QUILL
+    with pytest.raises(ServiceError, match="no previous model"):
+        store.before()
     store.adopt(STRONGER, name="stronger", time_utc_ns=1)
     store.adopt(WITH_INPUT, name="coolant", time_utc_ns=2)
     store.back(name="stronger", time_utc_ns=3)
@@ -340,7 +343,9 @@ def test_the_store_keeps_the_history_and_the_configuration_has_the_last_word(tmp
     ]
     assert store.load(sha256_of(WITH_INPUT)) == WITH_INPUT
     edited = ModelStore(tmp_path / "models", WITH_INPUT)  # somebody has configured another model since
-    assert edited.in_use() == WITH_INPUT and edited.before() is None
+    assert edited.in_use() == WITH_INPUT
+    with pytest.raises(ServiceError, match="no previous model"):
+        edited.before()
     (store.folder / f"{sha256_of(STRONGER)}.toml").write_bytes(b"something else")
     with pytest.raises(ServiceError, match="the file was changed"):
         store.in_use()

@@ -23,6 +23,8 @@ from compensator.model.effects.signals import RecordSignals
 BANK, BANK_LONGEST_MIN = 6, 600.0
 #: Ridge weight on the gains of a filter bank.
 BANK_RIDGE = 1e-3
+#: End of the names of channels in °C, whose zero is arbitrary: the square of such a value means nothing.
+DEGC = "_degc"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +145,7 @@ class Context:
     spans : mapping of str to float
         Span of each channel that moves, in its unit.
     zeroed : frozenset of str
-        Channels with a zero of their own: they come near 0 and go far from it.
+        Channels with a zero of their own: they come near 0 and go far from it. No temperature in °C is one.
     functions : mapping of str to (tuple of float, tuple of float)
         Coefficients b and a of each path.
     approximate : bool

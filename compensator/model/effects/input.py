@@ -18,7 +18,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
 from compensator.model.effects.blocks import Block, Delay, FilterBank, FromStart, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Free, Hypothesis, numbered, proposes
+from compensator.model.effects.hypothesis import BANK_RIDGE, DEGC, Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.seen import Seen, digits, quantity, signed
 from compensator.model.effects.signals import Signals
 
@@ -121,7 +121,8 @@ def inputs(context: Context) -> Iterator[Hypothesis]:
         yield Hypothesis(effect=linear, form="lag", free=one, amplitudes=gain)
         yield Hypothesis(effect=linear, form="lag and delay", free=(*one, delay), amplitudes=gain)
         yield Hypothesis(effect=both, form="two lags", free=two, amplitudes=gains, ordered=True)
-        yield Hypothesis(effect=square, form="square", free=one, amplitudes=(f"{gain[0]}2",))
+        if not channel.endswith(DEGC):
+            yield Hypothesis(effect=square, form="square", free=one, amplitudes=(f"{gain[0]}2",))
     if context.approximate:
         yield from banks(context)
 

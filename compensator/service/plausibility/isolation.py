@@ -28,7 +28,6 @@ LOG_ODDS = 3.0
 MISFIT = 4.0
 #: Samples without a change before a response is computed, so that the observer's gains have settled.
 _SETTLING = 120
-_HOUR_MIN = 60.0
 
 
 @dataclass(frozen=True, slots=True)

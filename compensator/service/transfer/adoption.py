@@ -265,12 +265,9 @@ class Adoption:
 
 
 def _model_file(store: ModelStore, order: _Order) -> bytes:
-    if order.action == CommandName.ADOPT:
-        return order.request.model.encode() if order.request.model else store.load(order.request.sha256)
-    before = store.before()
-    if before is None:
-        raise ServiceError("back: the configured model is in use; there is no previous model")
-    return before
+    if order.action == CommandName.BACK:
+        return store.before()
+    return order.request.model.encode() if order.request.model else store.load(order.request.sha256)
 
 
 def _give_way() -> Callable[[], None]:

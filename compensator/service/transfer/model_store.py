@@ -66,11 +66,11 @@ class ModelStore:
         adopted = self._read().in_use
         return self.load(adopted[-1].sha256) if adopted else self.configured
 
-    def before(self) -> bytes | None:
-        """Return the model file to which `back` returns; None if no model is adopted."""
+    def before(self) -> bytes:
+        """Return the model file to which `back` returns; ServiceError if no model is adopted."""
         adopted = self._read().in_use
         if not adopted:
-            return None
+            raise ServiceError("back: the configured model is in use; there is no previous model")
         return self.load(adopted[-2].sha256) if len(adopted) > 1 else self.configured
 
     def load(self, sha256: str) -> bytes:

@@ -212,7 +212,7 @@ def _warm(resumed: Resumed, last: _LastFile, loaded: LoadedConfig, model: Therma
     try:
         candidate = warm_up(loaded.resolve(config.recording.folder), config, model)
     except DataError as error:
-        resumed.note(f"{why}; the state cannot be restored ({error}): starting as at the first start", begun_anew=True)
+        resumed.note(f"{why}; the state cannot be restored ({error}): starting as at the first start", state_lost=True)
     else:
         resumed.compensation = candidate.compensation
         resumed.note(

@@ -265,15 +265,16 @@ async def test_port_that_is_no_port(rig: Any, tmp_path: Any) -> None:
     for protocol, port in [("modbus-rtu", str(file)), ("dcon", str(file)), ("dcon", "/dev/does-not-exist")]:
         table = adam() if protocol == "modbus-rtu" else {**adam(), "model": "dcon"}
         device = rig.fleet({"protocol": protocol, "port": port}, table).devices["d0"]
-        with pytest.raises(DeviceDisconnected, match="cannot open"):
+        with pytest.raises(DeviceDisconnected, match="cannot open") as refused:
             await device.read()
+        assert str(refused.value).count(port) == 1
 
 
 async def test_port_in_use_by_another_line(rig: Any, slave: Any, modbus_bus: Any) -> None:
     _, end, device = await pty_device(rig, made(slave), modbus_bus)
     await device.read()
     other = rig.fleet({"protocol": "modbus-rtu", "port": end.link}, adam()).devices["d0"]
-    with pytest.raises(DeviceDisconnected, match="cannot open"):
+    with pytest.raises(DeviceDisconnected, match="in use by another program"):
         await other.read()
     await device.close()
     assert (await other.read())[0].quality is Quality.GOOD
