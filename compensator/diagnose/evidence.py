@@ -136,7 +136,9 @@ class Evidence:
     def corrected(self, late: Effect) -> tuple[Evidence, Vector]:
         """Return the evidence with a late T_Q corrected as the engine does, and what that adds to y on every sample."""
         model = dataclasses.replace(self.model, effects=(*self.model.effects, late))
-        signals = tuple(signals_of(model, run, number) for number, run in enumerate(self.runs))
+        signals = tuple(
+            signals_of(model, run, own.number, own.begins_min) for run, own in zip(self.runs, self.signals, strict=True)
+        )
         before, after = (
             np.concatenate([r.share("all") + effects_of(m, run) for r, run in zip(rs, self.runs, strict=True)])
             for m, rs in ((self.model, self.signals), (model, signals))
@@ -170,7 +172,18 @@ class Evidence:
         return max(1.0, low_frequency_ratio([v[u] for v, u in pairs]))
 
 
-def signals_of(model: ThermalModel, run: Run, number: int = 0) -> RecordSignals:
+def _beginnings(runs: Sequence[Run]) -> list[float]:
+    """Return when each run begins after the start of the first, min: by its own time, or after the one before."""
+    begins: list[float] = []
+    end = first = runs[0].t_s[0]
+    for run in runs:
+        start = max(end, run.t_s[0])
+        begins.append(float(start - first) / 60.0)
+        end = start + run.t_s[-1] - run.t_s[0]
+    return begins
+
+
+def signals_of(model: ThermalModel, run: Run, number: int = 0, begins_min: float = 0.0) -> RecordSignals:
     """Run the base model's paths over a run.
 
     The heat is that of the plain inverse, without lag and linear; where the model corrects a late T_Q, that of the
@@ -195,6 +208,7 @@ def signals_of(model: ThermalModel, run: Run, number: int = 0) -> RecordSignals:
         tdtf=tdtf,
         share_of_ambient=model.dtf.sampled.response(drive_of(model, run.ambient_k)),
         number=number,
+        begins_min=begins_min,
     )
 
 
@@ -232,7 +246,8 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         If there is no y in it.
     """
     courses = [_without_noise(run) for run in runs]
-    signals = [signals_of(model, run, number) for number, run in enumerate(courses)]
+    begins = _beginnings(runs)
+    signals = [signals_of(model, run, i, begins[i]) for i, run in enumerate(courses)]
     parts = [
         run.y_um - own.y_dtf_um - own.y_tdtf_um - effects_of(model, run)
         for run, own in zip(courses, signals, strict=True)
@@ -303,6 +318,7 @@ def _context(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordS
         has_ambient=model.tdtf is not None,
         has_ttf=model.ttf is not None,
         minutes=max(record.size for record in signals) * signals[0].period_min,
+        span_min=signals[-1].begins_min + signals[-1].size * signals[-1].period_min,
         period_min=signals[0].period_min,
         sizes_um=sizes,
         taus_min={name: tuple(t for t in path.time_constants_min() if t > 0.0) for name, path in paths.items()},

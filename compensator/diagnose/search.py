@@ -20,7 +20,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, fit_terms, raw_columns, settled, summed
+from compensator.diagnose.fit import Fit, Term, fit_terms, raw_columns, response, settled, summed
 from compensator.diagnose.likelihood import Likelihood, Points, Rest
 from compensator.diagnose.scan import Place, Scan
 from compensator.diagnose.switching import switchings
@@ -30,6 +30,8 @@ from compensator.model.effects.hypothesis import Hypothesis, proposals
 MOST = 4
 #: What an effect must add to the logarithm of the evidence, beyond the number of places tried.
 MARGIN = 4.0
+#: What a source that no channel shows must add beyond that where the base has an error of its own, whose form it takes.
+UNSEEN = 15.0
 #: Hypotheses that are fitted after each scan, and how many of those are judged.
 FITTED, JUDGED = 6, 4
 #: Shortest period that averaged points show for what it is, points.
@@ -112,7 +114,7 @@ class Search:
             if self.score(better) <= self.score(best):
                 break
             best = self._exchanged(better)
-        best = self._with_simpler_name(self._pruned(best))
+        best = self._with_simpler_name(self._exchanged(self._pruned(best), len(best.terms)))
         return Selection(before=before, fit=best, rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))))
 
     def score(self, fit: Fit) -> float:
@@ -134,7 +136,8 @@ class Search:
 
     def _cost(self, hypothesis: Hypothesis) -> float:
         """Return what an effect must add to the evidence."""
-        return MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
+        unseen = UNSEEN if self.evidence.context.approximate and not hypothesis.effect.observed else 0.0
+        return unseen + MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
 
     # ------------------------------------------------------------------ steps
 
@@ -171,9 +174,17 @@ class Search:
                 found.append(max([added, *others], key=self.score))
         return sorted(found, key=self.score, reverse=True)
 
-    def _exchanged(self, fit: Fit) -> Fit:
-        """Exchange effects one at a time where that helps: what was found first may have absorbed two."""
-        for i in range(len(fit.terms) - 1):
+    def _exchanged(self, fit: Fit, count: int | None = None) -> Fit:
+        """Exchange effects one at a time where that helps: what was found first may have absorbed two.
+
+        Parameters
+        ----------
+        fit : Fit
+            Effects.
+        count : int, optional
+            How many effects are tried; by default all but the last, which was chosen beside the others.
+        """
+        for i in range(min(len(fit.terms), len(fit.terms) - 1 if count is None else count)):
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
             for candidate in self._proposed(others, unobserved=False)[:2]:
                 if candidate.places != fit.places:
@@ -186,7 +197,7 @@ class Search:
         while fit.terms:
             fewer = [settled(fit_terms(fit.likelihood, fit.starts(i))) for i in range(len(fit.terms))]
             best = max(range(len(fewer)), key=lambda i: self.score(fewer[i]))
-            small = [i for i, term in enumerate(fit.terms) if not self._is_worth_naming(term.hypothesis, fewer[i], fit)]
+            small = [i for i, term in enumerate(fit.terms) if not self._is_worth_naming(term, fewer[i], fit)]
             if self.score(fewer[best]) <= self.score(fit):
                 if not small:
                     return fit
@@ -199,12 +210,14 @@ class Search:
         noise = self.evidence.noise
         return noise.own_error_um > 0.0 and noise.is_expected(self.rms(fit) ** 2 * self.evidence.count)
 
-    def _is_worth_naming(self, hypothesis: Hypothesis, without: Fit, fit: Fit) -> bool:
-        """Return whether an effect explains enough of what is left, the base model's own error counted in."""
-        effect, allowance = hypothesis.effect, self.evidence.noise.allowance / self.evidence.count
-        others = self.evidence.context.approximate and len(fit.terms) > 1
+    def _is_worth_naming(self, term: Term, without: Fit, fit: Fit) -> bool:
+        """Return whether an effect is large enough beside what is left without it and the base model's own error."""
+        effect, others = term.hypothesis.effect, self.evidence.context.approximate and len(fit.terms) > 1
         share = effect.worth_with_others if others else effect.worth
-        return self.rms(fit) ** 2 + allowance < (1.0 - share) * (self.rms(without) ** 2 + allowance)
+        added = np.where(self.evidence.used, response(self.evidence, term), 0.0)
+        size = float(np.sum(self.evidence.without_nuisances(added) ** 2))
+        left = (self.rms(without) ** 2) * self.evidence.count + self.evidence.noise.allowance
+        return size > share * left
 
     def _is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""

@@ -330,6 +330,7 @@ def test_the_search_never_proposes_it() -> None:
     context = Context(
         has_ambient=True,
         has_ttf=True,
+        span_min=1440.0,
         minutes=2000.0,
         period_min=1.0,
         sizes_um={"DTF": 50.0, "TDTF": 5.0},

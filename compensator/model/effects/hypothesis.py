@@ -136,6 +136,8 @@ class Context:
         Whether the model has a TDTF and a TTF.
     minutes : float
         Length of the longest record, min.
+    span_min : float
+        Time from the start of the first record to the end of the last, min.
     period_min : float
         Sample period, min.
     sizes_um : mapping of str to float
@@ -158,6 +160,7 @@ class Context:
     has_ambient: bool
     has_ttf: bool
     minutes: float
+    span_min: float
     period_min: float
     sizes_um: Mapping[str, float]
     taus_min: Mapping[str, tuple[float, ...]] = field(default_factory=dict)

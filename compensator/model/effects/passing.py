@@ -18,6 +18,9 @@ from compensator.model.effects.hypothesis import Context, Free, Hypothesis, prop
 from compensator.model.effects.seen import Seen, digits, rounded, signed
 from compensator.model.effects.signals import RecordSignals
 
+#: No jump is looked for within this share of a record from its start.
+START_SHARE = 0.03
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimeOnly(Effect):
@@ -43,7 +46,7 @@ class Drift(TimeOnly):
     um_per_h: float = 1.0
 
     def course(self, record: RecordSignals) -> Vector:
-        return self.um_per_h * (record.minutes / 60.0)
+        return self.um_per_h * (record.time_min / 60.0)
 
     def explain(self, seen: Seen) -> str:
         return (
@@ -62,7 +65,7 @@ class Settling(TimeOnly):
     tau_min: float = 1.0
 
     def course(self, record: RecordSignals) -> Vector:
-        return self.size_um * (1.0 - np.exp(-record.minutes / self.tau_min))
+        return self.size_um * (1.0 - np.exp(-record.time_min / self.tau_min))
 
     def explain(self, seen: Seen) -> str:
         return (
@@ -82,7 +85,7 @@ class Jump(TimeOnly):
     at_min: float = 0.0
 
     def course(self, record: RecordSignals) -> Vector:
-        return self.jump_um * np.clip((record.minutes - self.at_min) / record.period_min + 1.0, 0.0, 1.0)
+        return self.jump_um * np.clip((record.time_min - self.at_min) / record.period_min + 1.0, 0.0, 1.0)
 
     def explain(self, seen: Seen) -> str:
         return (
@@ -102,7 +105,7 @@ class Periodic(TimeOnly):
     period_min: float = 1.0
 
     def columns(self, record: RecordSignals, blocks: Sequence[Block]) -> Matrix:
-        angle = 2.0 * np.pi * record.minutes / self.period_min
+        angle = 2.0 * np.pi * record.time_min / self.period_min
         return np.column_stack((np.sin(angle), np.cos(angle)))
 
     def explain(self, seen: Seen) -> str:
@@ -117,13 +120,15 @@ class Periodic(TimeOnly):
 @proposes
 def courses(context: Context) -> Iterator[Hypothesis]:
     """Propose a ramp, a drift of any time constant about the record's length, a jump at any time, any period."""
-    minutes, period = context.minutes, context.period_min
+    minutes, period = context.span_min, context.period_min
     yield Hypothesis(effect=Drift(), form="ramp", amplitudes=("um_per_h",))
     taus = tuple(float(t) for t in np.geomspace(minutes / 8.0, 2.0 * minutes, 6))
     tau = Free(name="tau_min", low=minutes / 10.0, high=3.0 * minutes, grid=taus)
     yield Hypothesis(effect=Settling(), form="settling", free=(tau,), amplitudes=("size_um",))
-    times = np.arange(5.0 * period, minutes - 5.0 * period, max(period, minutes / 600.0))
-    at = Free(name="at_min", low=period, high=minutes - period, grid=tuple(times.tolist()), log=False)
+    # What moves at the start of a record is its initial state.
+    first = max(5.0 * period, START_SHARE * minutes)
+    times = np.arange(first, minutes - 5.0 * period, max(period, minutes / 600.0))
+    at = Free(name="at_min", low=first - period, high=minutes - period, grid=tuple(times.tolist()), log=False)
     yield Hypothesis(effect=Jump(), form="jump", free=(at,), amplitudes=("jump_um",))
     # Of a period the record must hold about two.
     frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes

@@ -60,6 +60,8 @@ class RecordSignals(Signals[Vector]):
         What the DTF would make of the ambient's change if T_Q alone showed it, µm.
     number : int
         Which of several records this is.
+    begins_min : float
+        When it begins after the start of the first, min.
     """
 
     period_min: float
@@ -67,6 +69,7 @@ class RecordSignals(Signals[Vector]):
     tdtf: SampledTransferFunction
     share_of_ambient: Vector = field(default_factory=lambda: np.zeros(1))
     number: int = 0
+    begins_min: float = 0.0
 
     @property
     def size(self) -> int:
@@ -77,6 +80,11 @@ class RecordSignals(Signals[Vector]):
     def minutes(self) -> Vector:
         """Time from the start of the record, shape (n,), min."""
         return np.asarray(np.arange(self.size) * self.period_min)
+
+    @property
+    def time_min(self) -> Vector:
+        """Time from the start of the first record, shape (n,), min."""
+        return self.begins_min + self.minutes
 
     def function(self, path: str) -> SampledTransferFunction:
         """Return the transfer function of a path."""
