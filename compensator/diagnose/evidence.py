@@ -243,7 +243,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     noise_um = math.hypot(noise_floor(model, runs), _late_error_um(model, courses, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)
-    nuisances = np.asarray(block_diag(*(_nuisances(record, context) for record in signals)))
+    nuisances = np.asarray(block_diag(*(nuisances_of(record, context) for record in signals)))
     return Evidence(
         model=model,
         runs=tuple(runs),
@@ -276,8 +276,8 @@ def _basis(nuisances: Matrix, used: Mask) -> Matrix:
     return u[:, s > STATE_PRIOR * s[0]]
 
 
-def _nuisances(record: RecordSignals, context: Context) -> Matrix:
-    """Return a constant and the decay of every mode, each of size 1."""
+def nuisances_of(record: RecordSignals, context: Context) -> Matrix:
+    """Return a constant and the decay of every mode, each of size 1, on every sample."""
     taus: list[float] = []
     for tau in sorted({round(t, 1) for values in context.taus_min.values() for t in values}):
         if tau > 3.0 * record.period_min and (not taus or tau > 1.3 * taus[-1]):

@@ -1,0 +1,175 @@
+"""Which logged channel comes nearest to what the named effects leave.
+
+A sensor near a cause shows nearly what acts on Y, or the same a little earlier or later. So each channel alone goes
+through a filter bank, of lags behind it and of shorter ones ahead of it (a sensor that follows the cause), with
+regularised gains of one learned size. Channels are ranked by what that adds to the evidence.
+
+Named temperatures are among what is to be explained: a temperature may only be near the cause, while a speed or a flow
+is a cause itself and stays explained.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compensator.arrays import Matrix, Vector
+from compensator.diagnose.fit import Fit, Term, fit_terms
+from compensator.diagnose.likelihood import Likelihood, Points, Rest
+from compensator.model.effects.blocks import FilterBank
+from compensator.model.effects.signals import RecordSignals
+
+#: Lags behind a channel, and ahead of it, min.
+BEHIND_MIN, AHEAD_MIN = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0), (4.0, 12.0, 35.0)
+#: Sizes of a channel's gains that are tried, as shares of the deformation's spread.
+SIZES = np.geomspace(0.01, 3.0, 6)
+#: Names of the base's own temperatures among the channels.
+T_Q, AT = "t_q_degc", "at_degc"
+#: A channel of this ending is a temperature.
+TEMPERATURE = "_degc"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Near:
+    """A logged channel that resembles what is to be explained.
+
+    Parameters
+    ----------
+    channel : str
+        The channel; `t_q_degc` and `at_degc` are among them.
+    evidence : float
+        What it adds to the logarithm of the evidence, alone.
+    lag_min : float
+        Single lag that suits it best, min: what is to be explained comes later than the channel, or earlier where it is
+        negative.
+    """
+
+    channel: str
+    evidence: float
+    lag_min: float
+
+
+def is_near_only(term: Term) -> bool:
+    """Return whether the channel of an effect may be only near its cause: an input by a temperature."""
+    kind, _, channel = term.hypothesis.place
+    return kind == "input" and channel.endswith(TEMPERATURE)
+
+
+def nearest(fit: Fit) -> tuple[Near, ...]:
+    """Rank the logged channels by how near they come to what a fit leaves and what temperatures explain in it.
+
+    Parameters
+    ----------
+    fit : Fit
+        All effects found.
+
+    Returns
+    -------
+    tuple of Near
+        Nearest first; only those that add to the evidence.
+    """
+    causes = [t.start for t in fit.terms if t.hypothesis.effect.observed and not is_near_only(t)]
+    base = fit_terms(fit.likelihood, causes, evaluations=1)
+    ranking = _Ranking(base, fit.rest)
+    found = [ranking.of(name, columns) for name, columns in _banks(fit.likelihood.points)]
+    return tuple(sorted((near for near in found if near.evidence > 0.0), key=lambda near: -near.evidence))
+
+
+def course_evidence(fit: Fit, course: Vector) -> float:
+    """Return what a channel with exactly some course would add to the evidence of what a fit leaves without it.
+
+    Parameters
+    ----------
+    fit : Fit
+        All effects found.
+    course : numpy.ndarray, shape (n,)
+        On every sample, µm.
+    """
+    observed = [t.start for t in fit.terms if t.hypothesis.effect.observed]
+    base = fit_terms(fit.likelihood, observed, evaluations=1)
+    points = fit.likelihood.points
+    return _Ranking(base, fit.rest).of("", _unit(points, points.averaged(course[:, None]))).evidence
+
+
+class _Ranking:
+    """The evidence of single channels, with the slow rest between what is left without any and what a fit left."""
+
+    def __init__(self, base: Fit, smallest: Rest) -> None:
+        self._points = base.likelihood.points
+        largest = self._points.settled(base.columns, base.fixed, base.rest, steps=8)
+        between = dataclasses.replace(largest, slow_um=math.sqrt(largest.slow_um * smallest.slow_um))
+        self._views = []
+        for rest in (largest, between, smallest):
+            likelihood = Likelihood(self._points, rest)
+            kept = likelihood.projected(base.columns)
+            target = likelihood.target - likelihood.projected(base.fixed[:, None])[:, 0]
+            known = likelihood.log_prior - 0.5 * likelihood.log_det
+            self._views.append((likelihood, kept, target, known))
+        self._alone = max(_log_evidence(kept, target)[0] + known for _, kept, target, known in self._views)
+
+    def of(self, name: str, columns: Matrix) -> Near:
+        """Return how near a channel comes, given what it would be behind and ahead of all lags."""
+        best, lag = -math.inf, 0.0
+        scaled = columns * self._points.spread_um
+        for likelihood, kept, target, known in self._views:
+            white = likelihood.projected(scaled)
+            value = max(
+                _log_evidence(np.column_stack([kept, white * size / math.sqrt(white.shape[1])]), target)[0]
+                for size in SIZES
+            )
+            if value + known > best:
+                best, lag = value + known, _single_lag(white, target)
+        return Near(channel=name, evidence=best - self._alone, lag_min=lag)
+
+
+def _log_evidence(table: Matrix, target: Vector) -> tuple[float, Vector]:
+    """Return the logarithm of the evidence of columns of which one unit in each is expected, and their weights."""
+    root = np.linalg.cholesky(np.eye(table.shape[1]) + table.T @ table)
+    half = np.linalg.solve(root, table.T @ target)
+    surprise = float(target @ target - half @ half) + 2.0 * float(np.log(np.diag(root)).sum())
+    return -0.5 * surprise, np.linalg.solve(root.T, half)
+
+
+def _single_lag(white: Matrix, target: Vector) -> float:
+    """Return the lag of the one column that explains most, min; negative ahead of the channel."""
+    squares = np.einsum("ij,ij->j", white, white)
+    gains = (white.T @ target) ** 2 / (1.0 + squares)
+    lags = (*BEHIND_MIN, *(-lag for lag in AHEAD_MIN))
+    return float(lags[int(np.argmax(gains))]) if white.shape[1] == len(lags) else 0.0
+
+
+def _banks(points: Points) -> list[tuple[str, Matrix]]:
+    """Return every channel with its columns of size 1, the base's own temperatures among them."""
+    evidence = points.evidence
+    names = list(evidence.context.channels)
+    names += [T_Q, *([AT] if evidence.context.has_ambient else [])]
+    period_min = evidence.context.period_min
+    references = [run.difference_k + run.ambient_k for run in evidence.runs]
+
+    def signal(name: str, record: RecordSignals, t_q_k: Vector) -> Vector:
+        return t_q_k if name == T_Q else record.ambient_k if name == AT else record.channels[name]
+
+    found = []
+    for name in names:
+        values = [signal(name, r, t_q) for r, t_q in zip(evidence.signals, references, strict=True)]
+        found.append((name, _unit(points, points.averaged(_bank(values, period_min)))))
+    return found
+
+
+def _bank(values: Sequence[Vector], period_min: float) -> Matrix:
+    """Return the lags behind a channel and ahead of it over several records, shape (n, lags)."""
+    behind = FilterBank(BEHIND_MIN, [(1.0,) * len(BEHIND_MIN)], period_min)
+    ahead = FilterBank(AHEAD_MIN, [(1.0,) * len(AHEAD_MIN)], period_min)
+    parts = [np.column_stack([behind.columns(u - u[0]), ahead.columns((u - u[-1])[::-1])[::-1]]) for u in values]
+    return np.concatenate(parts)
+
+
+def _unit(points: Points, table: Matrix) -> Matrix:
+    """Return columns about their means, of standard deviation 1 on the points used; 0 where a column is constant."""
+    table = table - table[points.used].mean(axis=0)
+    spread = np.std(table[points.used], axis=0)
+    return np.asarray(table / np.where(spread > 1e-9, spread, np.inf))
