@@ -136,7 +136,7 @@ def advice_of(
     unexplained = _unexplained(found, explained_pct=explained_pct, is_explained=is_explained)
     near: tuple[Near, ...] = ()
     if unexplained is not None or between_rivals or any(map(is_near_only, fit.terms)):
-        near = nearest(fit)[:LISTED]
+        near = nearest(fit, found.selection.before.rest)[:LISTED]
     tests = list(between_rivals)
     if unexplained is not None and unexplained.kind == "unobserved":
         tests.insert(0, _shown_again(unexplained, fit, deciding))
@@ -196,7 +196,7 @@ def _described(
         tau_min=tau_min,
         times=tuple((run, at / 60.0) for run, at in times[:TIMES]),
         goes_with=event,
-        sensor_evidence=course_evidence(found.selection.fit, course),
+        sensor_evidence=course_evidence(found.selection.fit, found.selection.before.rest, course),
     )
 
 
@@ -237,7 +237,14 @@ def _shown_again(unexplained: Unexplained, fit: Fit, deciding: Deciding) -> Plan
     others = fit_terms(fit.likelihood, [t.start for t in fit.terms if t is not source], evaluations=1)
     event = unexplained.goes_with.event if unexplained.goes_with else ""
     size_um = float(np.median(np.abs(source.amplitudes)))
-    return deciding.shown_again(others, size_um=size_um, tau_min=unexplained.tau_min, event=event)
+    minutes = sum(r.size * r.period_min for r in deciding.trials.evidence.signals)
+    return deciding.shown_again(
+        others,
+        size_um=size_um,
+        tau_min=unexplained.tau_min,
+        event=event,
+        wait_h=minutes / 60.0 / len(source.amplitudes),
+    )
 
 
 def _seen_once(fit: Fit, deciding: Deciding) -> Iterator[SeenOnce]:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from compensator.arrays import Matrix, Vector
+from compensator.arrays import Indices, Matrix, Vector
 from compensator.diagnose.events import DAY, HEAT
 from compensator.diagnose.evidence import Evidence, nuisances_of
 from compensator.diagnose.fit import Fit, Term, raw_columns
@@ -70,7 +70,7 @@ class PlannedTest:
         """What to do, how long, and by how much it decides."""
         change = f"expected change of the log evidence {self.expected_evidence:.3g}, {DECIDES:g} decides"
         if self.decides:
-            return f"{self.words}; {self.hours:g} h are enough ({change})."
+            return f"{self.words}; from rest, {self.hours:g} h are enough ({change})."
         words = self.words[:1].lower() + self.words[1:]
         return f"No test of up to {HOURS[-1]:g} h decides; the best: {words} for {self.hours:g} h ({change})."
 
@@ -116,7 +116,7 @@ class Deciding:
         # Of tests that decide equally soon, the surer one.
         return max(planned, key=_soonest, default=None)
 
-    def shown_again(self, others: Fit, *, size_um: float, tau_min: float, event: str) -> PlannedTest:
+    def shown_again(self, others: Fit, *, size_um: float, tau_min: float, event: str, wait_h: float) -> PlannedTest:
         """Return the test in which a source that no channel shows acts again, with a sensor that shows it.
 
         Parameters
@@ -127,6 +127,8 @@ class Deciding:
             How far the source moves Y when it is switched, µm, and its lag, min.
         event : str
             The channel, `heat` or `day` that it goes with; empty: it is waited for.
+        wait_h : float
+            How long it takes until it acts by itself, h.
         """
         between = "a source that a new sensor shows", "nothing"
         trials = [trial for trial in self.trials.of([event]) if event and trial.driver == event]
@@ -134,18 +136,20 @@ class Deciding:
         for trial in trials or [trial for trial in self.trials.of(()) if not trial.driver]:
             joint = self._of(trial)
             lag = Lag(tau_min, trial.signals.period_min)
-            course = size_um * lag.filter(_level(trial) if trials else np.ones(trial.signals.size))
-            planned.append(self._test(trial, *joint.change_by(others, course), between))
+            level: Vector = _level(trial) if trials else np.asarray(trial.signals.minutes > 0.0, dtype=np.float64)
+            course = size_um * lag.filter(level)
+            planned.append(self._test(trial, joint.change_by(others, course), between))
         best = max(planned, key=_soonest)
         if trials:
             return best
         words = "Repeat the work of this record with the new sensor until the source acts again"
         if event == DAY:
             words = "Record a whole day again with the new sensor"
-        return dataclasses.replace(best, words=words)
+        hours = max(24.0 if event == DAY else 0.0, math.ceil(2.0 * (wait_h + best.hours)) / 2.0)
+        return dataclasses.replace(best, words=words, hours=hours)
 
     def _planned(self, trial: Trial, first: Fit, second: Fit, between: tuple[str, str]) -> PlannedTest:
-        return self._test(trial, *self._of(trial).change(first, second), between)
+        return self._test(trial, self._of(trial).change(first, second), between)
 
     def _of(self, trial: Trial) -> _Joint:
         if id(trial) not in self._joint:
@@ -153,13 +157,13 @@ class Deciding:
         return self._joint[id(trial)]
 
     @staticmethod
-    def _test(trial: Trial, hours: Vector, change: Vector, between: tuple[str, str]) -> PlannedTest:
+    def _test(trial: Trial, change: Vector, between: tuple[str, str]) -> PlannedTest:
         enough = np.flatnonzero(change >= DECIDES)
         at = int(enough[0]) if enough.size else int(np.argmax(change))
         return PlannedTest(
             words=trial.words,
             driver=trial.driver,
-            hours=float(hours[at]),
+            hours=HOURS[at],
             expected_evidence=float(change[at]),
             between=between,
         )
@@ -171,34 +175,36 @@ class _Joint:
     def __init__(self, evidence: Evidence, trial: Trial) -> None:
         self.record_period_min = evidence.context.period_min * max(1, math.ceil(evidence.count / POINTS))
         n = trial.signals.size
+        # A test begins at rest: only its zero is unknown.
+        rest = nuisances_of(trial.signals, evidence.context)
+        rest[:, 1:] = 0.0
         self.evidence = dataclasses.replace(
             evidence,
             signals=(*evidence.signals, trial.signals),
             residual=np.concatenate([evidence.residual, np.zeros(n)]),
             used=np.concatenate([evidence.used, np.ones(n, dtype=bool)]),
-            nuisances=np.asarray(block_diag(evidence.nuisances, nuisances_of(trial.signals, evidence.context))),
+            nuisances=np.asarray(block_diag(evidence.nuisances, rest)),
             noise=dataclasses.replace(evidence.noise, count=evidence.count + n),
         )
         self.points = Points(self.evidence)
         self.before = int(self.points.used[: self.points.starts[-1]].sum())
-        ends = np.array(HOURS) * 60.0 / self.points.period_min
-        self.ends = np.unique(np.clip(ends.astype(int), 1, self.points.count - self.before))
+        self.ends = np.ceil(np.array(HOURS) * 60.0 / self.points.period_min).astype(int)
         self._known: dict[int, tuple[Fit, Vector, Matrix, Matrix]] = {}
 
-    def change(self, first: Fit, second: Fit) -> tuple[Vector, Vector]:
-        """Return durations, h, and the expected change of the logarithm of the evidence at each."""
+    def change(self, first: Fit, second: Fit) -> Vector:
+        """Return the expected change of the logarithm of the evidence after each of the durations."""
         views = [self._prediction(fit, first.rest) for fit in (first, second)]
         d = views[0][0] - views[1][0]
         both = [_expected(d, table, precision, self.ends) for _, table, precision in views]
-        return self.ends * self.points.period_min / 60.0, np.minimum(*both)
+        return np.minimum(*both)
 
-    def change_by(self, fit: Fit, course: Vector) -> tuple[Vector, Vector]:
+    def change_by(self, fit: Fit, course: Vector) -> Vector:
         """Return the same for what a source adds to the test, beside a fit without it."""
         begin = self.evidence.used.size - course.size
         added = self.points.averaged(np.concatenate([np.zeros(begin), course])[:, None])
         d = self._whitening(fit.rest).of(added)[self.before :, 0]
         _, table, precision = self._prediction(fit, fit.rest)
-        return self.ends * self.points.period_min / 60.0, _expected(d, table, precision, self.ends)
+        return _expected(d, table, precision, self.ends)
 
     def _whitening(self, rest: Rest) -> Whitening:
         # The noise of a point is that of its samples' mean; with the test there may be more of them in a point.
@@ -251,9 +257,9 @@ class _Joint:
         return added, np.concatenate(columns, axis=1) if columns else np.zeros((added.size, 0))
 
 
-def _soonest(test: PlannedTest) -> tuple[bool, float, float]:
-    """Return the rank of a test: decides, soon, surely."""
-    return test.decides, -test.hours if test.decides else 0.0, test.expected_evidence
+def _soonest(test: PlannedTest) -> tuple[bool, float]:
+    """Return the rank of a test: one that decides soon, or else one that changes most. Simple ones come first."""
+    return test.decides, -test.hours if test.decides else test.expected_evidence
 
 
 def _level(trial: Trial) -> Vector:
@@ -264,10 +270,10 @@ def _level(trial: Trial) -> Vector:
     return np.asarray(change / max(float(np.abs(change).max()), 1e-12))
 
 
-def _expected(d: Vector, table: Matrix, precision: Matrix, ends: Vector) -> Vector:
+def _expected(d: Vector, table: Matrix, precision: Matrix, ends: Indices) -> Vector:
     """Return ½ dᵀ S⁻¹ d with S = 1 + T P⁻¹ Tᵀ, over the first points of a test."""
     found = []
-    for end in ends.astype(int).tolist():
+    for end in ends.tolist():
         some, part = table[:end], d[:end]
         moment = some.T @ part
         found.append(0.5 * float(part @ part - moment @ np.linalg.solve(precision + some.T @ some, moment)))

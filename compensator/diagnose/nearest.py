@@ -59,13 +59,15 @@ def is_near_only(term: Term) -> bool:
     return kind == "input" and channel.endswith(TEMPERATURE)
 
 
-def nearest(fit: Fit) -> tuple[Near, ...]:
+def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
     """Rank the logged channels by how near they come to what a fit leaves and what temperatures explain in it.
 
     Parameters
     ----------
     fit : Fit
         All effects found.
+    unexplained : Rest
+        The rest where no effect explains anything: where the search of it begins.
 
     Returns
     -------
@@ -74,33 +76,36 @@ def nearest(fit: Fit) -> tuple[Near, ...]:
     """
     causes = [t.start for t in fit.terms if t.hypothesis.effect.observed and not is_near_only(t)]
     base = fit_terms(fit.likelihood, causes, evaluations=1)
-    ranking = _Ranking(base, fit.rest)
+    ranking = _Ranking(base, unexplained, fit.rest)
     found = [ranking.of(name, columns) for name, columns in _banks(fit.likelihood.points)]
     return tuple(sorted((near for near in found if near.evidence > 0.0), key=lambda near: -near.evidence))
 
 
-def course_evidence(fit: Fit, course: Vector) -> float:
+def course_evidence(fit: Fit, unexplained: Rest, course: Vector) -> float:
     """Return what a channel with exactly some course would add to the evidence of what a fit leaves without it.
 
     Parameters
     ----------
     fit : Fit
         All effects found.
+    unexplained : Rest
+        The rest where no effect explains anything.
     course : numpy.ndarray, shape (n,)
         On every sample, µm.
     """
     observed = [t.start for t in fit.terms if t.hypothesis.effect.observed]
     base = fit_terms(fit.likelihood, observed, evaluations=1)
     points = fit.likelihood.points
-    return _Ranking(base, fit.rest).of("", _unit(points, points.averaged(course[:, None]))).evidence
+    return _Ranking(base, unexplained, fit.rest).of("", _unit(points, points.averaged(course[:, None]))).evidence
 
 
 class _Ranking:
     """The evidence of single channels, with the slow rest between what is left without any and what a fit left."""
 
-    def __init__(self, base: Fit, smallest: Rest) -> None:
+    def __init__(self, base: Fit, unexplained: Rest, smallest: Rest) -> None:
         self._points = base.likelihood.points
-        largest = self._points.settled(base.columns, base.fixed, base.rest, steps=8)
+        start = dataclasses.replace(unexplained, own_um=smallest.own_um)
+        largest = self._points.settled(base.columns, base.fixed, start)
         between = dataclasses.replace(largest, slow_um=math.sqrt(largest.slow_um * smallest.slow_um))
         self._views = []
         for rest in (largest, between, smallest):

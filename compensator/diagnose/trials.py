@@ -82,7 +82,7 @@ class Trials:
         channels : iterable of str
             Channels that the explanations name.
         """
-        for name in dict.fromkeys((self.heating, AT, "", *channels)):
+        for name in dict.fromkeys(("", self.heating, AT, *channels)):
             if name not in self._known:
                 self._known[name] = list(self._trials(name))
             yield from self._known[name]
@@ -135,9 +135,8 @@ class Trials:
             words = f"Step {label} by half of {by}, all of it, half and none, {LEVEL_H:g} h each"
             yield self._trial(words, name, {name: sizes})
         if name != self.heating and size:
-            heated = f"with the heat steady at {self._in_words(self.heating)}"
-            if self.heating != HEAT:
-                heated = f"with {self.heating} steady, changed by {self._in_words(self.heating)}"
+            heated = f"while {'the heat' if self.heating == HEAT else self.heating} stays "
+            heated += f"{self._in_words(self.heating)} above its start"
             words = f"Switch {name} by {by} on and off every {LEVEL_H:g} h {heated}"
             yield self._trial(words, name, {name: 1.0 - cycle, self.heating: hold})
 

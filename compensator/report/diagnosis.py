@@ -19,6 +19,7 @@ from compensator.diagnose.summary import (
     verdict,
 )
 from compensator.model.thermal_model import ThermalModel
+from compensator.report.advice import advice_blocks
 from compensator.report.page import (
     Block,
     Details,
@@ -51,6 +52,7 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
     t = _hours(diagnosis)
     blocks: list[Block] = [_before_and_after(t, diagnosis), error_table(diagnosis)]
     blocks += [_effect(t, effect) for effect in diagnosis.effects]
+    blocks += advice_blocks(diagnosis)
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))
