@@ -18,7 +18,7 @@ from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.events import DAY, GoesWith, Time, follows_day, goes_with, steepest
 from compensator.diagnose.findings import Findings
 from compensator.diagnose.fit import Fit, Term, fit_terms, response
-from compensator.diagnose.nearest import AT, Near, course_evidence, is_near_only, nearest
+from compensator.diagnose.nearest import AT, Near, acts_by_temperature, course_evidence, nearest
 from compensator.diagnose.trials import Trials
 from compensator.model.effects.hypothesis import digits
 from compensator.model.effects.unobserved import Unobserved
@@ -135,7 +135,7 @@ def advice_of(
     fit = found.selection.fit
     unexplained = _unexplained(found, explained_pct=explained_pct, is_explained=is_explained)
     near: tuple[Near, ...] = ()
-    if unexplained is not None or between_rivals or any(map(is_near_only, fit.terms)):
+    if unexplained is not None or between_rivals or any(map(acts_by_temperature, fit.terms)):
         near = nearest(fit, found.selection.before.rest)[:LISTED]
     tests = list(between_rivals)
     if unexplained is not None and unexplained.kind == "unobserved":

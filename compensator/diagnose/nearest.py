@@ -4,8 +4,9 @@ A sensor near a cause shows nearly what acts on Y, or the same a little earlier 
 through a filter bank, of lags behind it and of shorter ones ahead of it (a sensor that follows the cause), with
 regularised gains of one learned size. Channels are ranked by what that adds to the evidence.
 
-Named temperatures are among what is to be explained: a temperature may only be near the cause, while a speed or a flow
-is a cause itself and stays explained.
+Where a source was found that no channel shows, it is what is to be explained. Else it is what the named effects leave
+with what they explain by temperatures: a temperature may only be near the cause, while a speed or a flow is a cause
+itself and stays explained.
 """
 
 from __future__ import annotations
@@ -53,10 +54,10 @@ class Near:
     lag_min: float
 
 
-def is_near_only(term: Term) -> bool:
-    """Return whether the channel of an effect may be only near its cause: an input by a temperature."""
-    kind, _, channel = term.hypothesis.place
-    return kind == "input" and channel.endswith(TEMPERATURE)
+def acts_by_temperature(term: Term) -> bool:
+    """Return whether an effect acts by a temperature: that of a channel, or those that drive the base's paths."""
+    _, path, channel = term.hypothesis.place
+    return channel.endswith(TEMPERATURE) if channel else bool(path)
 
 
 def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
@@ -74,8 +75,10 @@ def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
     tuple of Near
         Nearest first; only those that add to the evidence.
     """
-    causes = [t.start for t in fit.terms if t.hypothesis.effect.observed and not is_near_only(t)]
-    base = fit_terms(fit.likelihood, causes, evaluations=1)
+    observed = [term for term in fit.terms if term.hypothesis.effect.observed]
+    if len(observed) == len(fit.terms):
+        observed = [term for term in observed if not acts_by_temperature(term)]
+    base = fit_terms(fit.likelihood, [term.start for term in observed], evaluations=1)
     ranking = _Ranking(base, unexplained, fit.rest)
     found = [ranking.of(name, columns) for name, columns in _banks(fit.likelihood.points)]
     return tuple(sorted((near for near in found if near.evidence > 0.0), key=lambda near: -near.evidence))
