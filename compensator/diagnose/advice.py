@@ -194,7 +194,7 @@ def _described(
         rms_um=float(np.std(used)),
         peak_to_peak_um=float(np.ptp(used)),
         tau_min=tau_min,
-        times=tuple((run, at / 60.0) for run, at in times[:TIMES]),
+        times=tuple((run, float(at) / 60.0) for run, at in times[:TIMES]),
         goes_with=event,
         sensor_evidence=course_evidence(found.selection.fit, found.selection.before.rest, course),
     )

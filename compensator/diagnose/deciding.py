@@ -23,13 +23,13 @@ from compensator.diagnose.events import DAY, HEAT
 from compensator.diagnose.evidence import Evidence, nuisances_of
 from compensator.diagnose.fit import Fit, Term, raw_columns
 from compensator.diagnose.likelihood import POINTS, Points, Rest, Whitening
-from compensator.diagnose.trials import Trial, Trials
+from compensator.diagnose.trials import REST_H, Trial, Trials
 from compensator.model.effects.blocks import Lag
 
 #: A change of the logarithm of the evidence that decides: odds of about 150 to 1.
 DECIDES = 5.0
-#: Durations of a test that are looked at, h.
-HOURS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+#: Durations of a test that are looked at, with the rest before it, h.
+HOURS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 #: Step of a searched parameter, as a share of its value.
 STEP = 1e-2
 #: What happened once does not come again by itself in a test.
@@ -70,7 +70,7 @@ class PlannedTest:
         """What to do, how long, and by how much it decides."""
         change = f"expected change of the log evidence {self.expected_evidence:.3g}, {DECIDES:g} decides"
         if self.decides:
-            return f"{self.words}; from rest, {self.hours:g} h are enough ({change})."
+            return f"{self.words}; {self.hours:g} h are enough, the first {REST_H:g} h at rest ({change})."
         words = self.words[:1].lower() + self.words[1:]
         return f"No test of up to {HOURS[-1]:g} h decides; the best: {words} for {self.hours:g} h ({change})."
 
@@ -136,7 +136,9 @@ class Deciding:
         for trial in trials or [trial for trial in self.trials.of(()) if not trial.driver]:
             joint = self._of(trial)
             lag = Lag(tau_min, trial.signals.period_min)
-            level: Vector = _level(trial) if trials else np.asarray(trial.signals.minutes > 0.0, dtype=np.float64)
+            level: Vector = (
+                _level(trial) if trials else np.asarray(trial.signals.minutes > 60.0 * REST_H, dtype=np.float64)
+            )
             course = size_um * lag.filter(level)
             planned.append(self._test(trial, joint.change_by(others, course), between))
         best = max(planned, key=_soonest)
@@ -175,9 +177,7 @@ class _Joint:
     def __init__(self, evidence: Evidence, trial: Trial) -> None:
         self.record_period_min = evidence.context.period_min * max(1, math.ceil(evidence.count / POINTS))
         n = trial.signals.size
-        # A test begins at rest: only its zero is unknown.
         rest = nuisances_of(trial.signals, evidence.context)
-        rest[:, 1:] = 0.0
         self.evidence = dataclasses.replace(
             evidence,
             signals=(*evidence.signals, trial.signals),
@@ -268,6 +268,11 @@ def _level(trial: Trial) -> Vector:
     values = signals.drive if trial.driver == HEAT else signals.channels[trial.driver]
     change = values - values[0] if trial.driver != HEAT else values
     return np.asarray(change / max(float(np.abs(change).max()), 1e-12))
+
+
+def _step(trial: Trial) -> Vector:
+    """Return a step after the rest that a test begins with."""
+    return np.asarray(trial.signals.minutes >= 60.0 * REST_H, dtype=np.float64)
 
 
 def _expected(d: Vector, table: Matrix, precision: Matrix, ends: Indices) -> Vector:

@@ -79,7 +79,7 @@ def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
     if len(observed) == len(fit.terms):
         observed = [term for term in observed if not acts_by_temperature(term)]
     base = fit_terms(fit.likelihood, [term.start for term in observed], evaluations=1)
-    ranking = _Ranking(base, unexplained, fit.rest)
+    ranking = _Ranking(base, unexplained)
     found = [ranking.of(name, columns) for name, columns in _banks(fit.likelihood.points)]
     return tuple(sorted((near for near in found if near.evidence > 0.0), key=lambda near: -near.evidence))
 
@@ -99,47 +99,36 @@ def course_evidence(fit: Fit, unexplained: Rest, course: Vector) -> float:
     observed = [t.start for t in fit.terms if t.hypothesis.effect.observed]
     base = fit_terms(fit.likelihood, observed, evaluations=1)
     points = fit.likelihood.points
-    return _Ranking(base, unexplained, fit.rest).of("", _unit(points, points.averaged(course[:, None]))).evidence
+    return _Ranking(base, unexplained).of("", _unit(points, points.averaged(course[:, None]))).evidence
 
 
 class _Ranking:
-    """The evidence of single channels, with the slow rest between what is left without any and what a fit left."""
+    """The evidence of single channels beside a fit, with the rest that is most probable without any of them.
 
-    def __init__(self, base: Fit, unexplained: Rest, smallest: Rest) -> None:
+    A smaller rest would take what a channel does not explain for more than it is, and rank by that.
+    """
+
+    def __init__(self, base: Fit, unexplained: Rest) -> None:
         self._points = base.likelihood.points
-        start = dataclasses.replace(unexplained, own_um=smallest.own_um)
-        largest = self._points.settled(base.columns, base.fixed, start)
-        between = dataclasses.replace(largest, slow_um=math.sqrt(largest.slow_um * smallest.slow_um))
-        self._views = []
-        for rest in (largest, between, smallest):
-            likelihood = Likelihood(self._points, rest)
-            kept = likelihood.projected(base.columns)
-            target = likelihood.target - likelihood.projected(base.fixed[:, None])[:, 0]
-            known = likelihood.log_prior - 0.5 * likelihood.log_det
-            self._views.append((likelihood, kept, target, known))
-        self._alone = max(_log_evidence(kept, target)[0] + known for _, kept, target, known in self._views)
+        start = dataclasses.replace(unexplained, own_um=base.rest.own_um)
+        self._likelihood = likelihood = Likelihood(self._points, self._points.settled(base.columns, base.fixed, start))
+        self._kept = likelihood.projected(base.columns)
+        self._target = likelihood.target - likelihood.projected(base.fixed[:, None])[:, 0]
+        self._alone = _log_evidence(self._kept, self._target)
 
     def of(self, name: str, columns: Matrix) -> Near:
         """Return how near a channel comes, given what it would be behind and ahead of all lags."""
-        best, lag = -math.inf, 0.0
-        scaled = columns * self._points.spread_um
-        for likelihood, kept, target, known in self._views:
-            white = likelihood.projected(scaled)
-            value = max(
-                _log_evidence(np.column_stack([kept, white * size / math.sqrt(white.shape[1])]), target)[0]
-                for size in SIZES
-            )
-            if value + known > best:
-                best, lag = value + known, _single_lag(white, target)
-        return Near(channel=name, evidence=best - self._alone, lag_min=lag)
+        white = self._likelihood.projected(columns * self._points.spread_um)
+        sizes = (SIZES / math.sqrt(white.shape[1])).tolist()
+        best = max(_log_evidence(np.column_stack([self._kept, white * size]), self._target) for size in sizes)
+        return Near(channel=name, evidence=best - self._alone, lag_min=_single_lag(white, self._target))
 
 
-def _log_evidence(table: Matrix, target: Vector) -> tuple[float, Vector]:
-    """Return the logarithm of the evidence of columns of which one unit in each is expected, and their weights."""
+def _log_evidence(table: Matrix, target: Vector) -> float:
+    """Return the logarithm of the evidence of columns of which one unit in each is expected."""
     root = np.linalg.cholesky(np.eye(table.shape[1]) + table.T @ table)
     half = np.linalg.solve(root, table.T @ target)
-    surprise = float(target @ target - half @ half) + 2.0 * float(np.log(np.diag(root)).sum())
-    return -0.5 * surprise, np.linalg.solve(root.T, half)
+    return -0.5 * float(target @ target - half @ half) - float(np.log(np.diag(root)).sum())
 
 
 def _single_lag(white: Matrix, target: Vector) -> float:

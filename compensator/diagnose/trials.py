@@ -23,8 +23,9 @@ from compensator.model.effects.hypothesis import digits
 from compensator.model.effects.input import unit_of
 from compensator.model.effects.signals import RecordSignals
 
-#: Longest test, and how long each level of one with several lasts, h.
-LONGEST_H, LEVEL_H = 24.0, 2.0
+#: Longest test, the rest that it begins with and that shows its zero and initial state, and how long each level of one
+#: with several lasts, h.
+LONGEST_H, REST_H, LEVEL_H = 24.0, 1.0, 2.0
 #: The air changes at least by this, within this time; a set temperature changes with this lag.
 LEAST_AMBIENT_K, AIR_H, SET_MIN = 2.0, 1.0, 15.0
 #: A temperature follows what is commanded if that explains this share of its variance.
@@ -69,7 +70,8 @@ class Trials:
         context = evidence.context
         self.period_min = context.period_min
         samples = np.arange(round(LONGEST_H * 60.0 / self.period_min), dtype=np.float64)
-        self._t_h: Vector = samples * self.period_min / 60.0
+        #: Time from the first change, h.
+        self._t_h: Vector = samples * self.period_min / 60.0 - REST_H
         self._known: dict[str, list[Trial]] = {}
         self._commanded = [name for name in context.channels if not name.endswith(TEMPERATURE)]
         self._temperatures = [name for name in context.channels if name.endswith(TEMPERATURE)]
@@ -141,8 +143,7 @@ class Trials:
             yield self._trial(words, name, {name: 1.0 - cycle, self.heating: hold})
 
     def _trial(self, words: str, driver: str, courses: Mapping[str, Vector]) -> Trial:
-        # A test begins with a sample at rest, which changes count from.
-        begun = self._t_h > 0.0
+        begun = self._t_h >= 0.0
         changes = {name: self.size(name) * course * begun for name, course in courses.items()}
         for name, course in changes.items():
             if name in self._temperatures:
@@ -170,7 +171,7 @@ class Trials:
             difference_k = change(DIFFERENCE) if DIFFERENCE in self._followers else self._warmed(heat)
         run = Run(
             name="test",
-            t_s=np.asarray(self._t_h * 3600.0),
+            t_s=np.asarray((self._t_h + REST_H) * 3600.0),
             difference_k=difference_k,
             ambient_k=change(AT),
             y_um=np.full(self._t_h.size, np.nan),
