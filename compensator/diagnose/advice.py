@@ -126,7 +126,7 @@ def advice_of(
     deciding : Deciding
         Tests of this machine.
     between_rivals : sequence of PlannedTest
-        The test that decides between each effect and each rival, most important first.
+        The best test between each effect and each rival, most important first.
     explained_pct : float or None
         What the named effects explain of what the channels can, %; None where that is not known.
     is_explained : bool
@@ -137,8 +137,9 @@ def advice_of(
     near: tuple[Near, ...] = ()
     if unexplained is not None or between_rivals or any(map(acts_by_temperature, fit.terms)):
         near = nearest(fit, found.selection.before.rest)[:LISTED]
-    tests = list(between_rivals)
-    if unexplained is not None and unexplained.kind == "unobserved":
+    # A test that decides comes before one that would not.
+    tests = sorted(between_rivals, key=lambda test: not test.decides)
+    if unexplained is not None and unexplained.kind != "remainder":
         tests.insert(0, _shown_again(unexplained, fit, deciding))
     return Advice(
         unexplained=unexplained,
@@ -233,17 +234,19 @@ def _sensor(unexplained: Unexplained, near: Sequence[Near]) -> str:
 
 
 def _shown_again(unexplained: Unexplained, fit: Fit, deciding: Deciding) -> PlannedTest:
-    source = next(t for t in fit.terms if not t.hypothesis.effect.observed)
-    others = fit_terms(fit.likelihood, [t.start for t in fit.terms if t is not source], evaluations=1)
-    event = unexplained.goes_with.event if unexplained.goes_with else ""
-    size_um = float(np.median(np.abs(source.amplitudes)))
-    minutes = sum(r.size * r.period_min for r in deciding.trials.evidence.signals)
+    """Return the test in which what is unexplained acts again."""
+    observed = [term for term in fit.terms if term.hypothesis.effect.observed]
+    sources = [term for term in fit.terms if not term.hypothesis.effect.observed]
+    others = fit_terms(fit.likelihood, [term.start for term in observed], evaluations=1)
+    switchings = sum(len(term.amplitudes) for term in sources) or max(1, len(unexplained.times))
+    size_um = float(np.median(np.abs(sources[0].amplitudes))) if sources else unexplained.peak_to_peak_um / 2.0
+    minutes = sum(record.size * record.period_min for record in deciding.trials.evidence.signals)
     return deciding.shown_again(
         others,
         size_um=size_um,
         tau_min=unexplained.tau_min,
-        event=event,
-        wait_h=minutes / 60.0 / len(source.amplitudes),
+        event=unexplained.goes_with.event if unexplained.goes_with else "",
+        wait_h=minutes / 60.0 / switchings,
     )
 
 

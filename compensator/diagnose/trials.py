@@ -204,7 +204,8 @@ class Trials:
             unit = "w" if self.evidence.context.has_ttf else "k"
         size = self.size(name)
         what = " of T_Q − AT" if name == HEAT and unit == "k" else ""
-        return f"{digits(abs(size) if name == AT else size)} {_UNITS.get(unit, unit)}{what}"
+        # Three digits, as a person sets it: 5000 and not 5e+03.
+        return f"{float(digits(size)):g} {_UNITS.get(unit, unit)}{what}"
 
     def _filtered(self, values: Vector) -> Matrix:
         return FilterBank(LAGS_MIN, [(1.0,) * len(LAGS_MIN)], self.period_min).columns(values)
