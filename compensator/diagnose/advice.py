@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.diagnose.deciding import Deciding, PlannedTest
+from compensator.diagnose.deciding import DECIDES, Deciding, PlannedTest
 from compensator.diagnose.events import DAY, GoesWith, Time, follows_day, goes_with, steepest
 from compensator.diagnose.findings import Findings
 from compensator.diagnose.fit import Fit, Term, fit_terms, response
@@ -219,15 +219,21 @@ def _sensor(unexplained: Unexplained, near: Sequence[Near]) -> str:
         where = f"in the housing around the source, a mass that follows in {tau} min"
     else:
         where = f"in the structure (column, bed) or the air or floor around it, which follow in {tau} min"
-    if not near:
+    alike = resembling(near)
+    if not alike:
         return f"Place the next sensor {where}; no logged channel resembles it."
-    first = near[0]
+    first = alike[0]
     if first.lag_min < 0.0:
         return (
             f"Place the next sensor {where}; {first.channel} follows it, so closer to the cause than {first.channel}."
         )
-    names = " and ".join(one.channel for one in near[:2])
+    names = " and ".join(one.channel for one in alike[:2])
     return f"Place the next sensor {where}, near {names}."
+
+
+def resembling(near: Sequence[Near]) -> list[Near]:
+    """Return the channels that come near by more than chance."""
+    return [one for one in near if one.evidence >= DECIDES]
 
 
 # ---------------------------------------------------------------------- tests
@@ -265,5 +271,5 @@ def _seen_once(fit: Fit, deciding: Deciding) -> Iterator[SeenOnce]:
 def _driver(term: Term, trials: Trials) -> str:
     _, path, channel = term.hypothesis.place
     if channel:
-        return channel
+        return trials.mover(channel)
     return {"DTF": trials.heating, "TTF": trials.heating, "TDTF": AT}.get(path, "")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from compensator.diagnose.advice import Advice, SeenOnce, Unexplained
-from compensator.diagnose.deciding import PlannedTest
+from compensator.diagnose.advice import Advice, SeenOnce, Unexplained, resembling
+from compensator.diagnose.deciding import SHOWN, PlannedTest
 from compensator.diagnose.events import DAY
 from compensator.model.effects.hypothesis import digits
 
@@ -25,11 +25,11 @@ def advice_lines(advice: Advice | None) -> list[str]:
     lines = []
     if advice.unexplained is not None:
         lines.append(_left(advice.unexplained))
-        if advice.nearest:
-            named = ", ".join(f"{near.channel} (log evidence +{digits(near.evidence)})" for near in advice.nearest[:3])
+        if alike := resembling(advice.nearest):
+            named = ", ".join(f"{near.channel} (log evidence +{digits(near.evidence)})" for near in alike[:3])
             lines.append(f"Logged channels that come nearest: {named}.")
         lines.append(advice.sensor)
-    lines += [f"Next test: {_between(test)}{test.sentence}" for test in advice.tests[:SAID]]
+    lines += [f"Next test, {_purpose(test)}: {test.sentence}" for test in advice.tests[:SAID]]
     lines += [_repeat(seen) for seen in advice.seen_once[:SAID]]
     return lines
 
@@ -48,8 +48,10 @@ def _left(unexplained: Unexplained) -> str:
     )
 
 
-def _between(test: PlannedTest) -> str:
-    return f"between {test.between[0]} and {test.between[1]}: "
+def _purpose(test: PlannedTest) -> str:
+    if test.between == SHOWN:
+        return "with the new sensor"
+    return f"to tell {test.between[0]} from {test.between[1]}"
 
 
 def _repeat(seen: SeenOnce) -> str:

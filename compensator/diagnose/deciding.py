@@ -30,6 +30,8 @@ from compensator.model.effects.blocks import Lag
 DECIDES = 5.0
 #: Durations of a test that are looked at, with the rest before it, h.
 HOURS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+#: The explanations between which a test decides that shows a hidden source again.
+SHOWN = ("a source that the new sensor shows", "no source")
 #: Step of a searched parameter, as a share of its value.
 STEP = 1e-2
 #: What happened once does not come again by itself in a test.
@@ -108,11 +110,14 @@ class Deciding:
             None where no test changes any of the drivers.
         """
         channels = dict.fromkeys(t.hypothesis.place[2] for fit in (first, second) for t in fit.terms)
-        planned = [
-            self._planned(trial, first, second, between)
+        trials = [
+            trial
             for trial in self.trials.of(filter(None, (*channels, *drivers)))
             if not drivers or trial.driver in drivers
         ]
+        planned = [self._planned(trial, first, second, between) for trial in trials if not trial.by_itself]
+        if not any(test.decides for test in planned):
+            planned += [self._planned(trial, first, second, between) for trial in trials if trial.by_itself]
         # Of tests that decide equally soon, the surer one.
         return max(planned, key=_soonest, default=None)
 
@@ -130,7 +135,6 @@ class Deciding:
         wait_h : float
             How long it takes until it acts by itself, h.
         """
-        between = "a source that a new sensor shows", "nothing"
         trials = [trial for trial in self.trials.of([event]) if event and trial.driver == event]
         planned = []
         for trial in trials or [trial for trial in self.trials.of(()) if not trial.driver]:
@@ -140,7 +144,7 @@ class Deciding:
                 _level(trial) if trials else np.asarray(trial.signals.minutes > 60.0 * REST_H, dtype=np.float64)
             )
             course = size_um * lag.filter(level)
-            planned.append(self._test(trial, joint.change_by(others, course), between))
+            planned.append(self._test(trial, joint.change_by(others, course), SHOWN))
         best = max(planned, key=_soonest)
         if trials:
             return best

@@ -7,6 +7,7 @@ of a coolant with a chiller of its own, can be set as well.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -49,11 +50,14 @@ class Trial:
         What is changed: a channel, `heat`, `at_degc`, or nothing.
     signals : RecordSignals
         What it would give.
+    by_itself : bool
+        Whether it changes by itself what only followed other things in the record, which takes a heater or a cooler.
     """
 
     words: str
     driver: str
     signals: RecordSignals
+    by_itself: bool = False
 
 
 class Trials:
@@ -92,7 +96,7 @@ class Trials:
     @cached_property
     def heating(self) -> str:
         """What heats the machine: the heat itself, or what T_Q − AT follows most in a model without known heat."""
-        if self.evidence.context.has_ttf or DIFFERENCE not in self._followers:
+        if not self._commanded or DIFFERENCE not in self._followers:
             return HEAT
         gains = self._followers[DIFFERENCE]
         shares = {name: float(np.ptp(self._bank(name) @ gains[name])) for name in self._commanded}
@@ -109,6 +113,10 @@ class Trials:
         start = self._start(name)
         return float(high - start if high - start >= start - low else low - start)
 
+    def mover(self, name: str) -> str:
+        """Return what is changed so that something changes: itself, or the heating that it follows."""
+        return self.heating if name in self._followers else name
+
     def swings(self, name: str) -> int:
         """Return how often something went up or down by much of its span in all runs."""
         return sum(swings(part) for part in self._by_run(name))
@@ -119,7 +127,7 @@ class Trials:
         if not name:
             yield self._trial("Leave the machine at rest", "", {})
             return
-        if name in self._followers or (name != AT and self.size(name) == 0.0):
+        if name != AT and self.size(name) == 0.0:
             return
         size, by = self.size(name), self._in_words(name)
         hold, cycle = np.ones(self._t_h.size), 1.0 * ((self._t_h // LEVEL_H) % 2.0 == 0.0)
@@ -127,6 +135,10 @@ class Trials:
         if name == AT:
             ramp = np.minimum(self._t_h / AIR_H, 1.0)
             yield self._trial(f"Change the ambient temperature by {by} with the machine at rest", name, {name: ramp})
+            return
+        if name in self._followers:
+            words = f"Step {name} by {by} by itself, with a heater or a cooler, and hold it"
+            yield dataclasses.replace(self._trial(words, name, {name: hold}), by_itself=True)
             return
         label = "the heat" if name == HEAT else name
         yield self._trial(f"Step {label} by {by} and hold it, all else steady", name, {name: hold})
@@ -168,7 +180,7 @@ class Trials:
         if context.has_ttf and model.ttf is not None:
             difference_k = model.ttf.sampled.response(heat)
         else:
-            difference_k = change(DIFFERENCE) if DIFFERENCE in self._followers else self._warmed(heat)
+            difference_k = self._warmed(heat) if HEAT in changes else change(DIFFERENCE)
         run = Run(
             name="test",
             t_s=np.asarray((self._t_h + REST_H) * 3600.0),

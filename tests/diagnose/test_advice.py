@@ -148,6 +148,24 @@ def test_the_expected_change_is_that_of_the_whole_covariance():
     assert _expected(d, table, precision, np.array([7, 20])) == pytest.approx(wanted)
 
 
+def test_in_a_test_temperatures_follow_what_they_followed_in_the_record():
+    n = int(HOURS * 60)
+    heat = signals(5, HOURS)[2]
+    rng = np.random.default_rng(2)
+    columns = machine(lambda s: np.zeros(s[0]), 5, housing_degc=20.0 + 0.1 * lag(heat, 40.0) + rng.normal(0.0, 0.02, n))
+    trials = Trials(evidence_of(QUILL, runs_from(columns)))
+    first = {trial.driver: trial for trial in reversed(list(trials.of(("coolant_degc", "housing_degc"))))}
+    step = trials.size("heat")
+    heated, cooled = first["heat"].signals, first["coolant_degc"].signals
+    assert heated.drive[-1] == pytest.approx(step) and heated.drive[30] == 0.0
+    assert np.ptp(heated.channels["housing_degc"]) == pytest.approx(0.1 * step, rel=0.1)
+    half = np.interp(0.05 * step, heated.channels["housing_degc"] - heated.channels["housing_degc"][0], heated.minutes)
+    assert half - 60.0 == pytest.approx(40.0 * np.log(2.0), abs=6.0)
+    assert np.ptp(cooled.channels["housing_degc"]) == 0.0 and not cooled.drive.any()
+    assert abs(np.ptp(cooled.channels["coolant_degc"])) == pytest.approx(abs(trials.size("coolant_degc")))
+    assert first["housing_degc"].by_itself and not first["coolant_degc"].by_itself
+
+
 @pytest.fixture(scope="module")
 def twins():
     """Coolant and cabinet move together in the record; the coolant acts."""
