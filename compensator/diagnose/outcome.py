@@ -11,7 +11,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.codes import ModelWarning, Remark
-from compensator.diagnose.advice import Advice
+from compensator.diagnose.advice import Advice, label
 from compensator.diagnose.deciding import PlannedTest
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
@@ -139,7 +139,7 @@ class Rival:
     @property
     def label(self) -> str:
         """Kind and place in words."""
-        return " ".join(filter(None, self.term.hypothesis.place))
+        return label(self.term)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
