@@ -15,9 +15,11 @@ import numpy as np
 from compensator.arrays import Indices, Vector
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
+from compensator.diagnose.advice import advice_of, label
+from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, with_paths
-from compensator.diagnose.fit import standard_errors
+from compensator.diagnose.fit import Term, standard_errors
 from compensator.diagnose.outcome import (
     FOLDS,
     HELD_OUT,
@@ -33,6 +35,8 @@ from compensator.diagnose.outcome import (
     seen_of,
     warnings_of,
 )
+from compensator.diagnose.search import Candidate
+from compensator.diagnose.trials import Trials
 from compensator.model.effects import Effect
 from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
@@ -72,7 +76,8 @@ def diagnose(
         evidence = evidence.with_free_paths()
     progress(0, FOLDS + 1)
     found = findings_of(evidence)
-    effects = _effects(found)
+    deciding = Deciding(Trials(evidence))
+    effects = _effects(found, deciding)
     held_out = _held_out(found, [effect.place for effect in effects], progress, executor_map)
     # A base that is far off is replaced by the most probable one even where every block holds an event of its own.
     helps = evidence.free_paths or rms_of(held_out.whole) <= rms_of(held_out.nothing)
@@ -86,8 +91,16 @@ def diagnose(
             rms_after_um=rms_of(held_out.whole),
         )
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
+    verdict, ceiling = _verdict(found, held_out), _ceiling(held_out)
+    advice = None
+    if verdict != "adequate":
+        tests = [rival.test for effect in effects for rival in effect.rivals if rival.test is not None]
+        explained_pct, is_explained = ceiling.explained_pct if ceiling else None, verdict == "explained"
+        advice = advice_of(
+            found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained
+        )
     return Diagnosis(
-        verdict=_verdict(found, held_out),
+        verdict=verdict,
         effects=effects,
         held_out=HELD_OUT_PATHS if evidence.free_paths else HELD_OUT,
         model=extended,
@@ -101,7 +114,8 @@ def diagnose(
         warnings=(*remarks, *warnings_of(effects, held_out.nothing, held_out.whole)),
         steps=held_out.steps,
         remainder=remainder,
-        ceiling=_ceiling(held_out),
+        ceiling=ceiling,
+        advice=advice,
     )
 
 
@@ -173,7 +187,7 @@ def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool) -
     return _Predictions(added=(found.paths, found.named, found.whole, found.ceiling, *steps), has=has)
 
 
-def _effects(found: Findings) -> tuple[FoundEffect, ...]:
+def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
     """Return the named effects, that which removes most first."""
     evidence, search = found.search.evidence, found.search
     selection = found.selection
@@ -187,6 +201,10 @@ def _effects(found: Findings) -> tuple[FoundEffect, ...]:
     errors = standard_errors(selection.fit)
     for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
         signal = found.responses[i]
+
+        def test(rival: Candidate, first: Term = term) -> PlannedTest | None:
+            return deciding.best(selection.fit, rival.fit, (label(first), label(rival.term)))
+
         effects.append(
             FoundEffect(
                 term=term,
@@ -194,7 +212,7 @@ def _effects(found: Findings) -> tuple[FoundEffect, ...]:
                 rms_before_um=rms_without([*found.responses[:i], *found.responses[i + 1 :]]),
                 rms_after_um=after,
                 signal=signal,
-                rivals=rivals_of(term, ((c.term, c.rms_um) for c in rivals), searched),
+                rivals=rivals_of(term, rivals, searched, test),
                 replaced=not found.explains,
             )
         )

@@ -260,7 +260,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     noise_um = math.hypot(noise_floor(model, runs), _late_error_um(model, courses, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)
-    nuisances = np.asarray(block_diag(*(_nuisances(record, context) for record in signals)))
+    nuisances = np.asarray(block_diag(*(nuisances_of(record, context) for record in signals)))
     return Evidence(
         model=model,
         runs=tuple(runs),
@@ -293,7 +293,7 @@ def _basis(nuisances: Matrix, used: Mask) -> Matrix:
     return u[:, s > STATE_PRIOR * s[0]]
 
 
-def _nuisances(record: RecordSignals, context: Context) -> Matrix:
+def nuisances_of(record: RecordSignals, context: Context) -> Matrix:
     """Return a constant and decays from the fastest that can be seen to the base's slowest mode, each of size 1."""
     fastest = FASTEST * record.period_min
     slowest = max([3.0 * fastest, *(t for values in context.taus_min.values() for t in values)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -11,8 +11,11 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.codes import ModelWarning, Remark
+from compensator.diagnose.advice import Advice, label
+from compensator.diagnose.deciding import PlannedTest
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
+from compensator.diagnose.search import Candidate
 from compensator.model.effects import Effect
 from compensator.model.effects.seen import Range, Seen
 from compensator.model.simulation import Scores, scores
@@ -29,6 +32,8 @@ HELD_OUT = (
 REPLACED = " All channels together explain the data better, so the remainder is deployed in its place."
 #: Another explanation is a rival while it leaves no more than this many times as much.
 RIVAL_TIMES = 1.2
+#: Most rivals of an effect.
+MOST_RIVALS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,16 +120,31 @@ class FoundEffect:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rival:
-    """Another explanation that is nearly as good."""
+    """Another explanation that is nearly as good.
+
+    Parameters
+    ----------
+    term : Term
+        The other explanation.
+    rms_after_um : float
+        What it leaves, µm rms.
+    test : PlannedTest or None
+        The test that tells both apart best; None where no test is possible.
+    """
 
     term: Term
     rms_after_um: float
-    how_to_tell_apart: str
+    test: PlannedTest | None
+
+    @property
+    def how_to_tell_apart(self) -> str:
+        """The test in words."""
+        return self.test.sentence if self.test else "No test with what was logged tells them apart."
 
     @property
     def label(self) -> str:
         """Kind and place in words."""
-        return " ".join(filter(None, self.term.hypothesis.place))
+        return label(self.term)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,6 +229,8 @@ class Diagnosis:
         What the channels explain and no named effect does; None where there is none.
     ceiling : Ceiling, optional
         What all channels could explain; None where no linear use of them leaves less than the base model.
+    advice : Advice, optional
+        What to measure and to test next; None where the model is adequate.
     """
 
     verdict: Verdict
@@ -226,6 +248,7 @@ class Diagnosis:
     steps: tuple[Step, ...] = ()
     remainder: Remainder | None = None
     ceiling: Ceiling | None = None
+    advice: Advice | None = None
 
     @property
     def before(self) -> Scores:
@@ -286,46 +309,31 @@ def seen_of(effect: Effect, signal: Vector, evidence: Evidence) -> Seen:
     )
 
 
-def rivals_of(term: Term, others: Iterable[tuple[Term, float]], after_um: float) -> tuple[Rival, ...]:
+def rivals_of(
+    term: Term, others: Iterable[Candidate], after_um: float, test: Callable[[Candidate], PlannedTest | None]
+) -> tuple[Rival, ...]:
     """Return the best of other explanations, one for each place, that leave nearly as little as an effect.
 
     Parameters
     ----------
     term : Term
         The effect.
-    others : iterable of (Term, float)
-        Other explanations and the rms that each leaves, µm, best first.
+    others : iterable of Candidate
+        Other explanations, best first.
     after_um : float
         What the effect leaves, µm rms.
+    test : callable
+        Returns the test that tells another explanation apart from the effect.
     """
     rivals: dict[tuple[str, str, str], Rival] = {}
-    for other, rms in others:
-        place = other.hypothesis.place
-        if place != term.hypothesis.place and place not in rivals and rms <= RIVAL_TIMES * after_um:
-            words = how_to_tell_apart(term, other)
-            rivals[place] = Rival(term=other, rms_after_um=rms, how_to_tell_apart=words)
-    return tuple(rivals.values())[:3]
-
-
-def how_to_tell_apart(first: Term, second: Term) -> str:
-    """Return which experiment tells two explanations apart."""
-    slow = max((v for term in (first, second) for n, v in term.named.items() if n.endswith("_min")), default=30.0)
-    hours = max(1.0, 3.0 * slow / 60.0)
-    one, two = _stimulus(first), _stimulus(second)
-    if one == two:
-        return f"{one.capitalize()}, with two step sizes, up and down, and record Y for {hours:.0f} h."
-    return f"{one.capitalize()}, then {two}; record Y for {hours:.0f} h each: only one of the two moves it."
-
-
-def _stimulus(term: Term) -> str:
-    _, path, channel = term.hypothesis.place
-    if channel:
-        return f"step {channel} with the heat steady"
-    if path in ("DTF", "TTF"):
-        return "step the heat with every other channel steady"
-    if path == "TDTF":
-        return "let the ambient temperature change by some kelvin without heat"
-    return "leave the machine at rest"
+    for other in others:
+        place, rms = other.term.hypothesis.place, other.rms_um
+        if place == term.hypothesis.place or place in rivals or rms > RIVAL_TIMES * after_um:
+            continue
+        rivals[place] = Rival(term=other.term, rms_after_um=rms, test=test(other))
+        if len(rivals) == MOST_RIVALS:
+            break
+    return tuple(rivals.values())
 
 
 def warnings_of(effects: Sequence[FoundEffect], before: Vector, after: Vector) -> tuple[Remark, ...]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from compensator.codes import ModelWarning, Remark
+from compensator.diagnose.advice_words import advice_lines, advice_table
 from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_rms, remainder
 from compensator.diagnose.fit import Term
 from compensator.diagnose.outcome import Ceiling, Diagnosis, FoundEffect, Remainder
@@ -70,6 +71,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
         "noise_floor_um": diagnosis.noise_floor_um,
         "remainder": _table(diagnosis.remainder),
         "ceiling": _table(diagnosis.ceiling),
+        "advice": advice_table(diagnosis.advice),
         "warnings": list(map(str, diagnosis.warnings)),
         "warning_codes": [warning.code for warning in diagnosis.warnings],
     }
@@ -142,6 +144,8 @@ def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | 
         if effect.rivals:
             yield rivals(effect)
     yield from remainder(found)
+    if advice := advice_lines(diagnosis.advice):
+        yield Words(title="What to measure and test next", lines=advice)
     yield from warnings_of(diagnosis.warnings)
     yield from warnings_of(remarks, "Remarks on the data")
 

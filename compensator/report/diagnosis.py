@@ -22,6 +22,7 @@ from compensator.diagnose.summary import (
 )
 from compensator.model.effects.seen import unit_of_channel
 from compensator.model.thermal_model import ThermalModel
+from compensator.report.advice import advice_blocks
 from compensator.report.held_out import TimeAxis, waterfall
 from compensator.report.page import (
     Block,
@@ -69,6 +70,7 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
     blocks += [_before_and_after(time, diagnosis), error_table(diagnosis)]
     blocks += [_effect(time, diagnosis, effect) for effect in diagnosis.effects]
     blocks += remainder(found)
+    blocks += advice_blocks(diagnosis)
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:
         blocks.append(_ranking(diagnosis))

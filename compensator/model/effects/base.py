@@ -101,7 +101,7 @@ class Effect:
     #: Least share of the residual's sum of squares that it must explain.
     worth: ClassVar[float] = 0.05
     #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
-    worth_with_others: ClassVar[float] = 0.05
+    worth_with_others: ClassVar[float] = 0.25
     #: Whether it acts before all of its channels were seen, each from when it is.
     acts_in_part: ClassVar[bool] = False
     #: Ridge weight on its linear parameters, against columns of norm 1; 0 leaves them free.

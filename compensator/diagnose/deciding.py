@@ -1,0 +1,289 @@
+"""By how much a test would decide between two explanations: the expected change of the logarithm of the evidence.
+
+Both explanations, as fitted to the record, predict the test. What they leave unknown (their parameters, the error of
+the base's paths, zero and initial state, slow rest, noise) has the distribution that the record leaves it. With the
+difference *d* of the predictions and the covariance *S* of the second one, the first, if it is true, gains
+
+    E[Δ log p] ≈ ½ dᵀ S⁻¹ d
+
+on average. Either may be true, so the smaller one of both directions counts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from compensator.arrays import Indices, Matrix, Vector
+from compensator.diagnose.events import DAY, HEAT
+from compensator.diagnose.evidence import Evidence, nuisances_of
+from compensator.diagnose.fit import Fit, Term, raw_columns
+from compensator.diagnose.likelihood import POINTS, Points, Rest, Whitening
+from compensator.diagnose.trials import REST_H, Trial, Trials
+from compensator.model.effects.blocks import Lag
+
+#: A change of the logarithm of the evidence that decides: odds of about 150 to 1.
+DECIDES = 5.0
+#: Durations of a test that are looked at, with the rest before it, h.
+HOURS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+#: The explanations between which a test decides that shows a hidden source again.
+SHOWN = ("a source that the new sensor shows", "no source")
+#: Step of a searched parameter, as a share of its value.
+STEP = 1e-2
+#: What happened once does not come again by itself in a test.
+ONCE = ("jump", "settling")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedTest:
+    """A test to run, and by how much it would decide.
+
+    Parameters
+    ----------
+    words : str
+        What is done.
+    driver : str
+        What is changed: a channel, `heat`, `at_degc`, or nothing.
+    hours : float
+        The shortest duration that decides, or the longest that was looked at, h.
+    expected_evidence : float
+        Expected change of the logarithm of the evidence at that duration.
+    between : tuple of str
+        The two explanations.
+    """
+
+    words: str
+    driver: str
+    hours: float
+    expected_evidence: float
+    between: tuple[str, str]
+
+    @property
+    def decides(self) -> bool:
+        """Whether it is expected to decide."""
+        return self.expected_evidence >= DECIDES
+
+    @property
+    def sentence(self) -> str:
+        """What to do, how long, and by how much it decides."""
+        change = f"expected change of the log evidence {self.expected_evidence:.3g}, {DECIDES:g} decides"
+        if self.decides:
+            return f"{self.words}; {self.hours:g} h are enough, the first {REST_H:g} h at rest ({change})."
+        words = self.words[:1].lower() + self.words[1:]
+        return f"No test of up to {HOURS[-1]:g} h decides; the best: {words} for {self.hours:g} h ({change})."
+
+
+class Deciding:
+    """Looks for the test that decides between fits.
+
+    Parameters
+    ----------
+    trials : Trials
+        Tests of the machine.
+    """
+
+    def __init__(self, trials: Trials) -> None:
+        self.trials = trials
+        self._joint: dict[int, _Joint] = {}
+
+    def best(
+        self, first: Fit, second: Fit, between: tuple[str, str], *, drivers: tuple[str, ...] = ()
+    ) -> PlannedTest | None:
+        """Return the test that decides soonest, or the one that is expected to decide most.
+
+        Parameters
+        ----------
+        first, second : Fit
+            The explanations, with everything else that acts.
+        between : tuple of str
+            Their names.
+        drivers : tuple of str
+            Only tests that change one of these; empty: all.
+
+        Returns
+        -------
+        PlannedTest or None
+            None where no test changes any of the drivers.
+        """
+        channels = dict.fromkeys(t.hypothesis.place[2] for fit in (first, second) for t in fit.terms)
+        trials = [
+            trial
+            for trial in self.trials.of(filter(None, (*channels, *drivers)))
+            if not drivers or trial.driver in drivers
+        ]
+        planned = [self._planned(trial, first, second, between) for trial in trials if not trial.by_itself]
+        if not any(test.decides for test in planned):
+            planned += [self._planned(trial, first, second, between) for trial in trials if trial.by_itself]
+        # Of tests that decide equally soon, the surer one.
+        return max(planned, key=_soonest, default=None)
+
+    def shown_again(self, others: Fit, *, size_um: float, tau_min: float, event: str, wait_h: float) -> PlannedTest:
+        """Return the test in which a source that no channel shows acts again, with a sensor that shows it.
+
+        Parameters
+        ----------
+        others : Fit
+            What else acts.
+        size_um, tau_min : float
+            How far the source moves Y when it is switched, µm, and its lag, min.
+        event : str
+            The channel, `heat` or `day` that it goes with; empty: it is waited for.
+        wait_h : float
+            How long it takes until it acts by itself, h.
+        """
+        trials = [trial for trial in self.trials.of([event]) if event and trial.driver == event]
+        planned = []
+        for trial in trials or [trial for trial in self.trials.of(()) if not trial.driver]:
+            joint = self._of(trial)
+            lag = Lag(tau_min, trial.signals.period_min)
+            level: Vector = (
+                _level(trial) if trials else np.asarray(trial.signals.minutes > 60.0 * REST_H, dtype=np.float64)
+            )
+            course = size_um * lag.filter(level)
+            planned.append(self._test(trial, joint.change_by(others, course), SHOWN))
+        best = max(planned, key=_soonest)
+        if trials:
+            return best
+        words = "Repeat the work of this record with the new sensor until the source acts again"
+        if event == DAY:
+            words = "Record a whole day again with the new sensor"
+        hours = max(24.0 if event == DAY else 0.0, math.ceil(2.0 * (wait_h + best.hours)) / 2.0)
+        return dataclasses.replace(best, words=words, hours=hours)
+
+    def _planned(self, trial: Trial, first: Fit, second: Fit, between: tuple[str, str]) -> PlannedTest:
+        return self._test(trial, self._of(trial).change(first, second), between)
+
+    def _of(self, trial: Trial) -> _Joint:
+        if id(trial) not in self._joint:
+            self._joint[id(trial)] = _Joint(self.trials.evidence, trial)
+        return self._joint[id(trial)]
+
+    @staticmethod
+    def _test(trial: Trial, change: Vector, between: tuple[str, str]) -> PlannedTest:
+        enough = np.flatnonzero(change >= DECIDES)
+        at = int(enough[0]) if enough.size else int(np.argmax(change))
+        return PlannedTest(
+            words=trial.words,
+            driver=trial.driver,
+            hours=HOURS[at],
+            expected_evidence=float(change[at]),
+            between=between,
+        )
+
+
+class _Joint:
+    """A record with a test after it."""
+
+    def __init__(self, evidence: Evidence, trial: Trial) -> None:
+        self.record_period_min = evidence.context.period_min * max(1, math.ceil(evidence.count / POINTS))
+        n = trial.signals.size
+        rest = nuisances_of(trial.signals, evidence.context)
+        self.evidence = dataclasses.replace(
+            evidence,
+            signals=(*evidence.signals, trial.signals),
+            residual=np.concatenate([evidence.residual, np.zeros(n)]),
+            used=np.concatenate([evidence.used, np.ones(n, dtype=bool)]),
+            nuisances=np.asarray(block_diag(evidence.nuisances, rest)),
+            noise=dataclasses.replace(evidence.noise, count=evidence.count + n),
+        )
+        self.points = Points(self.evidence)
+        self.before = int(self.points.used[: self.points.starts[-1]].sum())
+        self.ends = np.ceil(np.array(HOURS) * 60.0 / self.points.period_min).astype(int)
+        self._known: dict[int, tuple[Fit, Vector, Matrix, Matrix]] = {}
+
+    def change(self, first: Fit, second: Fit) -> Vector:
+        """Return the expected change of the logarithm of the evidence after each of the durations."""
+        views = [self._prediction(fit, first.rest) for fit in (first, second)]
+        d = views[0][0] - views[1][0]
+        both = [_expected(d, table, precision, self.ends) for _, table, precision in views]
+        return np.minimum(*both)
+
+    def change_by(self, fit: Fit, course: Vector) -> Vector:
+        """Return the same for what a source adds to the test, beside a fit without it."""
+        begin = self.evidence.used.size - course.size
+        added = self.points.averaged(np.concatenate([np.zeros(begin), course])[:, None])
+        d = self._whitening(fit.rest).of(added)[self.before :, 0]
+        _, table, precision = self._prediction(fit, fit.rest)
+        return _expected(d, table, precision, self.ends)
+
+    def _whitening(self, rest: Rest) -> Whitening:
+        # The noise of a point is that of its samples' mean; with the test there may be more of them in a point.
+        share = self.record_period_min / self.points.period_min if self.points.is_exact else 1.0
+        return Whitening(self.points, dataclasses.replace(rest, noise_um=rest.noise_um * float(np.sqrt(share))))
+
+    def _prediction(self, fit: Fit, rest: Rest) -> tuple[Vector, Matrix, Matrix]:
+        """Return the mean of the test, columns of what stays unknown in it, and their precision after the record."""
+        known = self._known.get(id(fit))
+        if known is None or known[0] is not fit:
+            added, slopes = self._response(fit)
+            table = np.column_stack([self.points.residual - added, added, self.points.random(rest), slopes])
+            white = self._whitening(rest).of(table)
+            seen, test = white[: self.before], white[self.before :]
+            precision = np.eye(white.shape[1] - 2) + seen[:, 2:].T @ seen[:, 2:]
+            mean = test[:, 1] + test[:, 2:] @ np.linalg.solve(precision, seen[:, 2:].T @ seen[:, 0])
+            known = self._known[id(fit)] = (fit, mean, test[:, 2:], precision)
+        return known[1:]
+
+    def _response(self, fit: Fit) -> tuple[Vector, Matrix]:
+        """Return what a fit adds to record and test, and its slopes by every parameter, averaged to points."""
+        total, columns = np.zeros(self.evidence.used.size), [np.zeros((self.evidence.used.size, 0))]
+        for term in fit.terms:
+            added, slopes = self._slopes(term)
+            if term.hypothesis.form in ONCE:
+                begin = sum(record.size for record in self.evidence.signals[:-1])
+                added[begin:], slopes[begin:] = 0.0, 0.0
+            total = total + added
+            columns.append(slopes)
+        table = self.points.averaged(np.column_stack([total, *columns]))
+        return table[:, 0], table[:, 1:]
+
+    def _slopes(self, term: Term) -> tuple[Vector, Matrix]:
+        """Return the response of a term, and its change by each of its parameters within what is usual before data."""
+
+        def response(values: tuple[float, ...]) -> tuple[Vector, Matrix]:
+            table = raw_columns(self.evidence, term.hypothesis, values)
+            added = table @ np.array(term.amplitudes) if term.amplitudes else table[:, 0]
+            return np.array(added), table
+
+        added, table = response(term.values)
+        columns = []
+        if term.amplitudes:
+            spread = np.maximum(np.std(table, axis=0), 1e-12)
+            columns.append(table * (self.points.spread_um / spread))
+        for i, value in enumerate(term.values):
+            step = STEP * max(abs(value), 1e-6)
+            moved = tuple(v + step if i == k else v for k, v in enumerate(term.values))
+            columns.append(((response(moved)[0] - added) / STEP)[:, None])
+        return added, np.concatenate(columns, axis=1) if columns else np.zeros((added.size, 0))
+
+
+def _soonest(test: PlannedTest) -> tuple[bool, float]:
+    """Return the rank of a test: one that decides soon, or else one that changes most. Simple ones come first."""
+    return test.decides, -test.hours if test.decides else test.expected_evidence
+
+
+def _level(trial: Trial) -> Vector:
+    """Return how far the driver of a test has been changed, as a share."""
+    signals = trial.signals
+    values = signals.drive if trial.driver == HEAT else signals.channels[trial.driver]
+    change = values - values[0] if trial.driver != HEAT else values
+    return np.asarray(change / max(float(np.abs(change).max()), 1e-12))
+
+
+def _step(trial: Trial) -> Vector:
+    """Return a step after the rest that a test begins with."""
+    return np.asarray(trial.signals.minutes >= 60.0 * REST_H, dtype=np.float64)
+
+
+def _expected(d: Vector, table: Matrix, precision: Matrix, ends: Indices) -> Vector:
+    """Return ½ dᵀ S⁻¹ d with S = 1 + T P⁻¹ Tᵀ, over the first points of a test."""
+    found = []
+    for end in ends.tolist():
+        some, part = table[:end], d[:end]
+        moment = some.T @ part
+        found.append(0.5 * float(part @ part - moment @ np.linalg.solve(precision + some.T @ some, moment)))
+    return np.array(found)

@@ -1,0 +1,172 @@
+"""Which logged channel comes nearest to what the named effects leave.
+
+A sensor near a cause shows nearly what acts on Y, or the same a little earlier or later. So each channel alone goes
+through a filter bank, of lags behind it and of shorter ones ahead of it (a sensor that follows the cause), with
+regularised gains of one learned size. Channels are ranked by what that adds to the evidence.
+
+Where a source was found that no channel shows, it is what is to be explained. Else it is what the named effects leave
+with what they explain by temperatures: a temperature may only be near the cause, while a speed or a flow is a cause
+itself and stays explained.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compensator.arrays import Matrix, Vector
+from compensator.diagnose.fit import Fit, Term, fit_terms
+from compensator.diagnose.likelihood import Likelihood, Points, Rest
+from compensator.model.effects.blocks import FilterBank
+from compensator.model.effects.signals import RecordSignals
+
+#: Lags behind a channel, and ahead of it, min.
+BEHIND_MIN, AHEAD_MIN = (0.0, 4.0, 12.0, 35.0, 100.0, 300.0), (4.0, 12.0, 35.0)
+#: Sizes of a channel's gains that are tried, as shares of the deformation's spread.
+SIZES = np.geomspace(0.01, 3.0, 6)
+#: Names of the base's own temperatures among the channels.
+T_Q, AT = "t_q_degc", "at_degc"
+#: A channel of this ending is a temperature.
+TEMPERATURE = "_degc"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Near:
+    """A logged channel that resembles what is to be explained.
+
+    Parameters
+    ----------
+    channel : str
+        The channel; `t_q_degc` and `at_degc` are among them.
+    evidence : float
+        What it adds to the logarithm of the evidence, alone.
+    lag_min : float
+        Single lag that suits it best, min: what is to be explained comes later than the channel, or earlier where it is
+        negative.
+    """
+
+    channel: str
+    evidence: float
+    lag_min: float
+
+
+def acts_by_temperature(term: Term) -> bool:
+    """Return whether an effect acts by a temperature: that of a channel, or those that drive the base's paths."""
+    _, path, channel = term.hypothesis.place
+    return channel.endswith(TEMPERATURE) if channel else bool(path)
+
+
+def nearest(fit: Fit, unexplained: Rest) -> tuple[Near, ...]:
+    """Rank the logged channels by how near they come to what a fit leaves and what temperatures explain in it.
+
+    Parameters
+    ----------
+    fit : Fit
+        All effects found.
+    unexplained : Rest
+        The rest where no effect explains anything: where the search of it begins.
+
+    Returns
+    -------
+    tuple of Near
+        Nearest first; only those that add to the evidence.
+    """
+    observed = [term for term in fit.terms if term.hypothesis.effect.observed]
+    if len(observed) == len(fit.terms):
+        observed = [term for term in observed if not acts_by_temperature(term)]
+    base = fit_terms(fit.likelihood, [term.start for term in observed], evaluations=1)
+    ranking = _Ranking(base, unexplained)
+    found = [ranking.of(name, columns) for name, columns in _banks(fit.likelihood.points)]
+    return tuple(sorted((near for near in found if near.evidence > 0.0), key=lambda near: -near.evidence))
+
+
+def course_evidence(fit: Fit, unexplained: Rest, course: Vector) -> float:
+    """Return what a channel with exactly some course would add to the evidence of what a fit leaves without it.
+
+    Parameters
+    ----------
+    fit : Fit
+        All effects found.
+    unexplained : Rest
+        The rest where no effect explains anything.
+    course : numpy.ndarray, shape (n,)
+        On every sample, µm.
+    """
+    observed = [t.start for t in fit.terms if t.hypothesis.effect.observed]
+    base = fit_terms(fit.likelihood, observed, evaluations=1)
+    points = fit.likelihood.points
+    return _Ranking(base, unexplained).of("", _unit(points, points.averaged(course[:, None]))).evidence
+
+
+class _Ranking:
+    """The evidence of single channels beside a fit, with the rest that is most probable without any of them.
+
+    A smaller rest would take what a channel does not explain for more than it is, and rank by that.
+    """
+
+    def __init__(self, base: Fit, unexplained: Rest) -> None:
+        self._points = base.likelihood.points
+        start = dataclasses.replace(unexplained, own_um=base.rest.own_um)
+        self._likelihood = likelihood = Likelihood(self._points, self._points.settled(base.columns, base.fixed, start))
+        self._kept = likelihood.projected(base.columns)
+        self._target = likelihood.target - likelihood.projected(base.fixed[:, None])[:, 0]
+        self._alone = _log_evidence(self._kept, self._target)
+
+    def of(self, name: str, columns: Matrix) -> Near:
+        """Return how near a channel comes, given what it would be behind and ahead of all lags."""
+        white = self._likelihood.projected(columns * self._points.spread_um)
+        sizes = (SIZES / math.sqrt(white.shape[1])).tolist()
+        best = max(_log_evidence(np.column_stack([self._kept, white * size]), self._target) for size in sizes)
+        return Near(channel=name, evidence=best - self._alone, lag_min=_single_lag(white, self._target))
+
+
+def _log_evidence(table: Matrix, target: Vector) -> float:
+    """Return the logarithm of the evidence of columns of which one unit in each is expected."""
+    root = np.linalg.cholesky(np.eye(table.shape[1]) + table.T @ table)
+    half = np.linalg.solve(root, table.T @ target)
+    return -0.5 * float(target @ target - half @ half) - float(np.log(np.diag(root)).sum())
+
+
+def _single_lag(white: Matrix, target: Vector) -> float:
+    """Return the lag of the one column that explains most, min; negative ahead of the channel."""
+    squares = np.einsum("ij,ij->j", white, white)
+    gains = (white.T @ target) ** 2 / (1.0 + squares)
+    lags = (*BEHIND_MIN, *(-lag for lag in AHEAD_MIN))
+    return float(lags[int(np.argmax(gains))]) if white.shape[1] == len(lags) else 0.0
+
+
+def _banks(points: Points) -> list[tuple[str, Matrix]]:
+    """Return every channel with its columns of size 1, the base's own temperatures among them."""
+    evidence = points.evidence
+    names = list(evidence.context.channels)
+    names += [T_Q, *([AT] if evidence.context.has_ambient else [])]
+    period_min = evidence.context.period_min
+    references = [run.difference_k + run.ambient_k for run in evidence.runs]
+
+    def signal(name: str, record: RecordSignals, t_q_k: Vector) -> Vector:
+        return t_q_k if name == T_Q else record.ambient_k if name == AT else record.channels[name]
+
+    found = []
+    for name in names:
+        values = [signal(name, r, t_q) for r, t_q in zip(evidence.signals, references, strict=True)]
+        found.append((name, _unit(points, points.averaged(_bank(values, period_min)))))
+    return found
+
+
+def _bank(values: Sequence[Vector], period_min: float) -> Matrix:
+    """Return the lags behind a channel and ahead of it over several records, shape (n, lags)."""
+    behind = FilterBank(BEHIND_MIN, [(1.0,) * len(BEHIND_MIN)], period_min)
+    ahead = FilterBank(AHEAD_MIN, [(1.0,) * len(AHEAD_MIN)], period_min)
+    parts = [np.column_stack([behind.columns(u - u[0]), ahead.columns((u - u[-1])[::-1])[::-1]]) for u in values]
+    return np.concatenate(parts)
+
+
+def _unit(points: Points, table: Matrix) -> Matrix:
+    """Return columns about their means, of standard deviation 1 on the points used; 0 where a column is constant."""
+    table = table - table[points.used].mean(axis=0)
+    spread = np.std(table[points.used], axis=0)
+    return np.asarray(table / np.where(spread > 1e-9, spread, np.inf))
