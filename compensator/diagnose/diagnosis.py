@@ -91,7 +91,7 @@ def diagnose(
             rms_after_um=rms_of(held_out.whole),
         )
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
-    verdict, ceiling = _verdict(found, held_out), _ceiling(held_out)
+    verdict, ceiling = _verdict(found, held_out, extended), _ceiling(held_out)
     advice = None
     if verdict != "adequate":
         tests = [rival.test for effect in effects for rival in effect.rivals if rival.test is not None]
@@ -274,12 +274,14 @@ def _ranked(found: Findings) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(best.items(), key=lambda item: item[1]))
 
 
-def _verdict(found: Findings, held_out: _HeldOut) -> Verdict:
-    """Return the verdict in one word."""
+def _verdict(found: Findings, held_out: _HeldOut, extended: ThermalModel) -> Verdict:
+    """Return the verdict in one word; what the engine cannot know of a late T_Q counts as noise."""
     evidence = found.search.evidence
     observed = [term.hypothesis.effect.observed for term in found.terms]
     left = evidence.left(evidence.residual, found.whole, at_rest=False)[evidence.used]
-    is_noise = evidence.noise.is_explained(float(left @ left))
+    unknown_um2 = late_variance_um2(extended)
+    noise = dataclasses.replace(evidence.noise, noise_um=float(np.hypot(evidence.noise.noise_um, unknown_um2**0.5)))
+    is_noise = noise.is_explained(float(left @ left))
     if not observed:
         return "adequate" if is_noise and not evidence.free_paths else "unexplained"
     if not any(observed):

@@ -80,9 +80,9 @@ class Findings:
     @property
     def rest_um(self) -> float:
         """Standard deviation of what they leave to an unknown slow cause and to the form of the effects, µm."""
-        rest = self.selection.fit.rest
-        if self.remainder is not None:
-            return self.remainder.rest.slow_um
+        rest, regressed = self.selection.fit.rest, self.remainder or self.refitted
+        if regressed is not None:
+            return regressed.rest.slow_um
         return float(np.hypot(rest.slow_um, rest.own_um))
 
 

@@ -24,7 +24,7 @@ SEEN_SHARE = 0.05
 #: Points of time that are tried in a record.
 POINTS = 240
 #: A source does not begin within this share of a record: what moves there is the initial state.
-START_SHARE = 0.03
+START_SHARE = 0.01
 #: What is switched once and acts within this many samples is a step.
 AT_ONCE = 5.0
 

@@ -11,7 +11,7 @@ from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.events import follows_day, goes_with, swings, switched
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
-from compensator.diagnose.fit import fit_terms
+from compensator.diagnose.fit import fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, Points
 from compensator.diagnose.nearest import nearest
 from compensator.diagnose.summary import contents, figures
@@ -201,7 +201,7 @@ def test_the_test_that_is_said_to_decide_decides_when_it_is_run(twins):
     gained = []
     for runs in (runs_from(columns), [*runs_from(columns), *runs_from(run)]):
         points = Points(evidence_of(QUILL, runs))
-        likelihood = Likelihood(points, points.typical_rest())
+        likelihood = settled(fit_terms(Likelihood(points, points.typical_rest()), [effect.term.start])).likelihood
         coolant, cabinet = (
             fit_terms(likelihood, [next(t for t in (effect.term, rival.term) if name in t.hypothesis.place).start])
             for name in ("coolant_degc", "cabinet_degc")

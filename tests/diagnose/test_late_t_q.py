@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from compensator.data.runs import Run
 from compensator.diagnose.diagnosis import Diagnosis, diagnose
-from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.evidence import signals_of
 from compensator.identify.calibration import predict
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model
@@ -87,7 +87,7 @@ def test_the_signals_of_a_model_that_corrects_it_are_the_engines() -> None:
     columns, _, _ = record([late], 1102, 24.0)
     runs = runs_from(columns)
     found = diagnose(QUILL, runs)
-    [own] = evidence_of(found.model, runs).signals
+    own = signals_of(found.model, runs[0])
     np.testing.assert_array_equal(own.share("all"), predict(found.model, runs[0]))
     again = diagnose(found.model, runs)
     assert [e.place for e in again.effects] == []

@@ -19,7 +19,7 @@ from compensator.model.effects.seen import Seen, digits, rounded, signed
 from compensator.model.effects.signals import RecordSignals
 
 #: No jump is looked for within this share of a record from its start.
-START_SHARE = 0.03
+START_SHARE = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

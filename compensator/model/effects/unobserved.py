@@ -38,7 +38,7 @@ class Unobserved(Effect):
     deployable = False
     observed = False
     # So free a form finds something in every residual.
-    worth = 0.15
+    worth, worth_with_others = 0.15, 0.75
     tau_min: float = 1.0
     times: tuple[tuple[int, float], ...] = ()
     sizes_um: tuple[float, ...] = ()
