@@ -80,6 +80,8 @@ class Scan:
                 continue
             some = white.T[at]
             gram = np.eye(width) + some @ some.transpose(0, 2, 1) - cross.T[at] @ back.T[at].transpose(0, 2, 1)
+            # Rounding of large columns must not take away what the prior adds.
+            gram += 1e-10 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(width)
             moment = products[at]
             solved = np.linalg.solve(gram, moment[..., None])[..., 0]
             gains[which] = 0.5 * np.einsum("ij,ij->i", moment, solved) - 0.5 * np.linalg.slogdet(gram)[1]
