@@ -340,6 +340,11 @@ class ModelWarning(Code):
         "The effects that were found increase the error on held-out data, so the model was left unchanged.",
         "Record for longer, with more change in the inputs.",
     )
+    NOT_CONFIRMED = (
+        "not_confirmed",
+        "The effects are clear in the data as a whole, but what is found without a block does not predict that block.",
+        "Check the extended model on another day: something in the data happened only once.",
+    )
     HARDLY_DETERMINED = (
         "hardly_determined",
         "The standard error of a parameter is larger than the parameter.",
@@ -349,11 +354,6 @@ class ModelWarning(Code):
         "nearly_as_good",
         "Another effect explains the residual almost as well.",
         "Run the experiment given with it, which distinguishes the two.",
-    )
-    ROUNDED_OFF = (
-        "rounded_off",
-        "An unnamed correction term is deployed together with the effect that was found.",
-        "Check the extended model on another day before relying on it.",
     )
     FITTED_ANEW = (
         "fitted_anew",

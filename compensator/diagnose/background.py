@@ -16,12 +16,12 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
 from scipy.optimize import minimize
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Points, Rest, Whitening, without_own_error
+from compensator.diagnose.likelihood import Points, Rest, Whitening, factored, without_own_error
 from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, MOST_ROWS, Regression
 
 #: Lags of the filter bank, min; those that are longer than a third of the record are left out.
@@ -162,7 +162,7 @@ class _Problem:
         """Return the logarithm of the evidence, and its slopes but for the first two."""
         white, log_det, random = self._white(x)
         gram = white[:, 1:].T @ white
-        factor = cho_factor(np.eye(gram.shape[0]) + gram[:, 1:], lower=True, check_finite=False)
+        factor = factored(gram[:, 1:])
         mean = cho_solve(factor, gram[:, 0], check_finite=False)
         surprise = white[:, 0] @ white[:, 0] - gram[:, 0] @ mean + log_det + 2.0 * np.log(np.diag(factor[0])).sum()
         slopes = np.diag(cho_solve(factor, np.eye(mean.size), check_finite=False)) - 1.0 + mean**2
@@ -203,7 +203,8 @@ class _Problem:
         weights = np.exp(x[3:])[self.groups] / self.scale
         covariance = np.linalg.inv(gram)[fixed:, fixed:]
         gains = (np.linalg.solve(gram, white[:, 1:].T @ white[:, 0])[fixed:]) * weights
-        root = np.linalg.cholesky(covariance + 1e-12 * np.eye(gains.size)) * weights[:, None]
+        sizes, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        root = axes * np.sqrt(np.maximum(sizes, 0.0)) * weights[:, None]
         # The directions of the covariance that matter most for y, over what was seen.
         seen = self.table[self.points.used] * np.where(np.isfinite(self.scale), self.scale, 0.0)
         _, _, directions = np.linalg.svd((seen - seen.mean(axis=0)) @ root, full_matrices=False)

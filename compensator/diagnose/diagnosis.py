@@ -46,6 +46,8 @@ from compensator.progress import ExecutorMap, Progress, unreported
 Place = tuple[str, str, str]
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
+#: Effects are not deployed where held-out blocks are predicted worse with them by more than this factor.
+CONTRADICTS = 1.25
 #: How the errors are measured where nothing was known of the paths.
 HELD_OUT_PATHS = f"{HELD_OUT}; before: the paths of the first model alone, also refitted to the others"
 
@@ -79,9 +81,9 @@ def diagnose(
     deciding = Deciding(Trials(evidence))
     effects = _effects(found, deciding)
     held_out = _held_out(found, [effect.place for effect in effects], progress, executor_map)
-    # A base that is far off is replaced by the most probable one even where every block holds an event of its own.
-    helps = evidence.free_paths or rms_of(held_out.whole) <= rms_of(held_out.nothing)
-    extended, remarks = _extended(model, found, effects) if helps else (model, ())
+    # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
+    contradicted = not evidence.free_paths and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
+    extended, remarks = (model, ()) if contradicted else _extended(model, found, effects, held_out)
     remainder = None
     if found.remainder is not None:
         remainder = Remainder(
@@ -111,7 +113,7 @@ def diagnose(
         held_out_named=held_out.named,
         held_out_after=held_out.whole,
         tried=_ranked(found),
-        warnings=(*remarks, *warnings_of(effects, held_out.nothing, held_out.whole)),
+        warnings=(*remarks, *warnings_of(effects, held_out.nothing, held_out.whole, deployed=extended is not model)),
         steps=held_out.steps,
         remainder=remainder,
         ceiling=ceiling,
@@ -220,7 +222,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
 
 
 def _extended(
-    model: ThermalModel, found: Findings, effects: Sequence[FoundEffect]
+    model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: _HeldOut
 ) -> tuple[ThermalModel, tuple[Remark, ...]]:
     """Return the model with every effect that can be deployed, the remainder, and the error that is left."""
     evidence = found.search.evidence
@@ -239,6 +241,10 @@ def _extended(
     kept_out = [effect.signal[evidence.used] for effect in effects if not effect.effect.deployable]
     left = found.rest_um**2 + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
     extended = dataclasses.replace(base, effects=(*model.effects, *deployed), sha256="")
+    if not kept_out:
+        # Half what the fit expects, half what held-out blocks show: the one is too small, the other has few blocks.
+        shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
+        left = 0.5 * (left + shown)
     # The engine states by itself what it cannot know of a late T_Q.
     left = max(left - (late_variance_um2(extended) - late_variance_um2(model)), 0.0)
     return dataclasses.replace(extended, y_std_um=float(np.sqrt(left))), remarks

@@ -39,7 +39,7 @@ EXACT_OWN = 0.3
 #: Effects have their form only to this share of their size: where forms are exact, and on a real machine.
 FORM_ERROR = (0.02, 0.1)
 #: The zero of a run is free: this many times the spread of the deformation.
-ZERO_TIMES = 100.0
+ZERO_TIMES = 10.0
 #: Typical size of an initial state, as a share of the spread of the deformation.
 START_SHARE = 0.1
 #: Typical slow rest where nothing is known of the paths, as a share of the spread of the deformation.
@@ -201,7 +201,7 @@ class Points:
             for where, size in zip(sized, (rest.start_um, rest.fast_um), strict=True):
                 white[:, 1:][:, where] *= size
             gram = white[:, 1:].T @ white
-            factor = cho_factor(np.eye(gram.shape[0]) + gram[:, 1:], lower=True, check_finite=False)
+            factor = factored(gram[:, 1:])
             mean = cho_solve(factor, gram[:, 0], check_finite=False)
             surprise = white[:, 0] @ white[:, 0] - gram[:, 0] @ mean + whitening.log_det + _log_det(factor)
             # How the evidence changes with the size of a group of random columns: by what the data say of each.
@@ -324,7 +324,7 @@ class Likelihood:
         self.points, self.rest = points, rest
         self._whitening = Whitening(points, rest)
         self._random = self._whitening.of(points.random(rest))
-        self._factor = cho_factor(np.eye(self._random.shape[1]) + self._random.T @ self._random, lower=True)
+        self._factor = factored(self._random.T @ self._random)
         self.log_det = self._whitening.log_det + _log_det(self._factor)
         self.log_prior = points.log_prior(rest)
         self.target = self.projected(points.residual[:, None])[:, 0]
@@ -339,6 +339,13 @@ class Likelihood:
 def dense(likelihood: Likelihood) -> Matrix:
     """Return the projection as one matrix, for many columns at once."""
     return likelihood.projected(np.eye(likelihood.points.used.size))
+
+
+def factored(gram: Matrix) -> tuple[Matrix, bool]:
+    """Return the Cholesky factor of a Gram matrix and the unit matrix, which rounding must not take away."""
+    unit = 1.0 + 1e-12 * float(np.trace(gram))
+    matrix, lower = cho_factor(gram + unit * np.eye(gram.shape[0]), lower=True, check_finite=False)
+    return np.asarray(matrix), bool(lower)
 
 
 def without_own_error(rest: Rest) -> Rest:

@@ -336,16 +336,21 @@ def rivals_of(
     return tuple(rivals.values())
 
 
-def warnings_of(effects: Sequence[FoundEffect], before: Vector, after: Vector) -> tuple[Remark, ...]:
+def warnings_of(effects: Sequence[FoundEffect], before: Vector, after: Vector, *, deployed: bool) -> tuple[Remark, ...]:
     """Return what to know before relying on the effects that were found."""
     warnings = []
     rms_before, rms_after = rms_of(before), rms_of(after)
     if effects and rms_after > rms_before:
-        text = (
-            f"On held-out blocks the effects make it worse ({rms_after:.2f} against {rms_before:.2f} µm rms), so the "
-            "model was left as it is."
-        )
-        warnings.append(Remark(ModelWarning.MADE_WORSE, text))
+        numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
+        if deployed:
+            text = (
+                f"The effects are clear in the data as a whole, but do not predict held-out blocks better {numbers}: "
+                "something happened only once. Check the extended model on another day."
+            )
+            warnings.append(Remark(ModelWarning.NOT_CONFIRMED, text))
+        else:
+            text = f"On held-out blocks the effects make it worse {numbers}, so the model was left as it is."
+            warnings.append(Remark(ModelWarning.MADE_WORSE, text))
     for effect in effects:
         kind, named = effect.place[0], effect.named
         loose = [name for name, std in effect.std.items() if std > abs(named[name]) > 0.0]
