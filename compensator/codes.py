@@ -350,11 +350,6 @@ class ModelWarning(Code):
         "Another effect explains the residual almost as well.",
         "Run the experiment given with it, which distinguishes the two.",
     )
-    ROUNDED_OFF = (
-        "rounded_off",
-        "An unnamed correction term is deployed together with the effect that was found.",
-        "Check the extended model on another day before relying on it.",
-    )
     FITTED_ANEW = (
         "fitted_anew",
         "The base model was calibrated while the effect acted, so its paths were refitted together with the effect.",

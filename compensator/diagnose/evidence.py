@@ -22,7 +22,6 @@ from compensator.data.runs import Run, noise_of, noise_std
 from compensator.diagnose.noise import NoiseTest, drive_of, noise_floor, own_error
 from compensator.diagnose.smoothing import course
 from compensator.errors import DataError
-from compensator.identify.output_error import low_frequency_ratio
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import DEGC, Context
 from compensator.model.effects.signals import RecordSignals
@@ -162,15 +161,6 @@ class Evidence:
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
         return np.asarray(open_ - table @ coefficients)
 
-    def variance_inflation(self, values: Vector) -> float:
-        """Return how much more power a residual has at low frequencies than white noise of its variance, at least 1.
-
-        The effective number of samples is smaller by this factor.
-        """
-        cuts = np.cumsum([record.size for record in self.signals])[:-1]
-        pairs = zip(np.split(values, cuts), np.split(self.used, cuts), strict=True)
-        return max(1.0, low_frequency_ratio([v[u] for v, u in pairs]))
-
 
 def _beginnings(runs: Sequence[Run]) -> list[float]:
     """Return when each run begins after the start of the first, min: by its own time, or after the one before."""
@@ -204,8 +194,6 @@ def signals_of(model: ThermalModel, run: Run, number: int = 0, begins_min: float
         y_dtf_um=y_dtf_um,
         y_tdtf_um=y_tdtf_um,
         channels={name: values for name, values in run.channels.items() if np.isfinite(values).all()},
-        dtf=model.dtf.sampled,
-        tdtf=tdtf,
         share_of_ambient=model.dtf.sampled.response(drive_of(model, run.ambient_k)),
         number=number,
         begins_min=begins_min,

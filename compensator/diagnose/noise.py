@@ -80,14 +80,6 @@ def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:
     return float(np.sqrt(sum(part**2 for part in parts)))
 
 
-def lead_noise_um2(model: ThermalModel, runs: Sequence[Run], lag_min: float) -> float:
-    """Return what the lead that reverses a lag of T_Q adds to the variance of the residual, µm²."""
-    by_t_q = _by_t_q(model)
-    led = by_t_q + lag_min * np.gradient(by_t_q, model.period_s / 60.0)
-    power = float(led @ led - by_t_q @ by_t_q)
-    return noise_of(runs)["t_q_degc"] ** 2 * max(power, 0.0)
-
-
 def _by_t_q(model: ThermalModel) -> Vector:
     """Return the response of the DTF's share to an impulse of T_Q, µm/K."""
     return model.dtf.sampled.response(drive_of(model, _IMPULSE))
