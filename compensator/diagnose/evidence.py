@@ -2,8 +2,9 @@
 
     residual = measured − free run of the base model = Σ effects + nuisances + noise
 
-Nuisances are what every record has and no effect causes: its zero and its unknown initial state. They are projected
-out of everything before anything is compared, so that they are never mistaken for an effect.
+Nuisances are what every record has and no effect causes: its zero and its unknown initial state. The likelihood
+integrates them out, and they are projected out of every residual that is stated, so that they are never mistaken for
+an effect.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Evidence:
     used : numpy.ndarray of bool, shape (n,)
         Samples that take part.
     nuisances : numpy.ndarray, shape (n, k)
-        A constant and the decay of every mode, of each run, on every sample.
+        A constant and decays of all times that the base may have, of each run, on every sample.
     basis : numpy.ndarray, shape (n, m)
         Orthonormal columns that the nuisances span on the samples used.
     context : Context

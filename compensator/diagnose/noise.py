@@ -1,4 +1,4 @@
-"""Is what is left noise? The levels, the thresholds, and the one place that compares them.
+"""Is what is left noise? Its levels, and what is compared with them.
 
 Two levels are known: what the sensors' noise alone makes of the residual, and the base model's own error from its
 calibration. The thresholds differ by the question that is asked.
@@ -17,7 +17,7 @@ from compensator.model.thermal_model import ThermalModel
 
 #: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
 OWN_SHARE = 0.1
-#: No effect is looked for below this many times the base model's own error.
+#: The base model's own error may leave this many times as much.
 OWN_TIMES = 1.3
 #: A residual up to this many times the base model's own error may come by itself on another day.
 EXPECTED_TIMES = 1.4
@@ -47,11 +47,11 @@ class NoiseTest:
 
     @property
     def allowance(self) -> float:
-        """Sum of squares that the own error may leave, µm²: nothing is looked for below it."""
+        """Sum of squares that the own error may leave, µm²."""
         return self.count * (OWN_TIMES * self.own_error_um) ** 2
 
     def is_expected(self, cost: float) -> bool:
-        """Return whether a residual, before any search, may come by itself on another day."""
+        """Return whether what is left may come by itself on another day, so that nothing more is looked for in it."""
         return cost < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
 
     def is_explained(self, cost: float) -> bool:

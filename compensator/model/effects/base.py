@@ -98,7 +98,7 @@ class Effect:
     background: ClassVar[bool] = False
     #: Whether it gives its name to a background effect that it explains most of.
     names_background: ClassVar[bool] = False
-    #: Least share of the residual's sum of squares that it must explain.
+    #: Least sum of squares that is named, as a share of what is left without it and of what the base may leave anyway.
     worth: ClassVar[float] = 0.05
     #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
     worth_with_others: ClassVar[float] = 0.25
