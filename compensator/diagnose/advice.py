@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from compensator.arrays import Vector
+from compensator.diagnose.ceiling import SHORT_PCT
 from compensator.diagnose.deciding import DECIDES, Deciding, PlannedTest
 from compensator.diagnose.events import DAY, GoesWith, Time, follows_day, goes_with, steepest
 from compensator.diagnose.findings import Findings
@@ -23,8 +24,6 @@ from compensator.diagnose.trials import Trials
 from compensator.model.effects.seen import digits
 from compensator.model.effects.unobserved import Unobserved
 
-#: Named effects fall short where they explain less than this of what the channels can explain, %.
-SHORT_PCT = 80.0
 #: Channels and times that are listed.
 LISTED, TIMES = 5, 12
 #: An effect whose driver went up or down no more often than this was seen once: one heating, one cooling.

@@ -86,7 +86,6 @@ class Background:
         blocks = self.template.blocks(context.period_min)
         self.columns = np.concatenate([self.template.columns(record, blocks) for record in evidence.signals])
         self.groups = np.repeat(np.arange(len(inputs)), len(taus))
-        self.inputs_of_base = len(base)
         # Where nothing is known of the base's paths, they are inputs like others.
         self.is_path = np.arange(len(inputs)) < len(base)
 
@@ -105,11 +104,6 @@ class Background:
             Most evaluations.
         """
         return _Problem(self, points, explained).solved(start, steps)
-
-    def response_of_base(self, effect: Regression) -> Vector:
-        """Return the part of that which the base's own inputs add, µm."""
-        own = self.groups < self.inputs_of_base
-        return np.asarray(self.columns[:, own] @ np.ravel(effect.gains)[own])
 
     def response(self, effect: Regression) -> Vector:
         """Return what a regression over these channels adds to y on every sample, µm."""

@@ -274,11 +274,6 @@ def _level(trial: Trial) -> Vector:
     return np.asarray(change / max(float(np.abs(change).max()), 1e-12))
 
 
-def _step(trial: Trial) -> Vector:
-    """Return a step after the rest that a test begins with."""
-    return np.asarray(trial.signals.minutes >= 60.0 * REST_H, dtype=np.float64)
-
-
 def _expected(d: Vector, table: Matrix, precision: Matrix, ends: Indices) -> Vector:
     """Return ½ dᵀ S⁻¹ d with S = 1 + T P⁻¹ Tᵀ, over the first points of a test."""
     found = []

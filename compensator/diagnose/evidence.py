@@ -2,8 +2,9 @@
 
     residual = measured − free run of the base model = Σ effects + nuisances + noise
 
-Nuisances are what every record has and no effect causes: its zero and its unknown initial state. They are projected
-out of everything before anything is compared, so that they are never mistaken for an effect.
+Nuisances are what every record has and no effect causes: its zero and its unknown initial state. The likelihood
+integrates them out, and they are projected out of every residual that is stated, so that they are never mistaken for
+an effect.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ from compensator.data.runs import Run, noise_of, noise_std
 from compensator.diagnose.noise import NoiseTest, drive_of, noise_floor, own_error
 from compensator.diagnose.smoothing import course
 from compensator.errors import DataError
-from compensator.identify.output_error import low_frequency_ratio
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import DEGC, Context
 from compensator.model.effects.signals import RecordSignals
@@ -60,7 +60,7 @@ class Evidence:
     used : numpy.ndarray of bool, shape (n,)
         Samples that take part.
     nuisances : numpy.ndarray, shape (n, k)
-        A constant and the decay of every mode, of each run, on every sample.
+        A constant and decays of all times that the base may have, of each run, on every sample.
     basis : numpy.ndarray, shape (n, m)
         Orthonormal columns that the nuisances span on the samples used.
     context : Context
@@ -162,15 +162,6 @@ class Evidence:
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
         return np.asarray(open_ - table @ coefficients)
 
-    def variance_inflation(self, values: Vector) -> float:
-        """Return how much more power a residual has at low frequencies than white noise of its variance, at least 1.
-
-        The effective number of samples is smaller by this factor.
-        """
-        cuts = np.cumsum([record.size for record in self.signals])[:-1]
-        pairs = zip(np.split(values, cuts), np.split(self.used, cuts), strict=True)
-        return max(1.0, low_frequency_ratio([v[u] for v, u in pairs]))
-
 
 def _beginnings(runs: Sequence[Run]) -> list[float]:
     """Return when each run begins after the start of the first, min: by its own time, or after the one before."""
@@ -204,8 +195,6 @@ def signals_of(model: ThermalModel, run: Run, number: int = 0, begins_min: float
         y_dtf_um=y_dtf_um,
         y_tdtf_um=y_tdtf_um,
         channels={name: values for name, values in run.channels.items() if np.isfinite(values).all()},
-        dtf=model.dtf.sampled,
-        tdtf=tdtf,
         share_of_ambient=model.dtf.sampled.response(drive_of(model, run.ambient_k)),
         number=number,
         begins_min=begins_min,

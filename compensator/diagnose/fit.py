@@ -33,14 +33,11 @@ class Term:
         Its free parameters.
     amplitudes : tuple of float
         Its linear parameters.
-    companion : bool
-        Whether it only absorbs what the other terms leave: it is deployed with them and not named beside them.
     """
 
     hypothesis: Hypothesis
     values: tuple[float, ...]
     amplitudes: tuple[float, ...] = ()
-    companion: bool = False
 
     @property
     def effect(self) -> Effect:
@@ -94,11 +91,6 @@ class Fit:
     def places(self) -> frozenset[tuple[str, str, str]]:
         """Kind, path and channel of each effect."""
         return frozenset(term.hypothesis.place for term in self.terms)
-
-    @property
-    def size_um(self) -> float:
-        """Standard deviation of what all effects add, µm."""
-        return float(np.std(self.added[self.likelihood.points.used]))
 
     def starts(self, without: int | None = None) -> list[Start]:
         """Return where another fit begins, with all terms or all but one."""

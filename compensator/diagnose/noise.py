@@ -1,4 +1,4 @@
-"""Is what is left noise? The levels, the thresholds, and the one place that compares them.
+"""Is what is left noise? Its levels, and what is compared with them.
 
 Two levels are known: what the sensors' noise alone makes of the residual, and the base model's own error from its
 calibration. The thresholds differ by the question that is asked.
@@ -17,7 +17,7 @@ from compensator.model.thermal_model import ThermalModel
 
 #: Largest error of its own that a base model is granted, as a share of the deformation's standard deviation.
 OWN_SHARE = 0.1
-#: No effect is looked for below this many times the base model's own error.
+#: The base model's own error may leave this many times as much.
 OWN_TIMES = 1.3
 #: A residual up to this many times the base model's own error may come by itself on another day.
 EXPECTED_TIMES = 1.4
@@ -47,11 +47,11 @@ class NoiseTest:
 
     @property
     def allowance(self) -> float:
-        """Sum of squares that the own error may leave, µm²: nothing is looked for below it."""
+        """Sum of squares that the own error may leave, µm²."""
         return self.count * (OWN_TIMES * self.own_error_um) ** 2
 
     def is_expected(self, cost: float) -> bool:
-        """Return whether a residual, before any search, may come by itself on another day."""
+        """Return whether what is left may come by itself on another day, so that nothing more is looked for in it."""
         return cost < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
 
     def is_explained(self, cost: float) -> bool:
@@ -78,14 +78,6 @@ def noise_floor(model: ThermalModel, runs: Sequence[Run]) -> float:
     by_at = -by_t_q + (model.tdtf.sampled.response(_IMPULSE) if model.tdtf else 0.0)
     parts = (noise["y_um"], noise["t_q_degc"] * np.linalg.norm(by_t_q), noise["at_degc"] * np.linalg.norm(by_at))
     return float(np.sqrt(sum(part**2 for part in parts)))
-
-
-def lead_noise_um2(model: ThermalModel, runs: Sequence[Run], lag_min: float) -> float:
-    """Return what the lead that reverses a lag of T_Q adds to the variance of the residual, µm²."""
-    by_t_q = _by_t_q(model)
-    led = by_t_q + lag_min * np.gradient(by_t_q, model.period_s / 60.0)
-    power = float(led @ led - by_t_q @ by_t_q)
-    return noise_of(runs)["t_q_degc"] ** 2 * max(power, 0.0)
 
 
 def _by_t_q(model: ThermalModel) -> Vector:

@@ -221,7 +221,7 @@ class Search:
 
     def _is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
-        if len(term.amplitudes) < 2 or term.hypothesis.effect.ridge:
+        if len(term.amplitudes) < 2 or term.hypothesis.effect.has_any_form:
             return True
         table = raw_columns(self.evidence, term.hypothesis, term.values) * np.array(term.amplitudes)
         table = table[self.evidence.used]
@@ -246,8 +246,6 @@ class Search:
 
     def _rivals(self, fit: Fit, index: int) -> tuple[Candidate, ...]:
         """Return what else explains the part of an effect, one for each place, best first."""
-        if fit.terms[index].companion:
-            return ()
         kept = fit.starts(index)
         base = fit_terms(fit.likelihood, kept, evaluations=1)
         found: dict[Place, Candidate] = {}

@@ -45,15 +45,12 @@ def one(model, own_um, seed, size_um):
     began = time.perf_counter()
     terms = Search(evidence).run().fit.terms
     seconds = time.perf_counter() - began
-    named = [term.hypothesis.place for term in terms if not term.companion]
+    named = [term.hypothesis.place for term in terms]
     if not effects:
         return None, named, np.nan, seconds
     truth = effects[0].reveal().describe()
     place = tuple(str(truth.get(key) or "") for key in ("kind", "path", "channel"))
-    deployed = [term for term in terms if term.effect.deployable]
-    if all(term.companion for term in deployed):
-        deployed = []
-    tables = [term.effect for term in deployed]
+    tables = [term.effect for term in terms if term.effect.deployable]
     fresh = runs(Duty.working_day(700 + seed, hours=24.0), 800 + seed, effects)[0]
 
     def error(candidate):

@@ -93,8 +93,6 @@ def test_every_form_streams_what_it_filters(form, data, seed):
         y_dtf_um=walk[2],
         y_tdtf_um=walk[3],
         channels={"c": walk[4]},
-        dtf=FUNCTION,
-        tdtf=FUNCTION,
     )
     stream = EffectStream(effect, 1.0)
     stepped = [

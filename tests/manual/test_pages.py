@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import importlib
 import re
@@ -11,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from compensator.cli import _parser
 from compensator.config import Config
 from compensator.identify.settings import Settings
 from compensator.model.effects.base import Effect, forms
-from compensator.model.effects.passing import Drift
-from compensator.model.effects.unobserved import Unobserved
 from compensator.model.model_file import load_model
 
 TOP = Path(__file__).resolve().parents[2]
@@ -26,12 +26,15 @@ MODEL, IDENTIFY, DIAGNOSE = (TOP / f"compensator/{room}/MATHEMATICS.md" for room
 EFFECTS = TOP / "compensator/model/effects"
 #: `module.NAME` = value, as the pages on the mathematics quote what the code has.
 QUOTED = re.compile(r"`(\w+)\.(\w+)` = (-?[\d.]+(?:e-?\d+)?)")
-CLASSES = {"Settings": Settings(), "Drift": Drift, "Effect": Effect, "Unobserved": Unobserved}
+#: A row of the table of settings: `module.NAME` or `Class.name`, and its value or values.
+SETTING = re.compile(r"^\| `(\w+\.\w+)` \| (-?[\d.e-]+(?:, -?[\d.e-]+)*) \|", flags=re.MULTILINE)
+#: Settings that are only shown; the page names them without a value.
+SHOWN = {"summary.SHOWN", "advice_words.SAID", "ceiling._NAMED"}
 
 
 def constant(room: str, holder: str, name: str) -> Any:
-    if holder in CLASSES:
-        return getattr(CLASSES[holder], name)
+    if holder == "Settings":
+        return getattr(Settings(), name)
     for place in (room, f"{room}.effects", "data", "recording", ""):
         try:
             return getattr(importlib.import_module(".".join(filter(None, ("compensator", place, holder)))), name)
@@ -40,12 +43,46 @@ def constant(room: str, holder: str, name: str) -> Any:
     raise AssertionError(f"no module {holder}")
 
 
-@pytest.mark.parametrize(("page", "least"), [(MODEL, 6), (IDENTIFY, 9), (DIAGNOSE, 19)], ids=lambda p: str(p)[-30:])
+@pytest.mark.parametrize(("page", "least"), [(MODEL, 6), (IDENTIFY, 9)], ids=lambda p: str(p)[-30:])
 def test_quoted_constants_are_those_of_the_code(page: Path, least: int) -> None:
     quoted = QUOTED.findall(page.read_text(encoding="utf-8"))
     assert len(quoted) >= least
     for holder, name, value in quoted:
         assert float(value.rstrip(".")) == constant(page.parent.name, holder, name), f"{page}: {holder}.{name}"
+
+
+def settings_of_diagnosis() -> dict[str, tuple[float, ...]]:
+    """Every number or short row of numbers at the top of a module of diagnose, and what effects must be worth."""
+    found: dict[str, Any] = {}
+    for file in sorted(DIAGNOSE.parent.glob("[!_]*.py")):
+        module = importlib.import_module(f"compensator.diagnose.{file.stem}")
+        assigned = [node for node in ast.parse(file.read_text("utf-8")).body if isinstance(node, ast.Assign)]
+        targets = [name for node in assigned for target in node.targets for name in ast.walk(target)]
+        found |= {f"{file.stem}.{t.id}": getattr(module, t.id) for t in targets if isinstance(t, ast.Name)}
+    for form in {base for effect in forms() for base in effect.__mro__ if issubclass(base, Effect)}:
+        found |= {f"{form.__name__}.{k}": v for k, v in vars(form).items() if k in ("worth", "worth_with_others")}
+    rows = {
+        name: tuple(np.atleast_1d(v)) for name, v in found.items() if isinstance(v, int | float | tuple | np.ndarray)
+    }
+    return {
+        name: tuple(map(float, row))
+        for name, row in rows.items()
+        if len(row) < 100 and all(isinstance(v, int | float | np.number) for v in row)
+    }
+
+
+def test_the_settings_of_the_diagnosis_are_in_its_table_and_no_others() -> None:
+    text = DIAGNOSE.read_text(encoding="utf-8")
+    rows = SETTING.findall(text)
+    listed = {name: tuple(map(float, values.split(", "))) for name, values in rows}
+    assert len(rows) == len(listed), "a setting stands twice"
+    settings = settings_of_diagnosis()
+    assert all(f"`{name}`" in text for name in SHOWN)
+    in_effects = {name for name in listed if (EFFECTS / f"{name.partition('.')[0]}.py").exists()}
+    assert set(listed) - in_effects == set(settings) - SHOWN
+    for name, values in listed.items():
+        known = constant("model.effects", *name.split(".")) if name in in_effects else settings[name]
+        assert values == pytest.approx(known if isinstance(known, tuple) else (known,), rel=5e-3), name
 
 
 def test_examples_on_the_page_run() -> None:

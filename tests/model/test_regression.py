@@ -125,8 +125,6 @@ def test_its_columns_over_a_record_are_what_the_gains_weight() -> None:
         y_tdtf_um=ambient,
         channels={"coolant_degc": late, "speed_rpm": CHANNELS["speed_rpm"]},
         period_min=1.0,
-        dtf=QUILL.dtf.sampled,
-        tdtf=QUILL.dtf.sampled,
     )
     found = REMAINDER.columns(record, REMAINDER.blocks(1.0))
     assert found.shape == (N, 15)

@@ -98,14 +98,14 @@ class Effect:
     background: ClassVar[bool] = False
     #: Whether it gives its name to a background effect that it explains most of.
     names_background: ClassVar[bool] = False
-    #: Least share of the residual's sum of squares that it must explain.
+    #: Least sum of squares that is named, as a share of what is left without it and of what the base may leave anyway.
     worth: ClassVar[float] = 0.05
     #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
     worth_with_others: ClassVar[float] = 0.25
     #: Whether it acts before all of its channels were seen, each from when it is.
     acts_in_part: ClassVar[bool] = False
-    #: Ridge weight on its linear parameters, against columns of norm 1; 0 leaves them free.
-    ridge: ClassVar[float] = 0.0
+    #: Whether its linear parameters are those of a filter bank that may have any form, so that they may cancel.
+    has_any_form: ClassVar[bool] = False
 
     path: str = ""
     channel: str = ""
@@ -179,10 +179,6 @@ class Effect:
     def lateness(self) -> Lateness | None:
         """By how much T_Q is late: not added to y, but corrected in the estimate of the heat."""
         return None
-
-    def effective_parameters(self, count: int) -> int:
-        """Return how many parameters the data spend on it, of `count` that are searched or linear."""
-        return count
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the parameters that people read, from all that are searched or linear."""

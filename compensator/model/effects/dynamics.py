@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, Lag, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, numbered, proposes
+from compensator.model.effects.hypothesis import Context, Hypothesis, numbered, proposes
 from compensator.model.effects.seen import Seen, digits
 from compensator.model.effects.signals import Signals
 
@@ -78,7 +78,7 @@ class ChangedPaths(BankEffect, Effect):
     kind = "dynamics"
     linear = ("gain", "gain_ambient")
     background = True
-    ridge = BANK_RIDGE
+    has_any_form = True
     path: str = only(default="DTF")
     form: str = only(default="changed")
     tau_min: tuple[float, ...] = numbers(0.0, 1e5)
@@ -90,9 +90,6 @@ class ChangedPaths(BankEffect, Effect):
 
     def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         return signals.drive, signals.ambient_k
-
-    def effective_parameters(self, count: int) -> int:
-        return 6
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the change of each path's gain at rest."""

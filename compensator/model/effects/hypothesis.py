@@ -21,8 +21,6 @@ from compensator.model.effects.signals import RecordSignals
 
 #: Lags in a filter bank, and the longest of them, min.
 BANK, BANK_LONGEST_MIN = 6, 600.0
-#: Ridge weight on the gains of a filter bank.
-BANK_RIDGE = 1e-3
 #: End of the names of channels in °C, whose zero is arbitrary: the square of such a value means nothing.
 DEGC = "_degc"
 
@@ -89,11 +87,6 @@ class Hypothesis:
     def label(self) -> str:
         """Kind, place and form in words."""
         return " ".join(filter(None, (*self.place, f"({self.form})" if self.form else "")))
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters that the data spend on it."""
-        return self.effect.effective_parameters(len(self.free) + len(self.amplitudes))
 
     def grid(self) -> list[tuple[float, ...]]:
         """Return the points where a search begins."""

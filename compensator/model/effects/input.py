@@ -18,7 +18,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, register, text
 from compensator.model.effects.blocks import Block, Delay, FilterBank, FromStart, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, DEGC, Context, Free, Hypothesis, numbered, proposes
+from compensator.model.effects.hypothesis import DEGC, Context, Free, Hypothesis, numbered, proposes
 from compensator.model.effects.seen import Seen, digits, quantity, signed
 from compensator.model.effects.signals import Signals
 
@@ -93,10 +93,7 @@ class Input(BankEffect, Effect):
 class InputBank(Input):
     """A channel through a filter bank of given lags: for a response whose form is not known."""
 
-    ridge = BANK_RIDGE
-
-    def effective_parameters(self, count: int) -> int:
-        return 5
+    has_any_form = True
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the gain at rest of all lags together, and the time to half of a step's response."""

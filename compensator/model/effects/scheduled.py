@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S
-from compensator.model.effects.hypothesis import BANK_RIDGE, Context, Hypothesis, numbered, proposes
+from compensator.model.effects.hypothesis import Context, Hypothesis, numbered, proposes
 from compensator.model.effects.seen import Seen, digits, quantity
 from compensator.model.effects.signals import Signals
 from compensator.model.transfer_function import SampledTransferFunction
@@ -115,7 +115,7 @@ class BankScheduled(BankEffect, Scheduled):
     """
 
     linear = ("gain", "gain_share")
-    ridge = BANK_RIDGE
+    has_any_form = True
     form: str = only(default="row")
     tau_min: tuple[float, ...] = numbers(0.0, 1e5)
     gain: tuple[float, ...] = numbers()
@@ -128,9 +128,6 @@ class BankScheduled(BankEffect, Scheduled):
     def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         c = self.scale(signals, run)
         return c * signals.source(self.path), c * signals.share(self.path)
-
-    def effective_parameters(self, count: int) -> int:
-        return 7
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the change of the gain at rest over the channel's span, as a share of it."""

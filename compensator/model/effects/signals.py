@@ -10,7 +10,6 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.model.effects.blocks import S
-from compensator.model.transfer_function import SampledTransferFunction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +53,6 @@ class RecordSignals(Signals[Vector]):
     ----------
     period_min : float
         Sample period, min.
-    dtf, tdtf : SampledTransferFunction
-        Paths of the base model.
     share_of_ambient : numpy.ndarray, shape (n,)
         What the DTF would make of the ambient's change if T_Q alone showed it, µm.
     number : int
@@ -65,8 +62,6 @@ class RecordSignals(Signals[Vector]):
     """
 
     period_min: float
-    dtf: SampledTransferFunction
-    tdtf: SampledTransferFunction
     share_of_ambient: Vector = field(default_factory=lambda: np.zeros(1))
     number: int = 0
     begins_min: float = 0.0
@@ -85,7 +80,3 @@ class RecordSignals(Signals[Vector]):
     def time_min(self) -> Vector:
         """Time from the start of the first record, shape (n,), min."""
         return self.begins_min + self.minutes
-
-    def function(self, path: str) -> SampledTransferFunction:
-        """Return the transfer function of a path."""
-        return self.tdtf if path == "TDTF" else self.dtf

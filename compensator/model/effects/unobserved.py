@@ -50,9 +50,6 @@ class Unobserved(Effect):
             columns.append(Lag(self.tau_min, record.period_min).filter(step * float(number == record.number)))
         return np.column_stack(columns)
 
-    def effective_parameters(self, count: int) -> int:
-        return count + len(self.times)
-
     def explain(self, seen: Seen) -> str:
         first, count = min(at for _, at in self.times) / 60.0, len(self.times)
         return (
