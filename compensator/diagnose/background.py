@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Points, Rest, Whitening, factored, without_own_error
+from compensator.diagnose.likelihood import Points, Rest, Whitening, factored, lags_of_paths, without_own_error
 from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, MOST_ROWS, Regression
 
 #: Lags of the filter bank, min; those that are longer than a third of the record are left out.
@@ -75,7 +75,7 @@ class Background:
             inputs += [(name, 1.0) for name in context.channels]
             inputs += [(name, 2.0) for name in context.channels if name in context.zeroed]
         inputs = inputs[:MOST_CHANNELS]
-        taus = tuple(tau for tau in LAGS_MIN if tau <= context.minutes / 3.0)
+        taus = tuple(tau for tau in LAGS_MIN if tau <= context.minutes / 3.0) if channels else lags_of_paths(context)
         self.template = Regression(
             channels=tuple(name for name, _ in inputs),
             exponents=tuple(exponent for _, exponent in inputs),

@@ -105,7 +105,7 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True) -> Findings:
     ceiling = background.fitted(points, nothing, selection.before.rest)
     paths = Background(evidence, channels=False) if evidence.free_paths else None
     refitted = paths.fitted(points, fit.added, fit.rest) if paths else None
-    remainder, explains = (None, True) if late_term(fit) else _remainder(fit, background, refitted, ceiling)
+    remainder, explains = (None, True) if late_term(fit) else _remainder(search, fit, background, refitted, ceiling)
     return Findings(
         search=search,
         selection=selection,
@@ -120,12 +120,14 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True) -> Findings:
 
 
 def _remainder(
-    fit: Fit, background: Background, refitted: Regressed | None, ceiling: Regressed
+    search: Search, fit: Fit, background: Background, refitted: Regressed | None, ceiling: Regressed
 ) -> tuple[Regressed | None, bool]:
     """Choose what is deployed beside named effects by the evidence, and whether they are deployed themselves.
 
     Parameters
     ----------
+    search : Search
+        What named effects cost.
     fit : Fit
         The named effects.
     background : Background
@@ -138,7 +140,7 @@ def _remainder(
     points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
     beside = background.fitted(points, fit.added, fit.rest) if fit.terms else ceiling
     known = refitted.log_evidence if refitted else _log_evidence(fit)
-    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) + MARGIN:
+    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - search.cost(fit):
         return ceiling, False
     size = float(np.std(beside.added[evidence.used]))
     least = LEAST * np.hypot(evidence.noise.noise_um, evidence.noise.own_error_um)

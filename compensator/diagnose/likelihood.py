@@ -27,6 +27,7 @@ from scipy.optimize import minimize
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.model.effects.blocks import FilterBank
+from compensator.model.effects.hypothesis import Context
 
 #: Points that the samples are averaged to.
 POINTS = 700
@@ -241,8 +242,7 @@ class Points:
     def _responses(self, drives: Sequence[Vector]) -> tuple[Matrix, Matrix, Matrix]:
         """Return fast, slow, and all responses to a drive."""
         context = self.evidence.context
-        longest = min(600.0, max(context.minutes / 3.0, 20.0 * context.period_min))
-        taus = np.array([0.0, *np.geomspace(context.period_min, longest, OWN_LAGS)])
+        taus = np.array(lags_of_paths(context))
         bank = FilterBank(taus.tolist(), [(1.0,) * taus.size], context.period_min)
         table = self.averaged(np.concatenate([bank.columns(drive) for drive in drives]))
         slow = table[:, taus >= FAST_MIN]
@@ -339,6 +339,12 @@ class Likelihood:
 def dense(likelihood: Likelihood) -> Matrix:
     """Return the projection as one matrix, for many columns at once."""
     return likelihood.projected(np.eye(likelihood.points.used.size))
+
+
+def lags_of_paths(context: Context) -> tuple[float, ...]:
+    """Return lags that any linear path is made of, min."""
+    longest = min(600.0, max(context.minutes / 3.0, 20.0 * context.period_min))
+    return (0.0, *np.geomspace(context.period_min, longest, OWN_LAGS).tolist())
 
 
 def factored(gram: Matrix) -> tuple[Matrix, bool]:

@@ -119,7 +119,11 @@ class Search:
 
     def score(self, fit: Fit) -> float:
         """Return *J*."""
-        return fit.log_evidence - sum(self._cost(term.hypothesis) for term in fit.terms)
+        return fit.log_evidence - self.cost(fit)
+
+    def cost(self, fit: Fit) -> float:
+        """Return what the effects of a fit must add to the evidence."""
+        return sum(self._cost(term.hypothesis) for term in fit.terms)
 
     def left(self, fit: Fit) -> Vector:
         """Return what a fit leaves on every sample, nuisances projected out, µm; 0 where samples are not used."""
@@ -165,6 +169,8 @@ class Search:
                 if id(start[0]) in seen:
                     continue
                 seen.add(id(start[0]))
+                if start[0].effect.jumps and self._starts_anywhere(fit):
+                    continue
                 added = fit_terms(likelihood, [*fit.starts(), start], evaluations=8)
                 if not self._is_plausible(added.terms[-1]):
                     continue
@@ -212,12 +218,19 @@ class Search:
 
     def _is_worth_naming(self, term: Term, without: Fit, fit: Fit) -> bool:
         """Return whether an effect is large enough beside what is left without it and the base model's own error."""
+        if self.evidence.free_paths:
+            # What is left without it is the whole deformation: only the evidence says what it is worth.
+            return True
         effect, others = term.hypothesis.effect, self.evidence.context.approximate and len(fit.terms) > 1
         share = effect.worth_with_others if others else effect.worth
         added = np.where(self.evidence.used, response(self.evidence, term), 0.0)
         size = float(np.sum(self.evidence.without_nuisances(added) ** 2))
         left = (self.rms(without) ** 2) * self.evidence.count + self.evidence.noise.allowance
         return size > share * left
+
+    def _starts_anywhere(self, fit: Fit) -> bool:
+        """Return whether an initial state of an effect is unknown: until its first reversal it looks like a jump."""
+        return self.evidence.context.approximate and any(t.hypothesis.effect.starts_anywhere for t in fit.terms)
 
     def _is_plausible(self, term: Term) -> bool:
         """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""

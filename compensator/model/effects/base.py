@@ -102,6 +102,9 @@ class Effect:
     worth: ClassVar[float] = 0.05
     #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
     worth_with_others: ClassVar[float] = 0.25
+    #: Whether it jumps at a time, and whether its unknown initial state looks like such a jump.
+    jumps: ClassVar[bool] = False
+    starts_anywhere: ClassVar[bool] = False
     #: Whether it acts before all of its channels were seen, each from when it is.
     acts_in_part: ClassVar[bool] = False
     #: Whether its linear parameters are those of a filter bank that may have any form, so that they may cancel.

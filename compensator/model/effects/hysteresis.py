@@ -25,6 +25,7 @@ class Hysteresis(Effect):
     """Play or stick-slip of one path, or of both together."""
 
     kind = "hysteresis"
+    starts_anywhere = True
     path: str = text("DTF", "TDTF", "all")
     form: str = text(*FORMS)
     half_width_um: float = number(0.0, 1e4)

@@ -80,6 +80,7 @@ class Jump(TimeOnly):
     """A jump at a time."""
 
     kind = "step"
+    jumps = True
     linear = ("jump_um",)
     jump_um: float = 1.0
     at_min: float = 0.0
@@ -127,8 +128,8 @@ def courses(context: Context) -> Iterator[Hypothesis]:
     yield Hypothesis(effect=Settling(), form="settling", free=(tau,), amplitudes=("size_um",))
     # What moves at the start of a record is its initial state.
     first = max(5.0 * period, START_SHARE * minutes)
-    times = np.arange(first, minutes - 5.0 * period, max(period, minutes / 600.0))
-    at = Free(name="at_min", low=first - period, high=minutes - period, grid=tuple(times.tolist()), log=False)
+    times = np.arange(first, minutes - first, max(period, minutes / 600.0))
+    at = Free(name="at_min", low=first - period, high=minutes - first, grid=tuple(times.tolist()), log=False)
     yield Hypothesis(effect=Jump(), form="jump", free=(at,), amplitudes=("jump_um",))
     # Of a period the record must hold about two.
     frequencies = np.arange(2.0, minutes / (4.0 * period), 0.35) / minutes

@@ -37,6 +37,7 @@ class Unobserved(Effect):
     linear = ("sizes_um",)
     deployable = False
     observed = False
+    jumps = True
     # So free a form finds something in every residual.
     worth, worth_with_others = 0.15, 0.75
     tau_min: float = 1.0
