@@ -109,6 +109,6 @@ def test_the_example_for_users_of_matlab_runs(
     page = (NOTEBOOK.parent / "MATLAB.md").read_text(encoding="utf-8")
     exec(page.partition("```python\n")[2].partition("```")[0], {})
     said = capsys.readouterr().out
-    assert "persistence" in said and "partly_explained" in said and "spindle_rpm" in said
+    assert "persistence" in said and "explained" in said and "spindle_rpm" in said
     assert {path.name for path in tmp_path.iterdir()} >= {"spindle.toml", "report.html", "spindle.png"}
     assert main(["simulate", "run.mat", "--model", "spindle.toml", "--out", "predicted.csv"]) == 0
