@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
@@ -271,12 +272,12 @@ def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[li
     gridded = [(measured, measured.at_period(period_s)) for measured in data]
     runs: list[Run] = []
     remarks: list[Remark] = []
-    for measured, part in gridded:
+    for number, (measured, part) in enumerate(gridded):
         remarks += part.remarks
         for record in part.records:
             require(measured.name, record, _NEEDED)
             for run, corrected in runs_of(measured.label, record):
-                runs.append(run)
+                runs.append(dataclasses.replace(run, recording=number))
                 remarks += corrected
     if not runs and gridded:
         raise DataError(_without_runs(gridded[0][0].name, gridded[0][1], period_s))

@@ -41,6 +41,8 @@ class Run:
         T_Q and AT that the changes count from, °C.
     channels : dict of str to numpy.ndarray, shape (n,)
         Every other column, gaps bridged.
+    recording : int
+        Which of several recordings it is a part of.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Run:
     heat_w: Vector | None
     reference: tuple[float, float]
     channels: dict[str, Vector]
+    recording: int = 0
 
     @property
     def t_q_degc(self) -> Vector:

@@ -23,6 +23,7 @@ from compensator.diagnose.fit import Term, standard_errors
 from compensator.diagnose.outcome import (
     FOLDS,
     HELD_OUT,
+    HELD_OUT_RECORDINGS,
     Ceiling,
     Diagnosis,
     FoundEffect,
@@ -49,7 +50,7 @@ FAR_OFF = 0.1
 #: Effects are not deployed where held-out blocks are predicted worse with them by more than this factor.
 CONTRADICTS = 1.25
 #: How the errors are measured where nothing was known of the paths.
-HELD_OUT_PATHS = f"{HELD_OUT}; before: the paths of the first model alone, also refitted to the others"
+WITH_PATHS = "; before: the paths of the first model alone, also refitted to the others"
 
 
 def diagnose(
@@ -76,7 +77,7 @@ def diagnose(
     evidence = evidence_of(model, runs)
     if model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um:
         evidence = evidence.with_free_paths()
-    progress(0, FOLDS + 1)
+    progress(0, len(list(evidence.blocks(FOLDS))) + 1)
     found = findings_of(evidence)
     deciding = Deciding(Trials(evidence))
     effects = _effects(found, deciding)
@@ -104,7 +105,7 @@ def diagnose(
     return Diagnosis(
         verdict=verdict,
         effects=effects,
-        held_out=HELD_OUT_PATHS if evidence.free_paths else HELD_OUT,
+        held_out=_how(evidence),
         model=extended,
         evidence=evidence,
         residual_before=np.where(evidence.used, found.search.left(found.selection.before) - found.paths, np.nan),
@@ -135,8 +136,8 @@ class _HeldOut:
 def _held_out(found: Findings, places: Sequence[Place], progress: Progress, executor_map: ExecutorMap) -> _HeldOut:
     """Repeat the search without each block; of two choices of nuisances, that which leaves less before."""
     evidence = found.search.evidence
-    progress(1, FOLDS + 1)
     blocks = list(evidence.blocks(FOLDS))
+    progress(1, len(blocks) + 1)
     views = [evidence.without(block) for block in blocks]
     timed = [t.effect for t in found.terms if not t.effect.deployable]
     only_unobserved = bool(found.terms) and not any(term.hypothesis.effect.observed for term in found.terms)
@@ -145,7 +146,7 @@ def _held_out(found: Findings, places: Sequence[Place], progress: Progress, exec
     left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
     searches = np.zeros(len(places), dtype=int)
     for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
-        progress(done, FOLDS + 1)
+        progress(done, len(blocks) + 1)
         searches += several.has
         for choice in (0, 1):
             for i, one in enumerate(several.added):
@@ -260,6 +261,13 @@ def _refitted(old: ThermalModel, new: ThermalModel) -> str:
         "The first model was calibrated while this acted and misses much of its own data, so its paths were refitted "
         f"together with it; gains changed: {gains}."
     )
+
+
+def _how(evidence: Evidence) -> str:
+    """Return how the errors are measured."""
+    count = len(list(evidence.blocks(FOLDS)))
+    words = HELD_OUT_RECORDINGS.format(count=count) if evidence.holds_out_recordings else HELD_OUT
+    return words + WITH_PATHS * evidence.free_paths
 
 
 def _ceiling(held_out: _HeldOut) -> Ceiling | None:

@@ -35,6 +35,8 @@ from compensator.model.transfer_function import SampledTransferFunction
 STATE_PRIOR = 1e-3
 #: Fastest decay of an initial state, samples, and the largest ratio of neighbouring decays.
 FASTEST, DECAY_RATIO = 2.0, 3.5
+#: Recordings are held out whole where the larger half of them has less than this share of the samples.
+LARGEST_GROUP = 0.75
 #: Least noise of Y: a reading has digits.
 LEAST_NOISE_UM = 1e-3
 #: A displacement is an effect, never a cause: another probe follows Y whatever moves it.
@@ -111,12 +113,37 @@ class Evidence:
         return np.asarray(columns - self.basis @ (self.basis.T @ columns))
 
     def blocks(self, count: int) -> Iterator[Mask]:
-        """Yield masks of blocks of time with equally many of the samples used."""
+        """Yield masks of what is held out: whole recordings where there are several, or else blocks of time.
+
+        Parameters
+        ----------
+        count : int
+            How many blocks of time with equally many of the samples used; most groups of recordings.
+        """
+        if self.holds_out_recordings:
+            yield from self._recordings(count)
+            return
         at = np.flatnonzero(self.used)
         for low, high in itertools.pairwise(np.linspace(0, at.size, count + 1).astype(int).tolist()):
             block = np.zeros(self.used.size, dtype=bool)
             block[at[low:high]] = True
             yield block
+
+    @property
+    def holds_out_recordings(self) -> bool:
+        """Whether recordings can be held out: there are several, and no single one has most of the samples."""
+        groups = list(self._recordings(2))
+        return len(groups) > 1 and max(int(mask.sum()) for mask in groups) < LARGEST_GROUP * self.count
+
+    def _recordings(self, count: int) -> Iterator[Mask]:
+        """Yield masks of groups of recordings with about equally many of the samples used."""
+        numbers = np.repeat([run.recording for run in self.runs], [run.t_s.size for run in self.runs])
+        masks = [self.used & (numbers == number) for number in np.unique(numbers)]
+        groups = [np.zeros(self.used.size, dtype=bool) for _ in range(min(count, len(masks)))]
+        for mask in sorted(masks, key=np.sum, reverse=True):
+            smallest = min(range(len(groups)), key=lambda i: int(groups[i].sum()))
+            groups[smallest] = groups[smallest] | mask
+        yield from groups
 
     def without(self, mask: Mask) -> Evidence:
         """Return the evidence without some of its samples."""
@@ -150,6 +177,8 @@ class Evidence:
     def left(self, raw: Vector, effects: Vector, *, at_rest: bool) -> Vector:
         """Return a raw residual less effects and less the nuisances as the samples used know them, on every sample.
 
+        A run of which no sample is used has its zero from its own mean.
+
         Parameters
         ----------
         raw, effects : numpy.ndarray, shape (n,)
@@ -160,7 +189,14 @@ class Evidence:
         open_ = raw - effects
         table = self.nuisances[:, :: self.nuisances.shape[1] // len(self.signals)] if at_rest else self.nuisances
         coefficients = np.linalg.lstsq(table[self.used], open_[self.used], rcond=STATE_PRIOR)[0]
-        return np.asarray(open_ - table @ coefficients)
+        left = np.asarray(open_ - table @ coefficients)
+        measured, first = np.isfinite(self.y_um), 0
+        for record in self.signals:
+            own = slice(first, first + record.size)
+            if not self.used[own].any() and measured[own].any():
+                left[own] -= left[own][measured[own]].mean()
+            first += record.size
+        return left
 
 
 def _beginnings(runs: Sequence[Run]) -> list[float]:

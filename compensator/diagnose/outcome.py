@@ -29,6 +29,10 @@ HELD_OUT = (
     f"each of {FOLDS} blocks of time predicted after choosing and fitting on the others; zero and initial state also "
     "from the others"
 )
+HELD_OUT_RECORDINGS = (
+    "each of {count} recordings or groups of them predicted after choosing and fitting on the others; its zero is its "
+    "own mean"
+)
 REPLACED = " All channels together explain the data better, so the remainder is deployed in its place."
 #: Another explanation is a rival while it leaves no more than this many times as much.
 RIVAL_TIMES = 1.2

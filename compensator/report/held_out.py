@@ -32,6 +32,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
         The diagnosis.
     """
     before, after = rms_of(diagnosis.held_out_before), rms_of(diagnosis.held_out_after)
+    count = len(list(diagnosis.evidence.blocks(FOLDS)))
     bars = [Bar("base model", f"{before:.2f} µm", 0.0, before, _LEFT)]
 
     def add(label: str, last: float, line: int, *, hatched: bool = False) -> None:
@@ -40,7 +41,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
         bars.append(Bar(label, f"{last:.2f} µm ({share})", first, last, line, hatched=hatched))
 
     for effect, step in zip(diagnosis.effects, diagnosis.steps, strict=False):
-        add(_found_in(effect, step.searches), step.rms_um, _EFFECT)
+        add(_found_in(effect, step.searches, count), step.rms_um, _EFFECT)
     named = rms_of(diagnosis.held_out_named) if diagnosis.remainder else after
     if _differs(named, bars[-1].last):
         add("other effects these searches found", named, _EFFECT)
@@ -63,10 +64,10 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
     )
 
 
-def _found_in(effect: FoundEffect, searches: int) -> str:
+def _found_in(effect: FoundEffect, searches: int, of: int) -> str:
     if not effect.effect.observed and searches == 0:
         return f"{name(effect)} (cannot be predicted)"
-    return name(effect) if searches == FOLDS else f"{name(effect)} (found in {searches} of {FOLDS} searches)"
+    return name(effect) if searches == of else f"{name(effect)} (found in {searches} of {of} searches)"
 
 
 def _percent(share: float) -> str:
@@ -106,7 +107,8 @@ class TimeAxis:
         hours = np.arange(run.size) * (diagnosis.model.period_s / 3600.0)
         starts = np.cumsum(sizes)[:-1]
         block = np.full(run.size, -1)
-        for number, mask in enumerate(diagnosis.evidence.blocks(FOLDS)):
+        masks = list(diagnosis.evidence.blocks(FOLDS))
+        for number, mask in enumerate(masks):
             block[mask] = number
         used = np.flatnonzero(block >= 0)
         changes = used[1:][np.diff(block[used]) != 0]
@@ -115,7 +117,7 @@ class TimeAxis:
         return cls(
             hours=np.asarray(hours),
             run=run,
-            blocks=_edges(f"edge between the {FOLDS} held-out blocks", hours[changes]),
+            blocks=_edges(f"edge between the {len(masks)} held-out blocks", hours[changes]),
             runs=_edges("start of the next run", hours[starts]),
         )
 

@@ -1,0 +1,65 @@
+"""Several recordings: whole ones are held out."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import compensator as tc
+from compensator.diagnose.diagnosis import diagnose
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.findings import findings_of
+from compensator.model.model_file import load_model
+from tests.diagnose.scenarios import draw, record
+from tests.identify.quill_runs import runs_from
+
+QUILL = load_model("quill")
+
+
+def recordings(*hours):
+    effect = draw("gain DTF", 3)
+    tables = [record([effect], 300 + i, h)[0] for i, h in enumerate(hours)]
+    runs = [dataclasses.replace(run, recording=i) for i, t in enumerate(tables) for run in runs_from(t)]
+    return tables, runs
+
+
+def test_recordings_are_held_out_whole_and_small_ones_together():
+    evidence = evidence_of(QUILL, recordings(10.0, 8.0, 6.0, 3.0)[1])
+    sizes = [record.size for record in evidence.signals]
+    ends = np.cumsum(sizes)
+    held = [{int(np.searchsorted(ends, i, side="right")) for i in np.flatnonzero(mask)} for mask in evidence.blocks(3)]
+    assert held == [{0}, {1}, {2, 3}]
+    assert sum(int(mask.sum()) for mask in evidence.blocks(3)) == evidence.count
+
+
+def test_a_short_recording_beside_a_long_one_is_no_judge():
+    evidence = evidence_of(QUILL, recordings(20.0, 2.0)[1])
+    assert not evidence.holds_out_recordings
+    first = next(evidence.blocks(3))
+    assert 0.3 < first.sum() / evidence.count < 0.4
+
+
+def test_a_recording_does_not_foretell_itself():
+    """Whatever Y is in the one that is held out, the same is predicted for it."""
+    _, runs = recordings(10.0, 8.0, 9.0)
+    evidence = evidence_of(QUILL, runs)
+    mask = list(evidence.blocks(3))[1]
+    predicted = findings_of(evidence.without(mask)).whole
+    disturbed = dataclasses.replace(evidence, residual=np.where(mask, 3.0 * evidence.residual, evidence.residual))
+    assert findings_of(disturbed.without(mask)).whole == pytest.approx(predicted, abs=1e-9)
+    # Its zero is its own mean, and no shift of it counts.
+    seen = evidence.without(mask)
+    left = seen.left(evidence.residual + 50.0 * mask, predicted, at_rest=False)
+    assert left == pytest.approx(seen.left(evidence.residual, predicted, at_rest=False), abs=1e-6)
+    assert abs(left[mask].mean()) < 1e-6
+
+
+def test_the_diagnosis_says_how_it_was_measured():
+    tables, runs = recordings(10.0, 8.0, 9.0)
+    found = diagnose(QUILL, runs)
+    assert [effect.place for effect in found.effects] == [("gain", "DTF", "")]
+    assert found.held_out.startswith("each of 3 recordings")
+    assert found.after.rms_um < 0.2 * found.before.rms_um
+    # The same by the Python face, which knows recordings by their files.
+    data = [{"t_s": np.arange(t["y_um"].size) * 60.0, **t} for t in tables]
+    assert tc.diagnose(QUILL, data).to_dict()["held_out"] == found.held_out
