@@ -12,15 +12,17 @@ effects are proposed with both, and judged with the rest that fits each best.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, fit_terms, raw_columns, response, settled, summed
+from compensator.diagnose.fit import Fit, Start, Term, fit_terms, raw_columns, response, settled, summed
 from compensator.diagnose.likelihood import Likelihood, Points, Rest
 from compensator.diagnose.scan import Place, Scan
 from compensator.diagnose.switching import switchings
@@ -159,13 +161,13 @@ class Search:
         """Return fits with one effect more, each with the view that suits it, best first."""
         views = self._views(fit)
         likelihoods = [Likelihood(self.points, rest) for rest in views]
-        found, seen = [], set()
+        found: list[Fit] = []
+        seen = set()
         for rest, likelihood in zip(views, likelihoods, strict=True):
-            starts = self._scan.ranked(rest, fit, self._cost)[:FITTED]
+            ranked: Iterable[Start] = self._scan.ranked(rest, fit, self._cost)[:FITTED]
             if unobserved and rest is views[-1] and all(t.hypothesis.effect.observed for t in fit.terms):
-                source = switchings(rest, fit)
-                starts += [source] if source else []
-            for start in starts:
+                ranked = itertools.chain(ranked, self._sources(rest, fit, found))
+            for start in ranked:
                 if id(start[0]) in seen:
                     continue
                 seen.add(id(start[0]))
@@ -227,6 +229,12 @@ class Search:
         size = float(np.sum(self.evidence.without_nuisances(added) ** 2))
         left = (self.rms(without) ** 2) * self.evidence.count + self.evidence.noise.allowance
         return size > share * left
+
+    def _sources(self, rest: Rest, fit: Fit, found: Sequence[Fit]) -> Iterator[Start]:
+        """Yield a source that no channel shows, where it may compete with the effects found."""
+        best = max((other.log_evidence for other in found), default=fit.log_evidence)
+        if source := switchings(rest, fit, best - fit.log_evidence):
+            yield source
 
     def _starts_anywhere(self, fit: Fit) -> bool:
         """Return whether an initial state of an effect is unknown: until its first reversal it looks like a jump."""

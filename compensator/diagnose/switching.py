@@ -19,6 +19,8 @@ Time = tuple[int, float]
 MOST = 32
 #: The lag is no longer than this share of the record: a longer one is a ramp.
 LONGEST_SHARE = 0.15
+#: Times moved off the grid add up to this many times as much to the evidence.
+REFINES = 3.0
 #: Least share of a step's norm that must be left without nuisances and held-out samples.
 SEEN_SHARE = 0.05
 #: Points of time that are tried in a record.
@@ -29,7 +31,7 @@ START_SHARE = 0.01
 AT_ONCE = 5.0
 
 
-def switchings(rest: Rest, fit: Fit) -> Start | None:
+def switchings(rest: Rest, fit: Fit, rival: float = 0.0) -> Start | None:
     """Find steps through a common lag that what a fit leaves may be made of, one after another.
 
     Parameters
@@ -38,13 +40,15 @@ def switchings(rest: Rest, fit: Fit) -> Start | None:
         What else there is.
     fit : Fit
         What leaves the residual.
+    rival : float
+        What the best effect that channels show adds to the evidence: nothing is refined that falls far short of it.
 
     Returns
     -------
     (Hypothesis, values) or None
         An unobserved source with its times, and where the search of its lag begins.
     """
-    return _Pursuit(rest, fit).found()
+    return _Pursuit(rest, fit).found(rival)
 
 
 class _Pursuit:
@@ -78,14 +82,16 @@ class _Pursuit:
             for k in range(max(2, round(START_SHARE * record.size)), record.size - 2, _stride(record.size))
         ]
 
-    def found(self) -> Start | None:
+    def found(self, rival: float) -> Start | None:
         """Return the source with the best times and lag."""
         ranked = []
         for lag in np.geomspace(self._tau.low, self._longest, 7).tolist():
             score, chosen = self._pursue(self._steps(self._grid, lag))
             if chosen:
-                ranked.append((score, lag))
-        refined = [(*self._refine(lag), lag) for _, lag in sorted(ranked)[:2]]
+                ranked.append((score, lag, len(chosen)))
+        least = self._score(self._residual, 0) - rival / REFINES
+        ranked = [one for one in ranked if one[0] < least]
+        refined = [(*self._refine(lag, count + 2), lag) for _, lag, count in sorted(ranked)[:2]]
         best = min((one for one in refined if one[1]), key=lambda one: one[0], default=None)
         if best is None:
             return None
@@ -157,13 +163,13 @@ class _Pursuit:
     def _score_of(self, times: list[Time], lag: float) -> float:
         return self._score(self._left(times, lag), len(times))
 
-    def _refine(self, lag: float) -> tuple[float, list[Time]]:
+    def _refine(self, lag: float, most: int) -> tuple[float, list[Time]]:
         """Pursue again, each time moved to where it fits best before the next one is looked for; then thin out."""
         table = self._steps(self._grid, lag)
         times: list[Time] = []
         best: tuple[float, list[Time]] = (self._score(self._residual, 0), [])
         left, worse = self._residual, 0
-        while len(times) < MOST and worse < 2:
+        while len(times) < min(most, MOST) and worse < 2:
             times.append(self._grid[int(np.argmax(np.abs(table.T @ left)))])
             times = self._moved(times, lag, last_only=len(times) % 4 != 0)
             left = self._left(times, lag)
