@@ -301,4 +301,4 @@ def _verdict(found: Findings, held_out: _HeldOut, extended: ThermalModel) -> Ver
     if not any(observed):
         return "unexplained"
     holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)
-    return "explained" if is_noise and holds and all(observed) else "partly_explained"
+    return "explained" if is_noise and holds and all(observed) and found.explains else "partly_explained"
