@@ -81,7 +81,9 @@ def diagnose(
     found = findings_of(evidence)
     deciding = Deciding(Trials(evidence))
     effects = _effects(found, deciding)
-    held_out = _held_out(found, [effect.place for effect in effects], progress, executor_map)
+    # Paths that were refitted with all effects say nothing beside only some of them.
+    places = [] if evidence.free_paths else [effect.place for effect in effects]
+    held_out = _held_out(found, places, progress, executor_map)
     # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
     contradicted = not evidence.free_paths and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
     extended, remarks = (model, ()) if contradicted else _extended(model, found, effects, held_out)

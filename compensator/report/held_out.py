@@ -44,7 +44,9 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
         add(_found_in(effect, step.searches, count), step.rms_um, _EFFECT)
     named = rms_of(diagnosis.held_out_named) if diagnosis.remainder else after
     if _differs(named, bars[-1].last):
-        add("other effects these searches found", named, _EFFECT)
+        together = "all effects, paths refitted with them"
+        others = "other effects these searches found"
+        add(together if diagnosis.evidence.free_paths else others, named, _EFFECT)
     if len(bars) > 1:
         bars.append(Bar("with the effects", f"{named:.2f} µm", 0.0, named, _LEFT))
     if diagnosis.remainder is not None:
