@@ -70,7 +70,7 @@ class ModelStore:
         """Return the model file to which `back` returns; ServiceError if no model is adopted."""
         adopted = self._read().in_use
         if not adopted:
-            raise ServiceError("back: the configured model is in use; no other was adopted")
+            raise ServiceError("back: the configured model is in use; no previous model was adopted")
         return self.load(adopted[-2].sha256) if len(adopted) > 1 else self.configured
 
     def load(self, sha256: str) -> bytes:
