@@ -84,6 +84,11 @@ def diagnose(
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects]
     held_out = _held_out(found, places, progress, executor_map)
+    beside = found.remainder is not None and found.explains and not evidence.free_paths
+    if beside and rms_of(held_out.whole) > rms_of(held_out.named):
+        # What explains nothing has to show that it helps.
+        found = dataclasses.replace(found, remainder=None)
+        held_out = dataclasses.replace(held_out, whole=held_out.named)
     # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
     contradicted = not evidence.free_paths and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
     extended, remarks = (model, ()) if contradicted else _extended(model, found, effects, held_out)
