@@ -16,12 +16,11 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve
 from scipy.optimize import minimize
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Points, Rest, Whitening, factored, lags_of_paths, without_own_error
+from compensator.diagnose.likelihood import Points, RandomColumns, Rest, Whitening, lags_of_paths, without_own_error
 from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, MOST_ROWS, Regression
 
 #: Lags of the filter bank, min; those that are longer than a third of the record are left out.
@@ -86,7 +85,7 @@ class Background:
         blocks = self.template.blocks(context.period_min)
         self.columns = np.concatenate([self.template.columns(record, blocks) for record in evidence.signals])
         self.groups = np.repeat(np.arange(len(inputs)), len(taus))
-        # Where nothing is known of the base's paths, they are inputs like others.
+        # The sizes of the base's own paths are known apart from those of channels.
         self.is_path = np.arange(len(inputs)) < len(base)
 
     def fitted(self, points: Points, explained: Vector, start: Rest, steps: int = 40) -> Regressed:
@@ -152,18 +151,17 @@ class _Problem:
         white[:, 1 + random.shape[1] :] *= np.exp(x[3:])[self.groups]
         return white, whitening.log_det, random.shape[1]
 
+    def _solved(self, x: Vector) -> RandomColumns:
+        white, log_det, _ = self._white(x)
+        return RandomColumns(white[:, 1:], white[:, 0], log_det)
+
     def _value(self, x: Vector) -> tuple[float, Vector]:
         """Return the logarithm of the evidence, and its slopes but for the first two."""
-        white, log_det, random = self._white(x)
-        gram = white[:, 1:].T @ white
-        factor = factored(gram[:, 1:])
-        mean = cho_solve(factor, gram[:, 0], check_finite=False)
-        surprise = white[:, 0] @ white[:, 0] - gram[:, 0] @ mean + log_det + 2.0 * np.log(np.diag(factor[0])).sum()
-        slopes = np.diag(cho_solve(factor, np.eye(mean.size), check_finite=False)) - 1.0 + mean**2
-        zeros = self.points.zeros.shape[1]
+        solved = self._solved(x)
+        slopes, zeros = solved.surplus(solved.mean.size), self.points.zeros.shape[1]
         starts = slopes[zeros : zeros + self.points.starts_of_modes.shape[1]].sum()
-        by_size = np.bincount(self.groups, weights=slopes[random:], minlength=self.is_path.size)
-        return -0.5 * float(surprise), np.array([starts, *by_size.tolist()])
+        by_size = np.bincount(self.groups, weights=slopes[-self.groups.size :], minlength=self.is_path.size)
+        return -solved.surprise, np.array([starts, *by_size.tolist()])
 
     def _prior(self, x: Vector) -> tuple[float, Vector]:
         sizes, channels, slopes = x[3:], ~self.is_path, np.zeros(x.size)
@@ -188,7 +186,7 @@ class _Problem:
         for i in range(2):
             moved = x.copy()
             moved[i] += 1e-3
-            slopes[i] += (self._value(moved)[0] - value) / 1e-3
+            slopes[i] += (-self._solved(moved).surprise - value) / 1e-3
         return -(value + prior), -slopes
 
     def _result(self, x: Vector, log_evidence: float) -> Regressed:

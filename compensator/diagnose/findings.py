@@ -151,10 +151,9 @@ def _remainder(
 
 def _log_evidence(fit: Fit) -> float:
     """Return the logarithm of the probability of the data with a fit's effects as they are."""
-    points = fit.likelihood.points
-    likelihood = Likelihood(points, fit.rest)
-    target = likelihood.projected((points.residual - fit.added)[:, None])[:, 0]
-    return likelihood.log_prior - 0.5 * (float(target @ target) + likelihood.log_det)
+    likelihood = Likelihood(fit.likelihood.points, fit.rest)
+    left = likelihood.left_by(fit.added)
+    return likelihood.log_prior - 0.5 * (float(left @ left) + likelihood.log_det)
 
 
 def with_paths(model: ThermalModel, found: Regression) -> tuple[ThermalModel, Regression | None]:

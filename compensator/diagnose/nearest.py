@@ -20,7 +20,7 @@ import numpy as np
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.fit import Fit, Term, fit_terms
-from compensator.diagnose.likelihood import Likelihood, Points, Rest
+from compensator.diagnose.likelihood import Likelihood, Points, RandomColumns, Rest
 from compensator.model.effects.blocks import FilterBank
 from compensator.model.effects.signals import RecordSignals
 
@@ -112,23 +112,16 @@ class _Ranking:
         self._points = base.likelihood.points
         start = dataclasses.replace(unexplained, own_um=base.rest.own_um)
         self._likelihood = likelihood = Likelihood(self._points, self._points.settled(base.columns, base.fixed, start))
-        self._kept = likelihood.projected(base.columns)
-        self._target = likelihood.target - likelihood.projected(base.fixed[:, None])[:, 0]
-        self._alone = _log_evidence(self._kept, self._target)
+        self._kept, self._target = base.projected(likelihood)
+        self._alone = RandomColumns(self._kept, self._target).surprise
 
     def of(self, name: str, columns: Matrix) -> Near:
         """Return how near a channel comes, given what it would be behind and ahead of all lags."""
         white = self._likelihood.projected(columns * self._points.spread_um)
         sizes = (SIZES / math.sqrt(white.shape[1])).tolist()
-        best = max(_log_evidence(np.column_stack([self._kept, white * size]), self._target) for size in sizes)
-        return Near(channel=name, evidence=best - self._alone, lag_min=_single_lag(white, self._target))
-
-
-def _log_evidence(table: Matrix, target: Vector) -> float:
-    """Return the logarithm of the evidence of columns of which one unit in each is expected."""
-    root = np.linalg.cholesky(np.eye(table.shape[1]) + table.T @ table)
-    half = np.linalg.solve(root, table.T @ target)
-    return -0.5 * float(target @ target - half @ half) - float(np.log(np.diag(root)).sum())
+        tables = [np.column_stack([self._kept, white * size]) for size in sizes]
+        best = min(RandomColumns(table, self._target).surprise for table in tables)
+        return Near(channel=name, evidence=self._alone - best, lag_min=_single_lag(white, self._target))
 
 
 def _single_lag(white: Matrix, target: Vector) -> float:

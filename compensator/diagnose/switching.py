@@ -25,6 +25,8 @@ REFINES = 3.0
 SEEN_SHARE = 0.05
 #: Points of time that are tried in a record.
 POINTS = 240
+#: Steps that are formed at once.
+AT_A_TIME = 32
 #: A source does not begin within this share of a record: what moves there is the initial state.
 START_SHARE = 0.01
 #: What is switched once and acts within this many samples is a step.
@@ -67,8 +69,7 @@ class _Pursuit:
         likelihood = Likelihood(points, rest)
         self._evidence, self._averaged = points.evidence, points.averaged
         self._projection = dense(likelihood)
-        kept = likelihood.projected(fit.columns)
-        target = likelihood.target - likelihood.projected(fit.fixed[:, None])[:, 0]
+        kept, target = fit.projected(likelihood)
         self._residual = target - kept @ np.linalg.solve(np.eye(kept.shape[1]) + kept.T @ kept, kept.T @ target)
         #: What a switching more costs: its time may be any, and its size.
         self._cost = math.log(points.count) + 2.0
@@ -81,6 +82,9 @@ class _Pursuit:
             for record in points.evidence.signals
             for k in range(max(2, round(START_SHARE * record.size)), record.size - 2, _stride(record.size))
         ]
+
+        self._known: dict[float, dict[Time, Vector]] = {}
+        self._least: dict[float, float] = {}
 
     def found(self, rival: float) -> Start | None:
         """Return the source with the best times and lag."""
@@ -108,30 +112,39 @@ class _Pursuit:
 
     def _steps(self, where: list[Time], lag: float) -> Matrix:
         """Return one column for each time: a step through the lag, projected, of norm 1."""
+        if lag not in self._known:
+            columns, share = self._projected(self._grid, lag)
+            # A step of which next to nothing is left may have any size: leave it out.
+            self._least[lag] = SEEN_SHARE * float(np.median(share))
+            self._known[lag] = dict(zip(self._grid, self._normed(columns, share, lag).T, strict=True))
+        known = self._known[lag]
+        if new := [time for time in dict.fromkeys(where) if time not in known]:
+            known.update(zip(new, self._normed(*self._projected(new, lag), lag).T, strict=True))
+        return np.array([known[time] for time in where]).reshape(-1, self._residual.size).T
+
+    def _normed(self, columns: Matrix, share: Vector, lag: float) -> Matrix:
+        return np.asarray(columns / np.where(share > self._least[lag], np.linalg.norm(columns, axis=0), np.inf))
+
+    def _projected(self, where: list[Time], lag: float) -> tuple[Matrix, Vector]:
+        """Return steps at some times, and which share of the norm of each is left."""
         records = self._evidence.signals
-        sizes = [record.size for record in records]
-        begin = np.cumsum([0, *sizes[:-1]])
-        longest = max(sizes)
-        shape = Lag(lag, self._period).filter(np.concatenate(([0.0], np.ones(longest + 1))))[1:]
-        table = np.zeros((sum(sizes), len(where)))
-        for column, (record, at) in enumerate(where):
-            first = int(at / self._period)
-            part = at / self._period - first
-            room = sizes[record] - first
-            step = shape[:room].copy()
-            # Between two samples, a step is as much of the one before as of the one after.
-            step[1:] = (1.0 - part) * shape[1:room] + part * shape[: room - 1]
-            step[0] *= 1.0 - part
-            table[begin[record] + first : begin[record] + sizes[record], column] = step
-        if not where:
-            return np.zeros((self._residual.size, 0))
-        averaged = self._averaged(table)
+        begin = np.cumsum([0, *[record.size for record in records]])
+        longest = max(record.size for record in records)
+        # Two zeros before it, so that a step may begin between two samples.
+        shape = np.concatenate(([0.0], Lag(lag, self._period).filter(np.concatenate(([0.0], np.ones(longest + 1))))))
+        parts = []
+        for few in (where[i : i + AT_A_TIME] for i in range(0, len(where), AT_A_TIME)):
+            table = np.zeros((len(few), int(begin[-1])))
+            for row, (record, at) in zip(table, few, strict=True):
+                first = int(at / self._period)
+                part, own = at / self._period - first, row[begin[record] : begin[record + 1]]
+                room = own.size - first
+                own[first:] = (1.0 - part) * shape[2 : 2 + room] + part * shape[1 : 1 + room]
+            parts.append(self._averaged(table.T))
+        averaged = np.concatenate(parts, axis=1)
         whole = np.linalg.norm(averaged - averaged.mean(axis=0), axis=0)
-        table = self._projection @ averaged
-        norm = np.linalg.norm(table, axis=0)
-        # A step of which next to nothing is left may have any size: leave it out.
-        norm[norm < SEEN_SHARE * np.median(norm / (whole + 1e-9)) * whole + 1e-9] = np.inf
-        return np.asarray(table / norm)
+        columns = self._projection @ averaged
+        return columns, np.linalg.norm(columns, axis=0) / (whole + 1e-9)
 
     def _pursue(self, table: Matrix) -> tuple[float, list[int]]:
         """Choose the best step, refit, and continue while each is worth its cost."""
@@ -177,16 +190,21 @@ class _Pursuit:
             worse = 0 if now < best[0] else worse + 1
             if worse == 0:
                 best = (now, list(times))
-        score, times = best
-        times = self._moved(times, lag, last_only=False) if times else times
+        times = self._moved(best[1], lag, last_only=False)
+        times = self._thinned(times, lag)
+        return self._score_of(times, lag), times
+
+    def _thinned(self, times: list[Time], lag: float) -> list[Time]:
+        """Leave out, one after another, the steps that are not worth their cost."""
         while len(times) > 1:
-            fewer = [times[:k] + times[k + 1 :] for k in range(len(times))]
-            scores = [self._score_of(some, lag) for some in fewer]
-            score = self._score_of(times, lag)
-            if min(scores) >= score:
+            table = self._steps(times, lag)
+            inverse = np.linalg.inv(table.T @ table + 1e-9 * np.eye(len(times)))
+            worth = 0.5 * (inverse @ (table.T @ self._residual)) ** 2 / np.diag(inverse)
+            least = int(np.argmin(worth))
+            if worth[least] >= self._cost:
                 break
-            times = fewer[int(np.argmin(scores))]
-        return score, times
+            times = times[:least] + times[least + 1 :]
+        return times
 
     def _left(self, times: list[Time], lag: float) -> Vector:
         q = np.linalg.qr(self._steps(times, lag))[0]
