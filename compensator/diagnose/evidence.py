@@ -338,6 +338,9 @@ def _context(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordS
             if np.min(np.abs(values)) < 0.05 * np.ptp(values) and not name.endswith(DEGC):
                 zeroed.add(name)
     paths = {name: path.sampled for name, path in (("DTF", model.dtf), ("TDTF", model.tdtf)) if path is not None}
+    both = (("DTF", model.dtf), ("TDTF", model.tdtf))
+    known = {name: path.gain_with_std() for name, path in both if path is not None}
+    gains = {name: (gain, std if math.isfinite(std) else 0.0) for name, (gain, std) in known.items()}
     sizes = {name: max(float(np.ptp(record.share(name))) for record in signals) for name in ("DTF", "TDTF")}
     return Context(
         has_ambient=model.tdtf is not None,
@@ -352,4 +355,5 @@ def _context(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordS
         approximate=model.held_out_rms_um is not None,
         has_late_t_q=model.late_t_q is not None,
         functions={name: (path.b, path.a) for name, path in paths.items()},
+        gains=gains,
     )

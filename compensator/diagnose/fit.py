@@ -92,6 +92,10 @@ class Fit:
         """Kind, path and channel of each effect."""
         return frozenset(term.hypothesis.place for term in self.terms)
 
+    def projected(self, likelihood: Likelihood) -> tuple[Matrix, Vector]:
+        """Return the columns of the amplitudes, and the data without what has none, as a likelihood projects them."""
+        return likelihood.projected(self.columns), likelihood.left_by(self.fixed)
+
     def starts(self, without: int | None = None) -> list[Start]:
         """Return where another fit begins, with all terms or all but one."""
         return [term.start for i, term in enumerate(self.terms) if i != without]
@@ -183,10 +187,9 @@ class _Problem:
 def _part(likelihood: Likelihood, hypothesis: Hypothesis, values: tuple[float, ...]) -> _Part:
     points = likelihood.points
     table, scale = raw_columns(points.evidence, hypothesis, values), None
+    averaged = points.averaged(table)
     if hypothesis.amplitudes:
-        averaged, scale = points.scaled(table)
-    else:
-        averaged = points.averaged(table)
+        averaged, scale = points.scaled(averaged, hypothesis.sizes, averaged.shape[1])
     return _Part(values, averaged, scale, likelihood.projected(averaged))
 
 

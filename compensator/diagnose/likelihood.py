@@ -16,15 +16,17 @@ regularizations and Gaussian processes (Automatica 2012); Rasmussen and Williams
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_banded
+from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dtbtrs
 from scipy.optimize import minimize
 
-from compensator.arrays import Matrix, Vector
+from compensator.arrays import Indices, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.model.effects.blocks import FilterBank
 from compensator.model.effects.hypothesis import Context
@@ -48,6 +50,8 @@ SLOW_SHARE = 0.03
 #: Typical time constant of the slow rest, min, and how far (in e-folds) noise, slow rest, its time constant, the
 #: initial state and the paths' fast error may be from what is typical.
 REST_MIN, REST_FOLDS = 60.0, (0.4, 1.0, 1.0, 2.0, 0.5)
+#: Stretches of so few points are whitened in a loop.
+FEW = 12
 #: Furthest that the search of the rest goes, in e-folds.
 FURTHEST = 6.0
 
@@ -103,8 +107,11 @@ class Points:
         self.starts = np.cumsum([0, *[e.size for e in edges[:-1]]])
         self.period_min = context.period_min * stride
         self.count = int(self.used.sum())
-        #: Variance of the noise of each point, relative to a full one.
-        self.relative_variance = stride / self._counts
+        #: Variance of the noise of each point, relative to a full one, infinite where it is not used; where runs begin;
+        #: stretches of points with equal noise: begin, end, variance.
+        self.relative_variance = np.where(self.used, stride / self._counts, np.inf)
+        self.begins = frozenset(self.starts.tolist())
+        self.stretches = _stretches(self.relative_variance, self.starts)
         self.spread_um = max(evidence.spread_um, 1e-9)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
         self.is_exact = self.is_exact or evidence.free_paths
@@ -130,12 +137,26 @@ class Points:
         sums = np.add.reduceat(table * self._weights[:, None], self._edges, axis=0)
         return np.asarray(sums / self._counts[:, None])
 
-    def scaled(self, table: Matrix) -> tuple[Matrix, Vector]:
-        """Return averaged columns of which one unit in each moves y by its spread in all, and their scales."""
-        points = self.averaged(table)
+    def scaled(self, points: Matrix, sizes: Sequence[float], together: int) -> tuple[Matrix, Vector]:
+        """Return averaged columns of which one unit is what is expected of each amplitude, and their scales.
+
+        That moves y by its spread, all amplitudes together, or is the size that the machine bounds it by.
+
+        Parameters
+        ----------
+        points : numpy.ndarray, shape (points, k)
+            One column for each amplitude.
+        sizes : sequence of float
+            Bounds of the amplitudes, repeated over the columns; none where there are none.
+        together : int
+            How many of the columns belong to one effect.
+        """
         spread = np.std(points[self.used], axis=0)
         spread[spread < 1e-12] = 1.0
-        scale = self.spread_um / spread / math.sqrt(table.shape[1])
+        scale = self.spread_um / spread
+        if sizes:
+            scale = np.minimum(scale, np.resize(sizes, scale.size))
+        scale = scale / math.sqrt(together)
         return points * scale, scale
 
     def typical_rest(self) -> Rest:
@@ -195,30 +216,24 @@ class Points:
         searched = np.arange(0 if self.is_exact else 1, 5)
         at = np.clip(_logs(start), self._typical - FURTHEST, self._typical + FURTHEST)
 
-        def value(logs: Vector) -> tuple[float, Vector]:
+        def solved(logs: Vector) -> RandomColumns:
             rest = self._rest(logs, start)
             whitening = Whitening(self, rest)
             white = whitening.of(table)
             for where, size in zip(sized, (rest.start_um, rest.fast_um), strict=True):
                 white[:, 1:][:, where] *= size
-            gram = white[:, 1:].T @ white
-            factor = factored(gram[:, 1:])
-            mean = cho_solve(factor, gram[:, 0], check_finite=False)
-            surprise = white[:, 0] @ white[:, 0] - gram[:, 0] @ mean + whitening.log_det + _log_det(factor)
-            # How the evidence changes with the size of a group of random columns: by what the data say of each.
-            known = np.diag(cho_solve(factor, np.eye(mean.size)[:, : ends[2]], check_finite=False))
-            surplus = mean[: ends[2]] ** 2 + known - 1.0
-            return 0.5 * float(surprise), -np.array([surplus[where].sum() for where in sized])
+            return RandomColumns(white[:, 1:], white[:, 0], whitening.log_det)
 
         def with_gradient(some: Vector) -> tuple[float, Vector]:
             logs = at.copy()
             logs[searched] = some
-            (here, by_size), slopes = value(logs), np.zeros(5)
-            slopes[3:] = by_size
+            model, slopes = solved(logs), np.zeros(5)
+            here, surplus = model.surprise, model.surplus(ends[2])
+            slopes[3:] = [-surplus[where].sum() for where in sized]
             for i in searched[searched < 3].tolist():
                 moved = logs.copy()
                 moved[i] += 1e-3
-                slopes[i] = (value(moved)[0] - here) / 1e-3
+                slopes[i] = (solved(moved).surprise - here) / 1e-3
             off = (logs - self._typical) / REST_FOLDS
             return here + 0.5 * float(off @ off), (slopes + off / REST_FOLDS)[searched]
 
@@ -275,17 +290,13 @@ class Whitening:
         self._used = points.used
         phi = math.exp(-points.period_min / rest.tau_min)
         stationary = (rest.slow_um / rest.noise_um) ** 2
-        gains, variances = np.zeros(points.used.size), np.ones(points.used.size)
-        begins, p = set(points.starts.tolist()), stationary
-        noises = points.relative_variance.tolist()
-        for i, used in enumerate(points.used.tolist()):
-            if i in begins:
+        predicted, p = np.empty(points.used.size), stationary
+        for begin, end, noise in points.stretches:
+            if begin in points.begins:
                 p = stationary
-            if used:
-                variances[i] = p + noises[i]
-                gains[i] = p / variances[i]
-                p *= 1.0 - gains[i]
-            p = phi * phi * p + stationary * (1.0 - phi * phi)
+            predicted[begin:end], p = _predicted_variances(p, end - begin, noise, phi, stationary)
+        variances = predicted + points.relative_variance
+        gains = predicted / variances
         self._into = phi * gains
         self._into[points.starts[1:] - 1] = 0.0
         self._bands = np.ones((2, points.used.size))
@@ -296,10 +307,44 @@ class Whitening:
 
     def of(self, table: Matrix) -> Matrix:
         """Return columns as the filter leaves them, on the points used."""
-        driven = np.zeros(table.shape)
+        if not table.shape[1]:
+            return np.zeros((self._scale.size, 0))  # LAPACK must not be called with nothing
+        driven = np.zeros(table.shape, order="F")
         driven[1:] = self._into[:-1, None] * table[:-1]
-        predicted = solve_banded((1, 0), self._bands, driven, check_finite=False)
+        predicted, _ = dtbtrs(self._bands, driven, uplo="L", diag="U", overwrite_b=1)
         return np.asarray((table - predicted)[self._used] * self._scale[:, None])
+
+
+class RandomColumns:
+    """White noise of size 1 and columns whose weights are unknown with standard deviation 1.
+
+    Parameters
+    ----------
+    columns : numpy.ndarray, shape (m, k)
+        Whitened.
+    target : numpy.ndarray, shape (m,)
+        What they and the noise add up to.
+    log_det : float
+        Logarithm of the determinant of the covariance without them.
+
+    Attributes
+    ----------
+    mean : numpy.ndarray, shape (k,)
+        Most probable weights.
+    surprise : float
+        Half the squares and half the logarithm of the determinant: less the logarithm of the evidence.
+    """
+
+    def __init__(self, columns: Matrix, target: Vector, log_det: float = 0.0) -> None:
+        moment = columns.T @ target
+        self._factor = factored(columns.T @ columns)
+        self.mean = cho_solve(self._factor, moment, check_finite=False)
+        self.surprise = 0.5 * float(target @ target - moment @ self.mean + log_det + log_det_of(self._factor))
+
+    def surplus(self, count: int) -> Vector:
+        """Return the slope of the log evidence by the logarithm of the size of each of the first columns."""
+        known = np.diag(cho_solve(self._factor, np.eye(self.mean.size)[:, :count], check_finite=False))
+        return np.asarray(self.mean[:count] ** 2 + known - 1.0)
 
 
 class Likelihood:
@@ -325,9 +370,13 @@ class Likelihood:
         self._whitening = Whitening(points, rest)
         self._random = self._whitening.of(points.random(rest))
         self._factor = factored(self._random.T @ self._random)
-        self.log_det = self._whitening.log_det + _log_det(self._factor)
+        self.log_det = self._whitening.log_det + log_det_of(self._factor)
         self.log_prior = points.log_prior(rest)
         self.target = self.projected(points.residual[:, None])[:, 0]
+
+    def left_by(self, added: Vector) -> Vector:
+        """Return what effects that add so much to the points leave of the target."""
+        return self.target - self.projected(added[:, None])[:, 0]
 
     def projected(self, table: Matrix) -> Matrix:
         """Return averaged columns without noise correlation, nuisances and own error."""
@@ -339,6 +388,41 @@ class Likelihood:
 def dense(likelihood: Likelihood) -> Matrix:
     """Return the projection as one matrix, for many columns at once."""
     return likelihood.projected(np.eye(likelihood.points.used.size))
+
+
+def _stretches(variance: Vector, starts: Indices) -> list[tuple[int, int, float]]:
+    """Return where equal variances begin and end, cut where runs begin."""
+    changes = np.flatnonzero(variance[1:] != variance[:-1]) + 1
+    edges = np.unique(np.concatenate([starts, changes, [variance.size]])).tolist()
+    return [(a, b, float(variance[a])) for a, b in itertools.pairwise(edges)]
+
+
+def _predicted_variances(first: float, count: int, noise: float, phi: float, stationary: float) -> tuple[Vector, float]:
+    """Return the variances of a slow rest before each of some points with equal noise, and after them.
+
+    What the Kalman filter makes of a variance is a linear fraction of it, so that many points need no loop.
+    """
+    if count <= FEW:
+        values = []
+        for _ in range(count):
+            values.append(first)
+            left = first if noise == math.inf else first * noise / (first + noise)
+            first = stationary + phi * phi * (left - stationary)
+        return np.array(values), first
+    n = np.arange(count + 1, dtype=np.float64)
+    course: Vector
+    if noise == math.inf:
+        course = stationary + np.power(phi, 2.0 * n) * (first - stationary)
+        return course[:-1], float(course[-1])
+    driven = stationary * (1.0 - phi * phi)
+    half = 0.5 * (noise * (1.0 - phi * phi) - driven)
+    root = math.sqrt(half * half + driven * noise)
+    # The larger of both fixed points, without cancellation, and the other, which is negative.
+    settled = driven * noise / (half + root) if half > 0.0 else root - half
+    other = settled - 2.0 * root
+    odds = np.power(phi * noise / (settled + noise), 2.0 * n) * (first - settled) / (first - other)
+    course = (settled - other * odds) / (1.0 - odds)
+    return course[:-1], float(course[-1])
 
 
 def lags_of_paths(context: Context) -> tuple[float, ...]:
@@ -363,5 +447,6 @@ def _logs(rest: Rest) -> Vector:
     return np.log([rest.noise_um, rest.slow_um, rest.tau_min, rest.start_um, max(rest.fast_um, 1e-9)])
 
 
-def _log_det(factor: tuple[Matrix, bool]) -> float:
+def log_det_of(factor: tuple[Matrix, bool]) -> float:
+    """Return the logarithm of the determinant of a matrix from its Cholesky factor."""
     return 2.0 * float(np.log(np.diag(factor[0])).sum())

@@ -106,9 +106,29 @@ class Search:
         """
         unobserved = unobserved and not self.evidence.free_paths
         rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
-        before = best = fit_terms(Likelihood(self.points, rest), [])
+        before = fit_terms(Likelihood(self.points, rest), [])
+        grown = self._grown(before, unobserved=unobserved)
+        best = self._pruned(grown)
+        if grown.terms and not best.terms:
+            # What was too small to name must not keep out what is not.
+            best = self._pruned(self._grown(before, unobserved=unobserved, apart_from=grown.places))
+        best = self._with_simpler_name(self._exchanged(best, len(best.terms)))
+        return Selection(before=before, fit=best, rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))))
+
+    def _grown(self, best: Fit, *, unobserved: bool, apart_from: frozenset[Place] = frozenset()) -> Fit:
+        """Add one effect after another while each is worth its cost.
+
+        Parameters
+        ----------
+        best : Fit
+            Where to begin.
+        unobserved : bool
+            Whether an unobserved source is looked for.
+        apart_from : frozenset of Place
+            Effects that are not looked for.
+        """
         while len(best.terms) < MOST and not self._is_expected(best):
-            proposed = self._proposed(best, unobserved=unobserved)
+            proposed = self._proposed(best, unobserved=unobserved, apart_from=apart_from)
             # A source with many switchings looks poor until the rest is settled with it.
             late = [fit for fit in proposed[JUDGED:] if not fit.terms[-1].hypothesis.effect.observed]
             candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
@@ -116,8 +136,7 @@ class Search:
             if self.score(better) <= self.score(best):
                 break
             best = self._exchanged(better)
-        best = self._with_simpler_name(self._exchanged(self._pruned(best), len(best.terms)))
-        return Selection(before=before, fit=best, rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))))
+        return best
 
     def score(self, fit: Fit) -> float:
         """Return *J*."""
@@ -157,7 +176,7 @@ class Search:
             views.append(dataclasses.replace(fit.rest, slow_um=math.sqrt(fit.rest.slow_um * small)))
         return views
 
-    def _proposed(self, fit: Fit, *, unobserved: bool) -> list[Fit]:
+    def _proposed(self, fit: Fit, *, unobserved: bool, apart_from: frozenset[Place] = frozenset()) -> list[Fit]:
         """Return fits with one effect more, each with the view that suits it, best first."""
         views = self._views(fit)
         likelihoods = [Likelihood(self.points, rest) for rest in views]
@@ -168,7 +187,7 @@ class Search:
             if unobserved and rest is views[-1] and all(t.hypothesis.effect.observed for t in fit.terms):
                 ranked = itertools.chain(ranked, self._sources(rest, fit, found))
             for start in ranked:
-                if id(start[0]) in seen:
+                if id(start[0]) in seen or start[0].place in apart_from:
                     continue
                 seen.add(id(start[0]))
                 if start[0].effect.jumps and self._starts_anywhere(fit):
@@ -223,8 +242,9 @@ class Search:
         if self.evidence.free_paths:
             # What is left without it is the whole deformation: only the evidence says what it is worth.
             return True
-        effect, others = term.hypothesis.effect, self.evidence.context.approximate and len(fit.terms) > 1
-        share = effect.worth_with_others if others else effect.worth
+        effect = term.hypothesis.effect
+        absorbs = self.evidence.context.approximate and (len(fit.terms) > 1 or effect.is_like_own_error)
+        share = effect.worth_with_others if absorbs else effect.worth
         added = np.where(self.evidence.used, response(self.evidence, term), 0.0)
         size = float(np.sum(self.evidence.without_nuisances(added) ** 2))
         left = (self.rms(without) ** 2) * self.evidence.count + self.evidence.noise.allowance

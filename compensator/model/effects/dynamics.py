@@ -13,6 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, Lag, S
 from compensator.model.effects.hypothesis import Context, Hypothesis, numbered, proposes
@@ -109,7 +111,8 @@ def modes(context: Context) -> Iterator[Hypothesis]:
     for path in context.paths:
         missing = MissingMode(path=path, tau_min=0.0, gain=1.0)
         name = f"gain_um_per_{context.drive_unit(path)}"
-        yield Hypothesis(effect=missing, form="missing", free=(context.tau(),), amplitudes=(name,))
+        sizes = (context.gain_change(path),)
+        yield Hypothesis(effect=missing, form="missing", free=(context.tau(),), amplitudes=(name,), sizes=sizes)
     for path in context.paths:
         for tau in context.taus_min.get(path, ()):
             if tau > 2.0 * context.period_min:
@@ -120,4 +123,5 @@ def modes(context: Context) -> Iterator[Hypothesis]:
     names = f"change_um_per_{context.drive_unit('DTF')}", "change_ambient_um_per_k"
     amplitudes = tuple(n for name in names for n in numbered(name, len(taus)))
     both = ChangedPaths(tau_min=taus, gain=ones, gain_ambient=ones)
-    yield Hypothesis(effect=both, form="changed", amplitudes=amplitudes)
+    sizes = tuple(np.repeat([context.gain_change("DTF"), context.gain_change("TDTF")], len(taus)).tolist())
+    yield Hypothesis(effect=both, form="changed", amplitudes=amplitudes, sizes=sizes)

@@ -35,4 +35,4 @@ class Gain(Effect):
 def gains(context: Context) -> Iterator[Hypothesis]:
     """Propose every path."""
     for path in context.paths:
-        yield Hypothesis(effect=Gain(path=path, change=1.0), amplitudes=("change",))
+        yield Hypothesis(effect=Gain(path=path, change=1.0), amplitudes=("change",), sizes=(context.change(path),))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -65,6 +66,9 @@ class Hypothesis:
         Parameters that are searched.
     amplitudes : tuple of str
         Names of the linear parameters, with units.
+    sizes : tuple of float
+        How large each of them may be before the data are seen (standard deviation, in its unit), where the machine
+        says so: a path changes by about its own gain at most. None: as large as moves y by what it moved.
     path : str
         Path that the diagnosis names, where it is not the effect's own.
     ordered : bool
@@ -75,6 +79,7 @@ class Hypothesis:
     form: str = ""
     free: tuple[Free, ...] = ()
     amplitudes: tuple[str, ...] = ()
+    sizes: tuple[float, ...] = ()
     path: str = ""
     ordered: bool = False
 
@@ -143,6 +148,8 @@ class Context:
         Channels with a zero of their own: they come near 0 and go far from it. No temperature in °C is one.
     functions : mapping of str to (tuple of float, tuple of float)
         Coefficients b and a of each path.
+    gains : mapping of str to (float, float)
+        Gain of each path at rest and its standard error, 0 where none is known, in µm per unit of what drives it.
     approximate : bool
         Whether effects match the forms only approximately, as on a machine that the model was identified on:
         filter banks are then proposed in addition to the exact forms.
@@ -160,6 +167,7 @@ class Context:
     spans: Mapping[str, float] = field(default_factory=dict)
     zeroed: frozenset[str] = frozenset()
     functions: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
+    gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     approximate: bool = False
     has_late_t_q: bool = False
 
@@ -172,6 +180,16 @@ class Context:
     def paths(self) -> tuple[str, ...]:
         """Paths that lead to the deformation and move it."""
         return tuple(name for name, size in self.sizes_um.items() if size > 0.0)
+
+    def change(self, path: str) -> float:
+        """Return by which share of it the gain of a path may change: all of it, and more where it is hardly known."""
+        gain, std = self.gains.get(path, (math.inf, 0.0))
+        return 1.0 + std / abs(gain) if gain else math.inf
+
+    def gain_change(self, path: str) -> float:
+        """Return by how much the gain of a path at rest may change, in µm per unit of what drives it."""
+        gain, std = self.gains.get(path, (math.inf, 0.0))
+        return abs(gain) + std
 
     def drive_unit(self, path: str) -> str:
         """Return the unit of what drives a path, as names of parameters have it."""

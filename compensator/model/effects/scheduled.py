@@ -17,6 +17,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
 from compensator.arrays import NAN
 from compensator.model.effects.base import BankEffect, Effect, Run, number, numbers, only, register, text
 from compensator.model.effects.blocks import Block, FilterBank, FromStart, Function, Lag, S
@@ -143,11 +145,15 @@ def schedules(context: Context) -> Iterator[Hypothesis]:
     for channel, path in itertools.product(context.channels, context.paths):
         origin, (b, a) = "zero" if channel in context.zeroed else "start", context.functions[path]
         place: dict[str, Any] = {"path": path, "channel": channel, "origin": origin, "span": context.spans[channel]}
+        sizes = (context.change(path),)
         if context.approximate:
             dc_gain = math.fsum(b) / math.fsum(a)
+            both = tuple(np.repeat([context.gain_change(path), *sizes], len(taus)).tolist())
             bank = BankScheduled(**place, tau_min=taus, gain=ones, gain_share=ones, dc_gain=dc_gain)
-            yield Hypothesis(effect=bank, form="row", amplitudes=gains)
-        yield Hypothesis(effect=ShareScheduled(**place, change=1.0), form="share", amplitudes=change)
-        yield Hypothesis(effect=DriveScheduled(**place, change=1.0, b=b, a=a), form="drive", amplitudes=change)
+            yield Hypothesis(effect=bank, form="row", amplitudes=gains, sizes=both)
+        yield Hypothesis(effect=ShareScheduled(**place, change=1.0), form="share", amplitudes=change, sizes=sizes)
+        yield Hypothesis(
+            effect=DriveScheduled(**place, change=1.0, b=b, a=a), form="drive", amplitudes=change, sizes=sizes
+        )
         speed = SpeedScheduled(**place, change=1.0, tau_min=0.0)
-        yield Hypothesis(effect=speed, form="speed", free=(context.tau(),), amplitudes=change)
+        yield Hypothesis(effect=speed, form="speed", free=(context.tau(),), amplitudes=change, sizes=sizes)
