@@ -39,12 +39,11 @@ from compensator.diagnose.outcome import (
 from compensator.diagnose.search import Candidate
 from compensator.diagnose.trials import Trials
 from compensator.model.effects import Effect
+from compensator.model.effects.hypothesis import Place
 from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
 
-#: Kind, path and channel.
-Place = tuple[str, str, str]
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
 #: Effects are not deployed where held-out blocks are predicted worse with them by more than this factor.

@@ -16,7 +16,7 @@ from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import Likelihood, Points, Rest, without_own_error
 from compensator.model.effects import Effect
-from compensator.model.effects.hypothesis import Free, Hypothesis
+from compensator.model.effects.hypothesis import Free, Hypothesis, Place
 
 Start = tuple[Hypothesis, Sequence[float]]
 
@@ -88,7 +88,7 @@ class Fit:
         return self.likelihood.rest
 
     @property
-    def places(self) -> frozenset[tuple[str, str, str]]:
+    def places(self) -> frozenset[Place]:
         """Kind, path and channel of each effect."""
         return frozenset(term.hypothesis.place for term in self.terms)
 

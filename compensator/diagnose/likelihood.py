@@ -95,7 +95,7 @@ class Points:
     def __init__(self, evidence: Evidence) -> None:
         self.evidence = evidence
         noise, context = evidence.noise, evidence.context
-        self.is_exact = not context.approximate
+        self.is_exact = not context.approximate or evidence.free_paths
         stride = max(1, math.ceil(evidence.count / POINTS))
         starts = np.cumsum([0, *[record.size for record in evidence.signals[:-1]]])
         edges = [np.arange(s, s + record.size, stride) for s, record in zip(starts, evidence.signals, strict=True)]
@@ -114,7 +114,6 @@ class Points:
         self.stretches = _stretches(self.relative_variance, self.starts)
         self.spread_um = max(evidence.spread_um, 1e-9)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
-        self.is_exact = self.is_exact or evidence.free_paths
         self.own_um = (
             self.spread_um
             if evidence.free_paths

@@ -17,6 +17,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
 from compensator.diagnose.search import Candidate
 from compensator.model.effects import Effect
+from compensator.model.effects.hypothesis import Place
 from compensator.model.effects.seen import Range, Seen
 from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import ThermalModel
@@ -72,7 +73,7 @@ class FoundEffect:
         return getattr(self, key)
 
     @property
-    def place(self) -> tuple[str, str, str]:
+    def place(self) -> Place:
         """Kind, path and channel."""
         return self.term.hypothesis.place
 
@@ -329,7 +330,7 @@ def rivals_of(
     test : callable
         Returns the test that tells another explanation apart from the effect.
     """
-    rivals: dict[tuple[str, str, str], Rival] = {}
+    rivals: dict[Place, Rival] = {}
     for other in others:
         place, rms = other.term.hypothesis.place, other.rms_um
         if place == term.hypothesis.place or place in rivals or rms > RIVAL_TIMES * after_um:

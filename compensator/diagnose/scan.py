@@ -12,8 +12,6 @@ from compensator.diagnose.fit import Fit, Start, raw_columns
 from compensator.diagnose.likelihood import Likelihood, Points, Rest, dense
 from compensator.model.effects.hypothesis import Hypothesis
 
-Place = tuple[str, str, str]
-
 
 class Scan:
     """Hypotheses with their columns at every point of their grids.

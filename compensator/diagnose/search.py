@@ -24,9 +24,9 @@ from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, raw_columns, response, settled, summed
 from compensator.diagnose.likelihood import Likelihood, Points, Rest
-from compensator.diagnose.scan import Place, Scan
+from compensator.diagnose.scan import Scan
 from compensator.diagnose.switching import switchings
-from compensator.model.effects.hypothesis import Hypothesis, proposals
+from compensator.model.effects.hypothesis import Hypothesis, Place, proposals
 
 #: Most effects looked for.
 MOST = 4

@@ -52,6 +52,10 @@ class Free:
     key: str = ""
 
 
+#: Kind, path and channel: what the diagnosis names.
+Place = tuple[str, str, str]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hypothesis:
     """One way in which the model could lack something.
@@ -84,7 +88,7 @@ class Hypothesis:
     ordered: bool = False
 
     @property
-    def place(self) -> tuple[str, str, str]:
+    def place(self) -> Place:
         """Kind, path and channel: what the diagnosis names."""
         return self.effect.kind, self.path or self.effect.path, self.effect.channel
 
