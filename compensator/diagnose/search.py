@@ -242,9 +242,8 @@ class Search:
         if self.evidence.free_paths:
             # What is left without it is the whole deformation: only the evidence says what it is worth.
             return True
-        effect = term.hypothesis.effect
-        absorbs = self.evidence.context.approximate and (len(fit.terms) > 1 or effect.is_like_own_error)
-        share = effect.worth_with_others if absorbs else effect.worth
+        effect, others = term.hypothesis.effect, self.evidence.context.approximate and len(fit.terms) > 1
+        share = effect.worth_with_others if others else effect.worth
         added = np.where(self.evidence.used, response(self.evidence, term), 0.0)
         size = float(np.sum(self.evidence.without_nuisances(added) ** 2))
         left = (self.rms(without) ** 2) * self.evidence.count + self.evidence.noise.allowance

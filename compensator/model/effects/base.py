@@ -102,8 +102,6 @@ class Effect:
     worth: ClassVar[float] = 0.05
     #: The same next to another effect where forms are approximate: what depends on time alone fits what they miss.
     worth_with_others: ClassVar[float] = 0.25
-    #: Whether an identified model's own error looks like it, so that it needs as much alone.
-    is_like_own_error: ClassVar[bool] = False
     #: Whether it jumps at a time, and whether its unknown initial state looks like such a jump.
     jumps: ClassVar[bool] = False
     starts_anywhere: ClassVar[bool] = False

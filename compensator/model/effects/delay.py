@@ -27,7 +27,7 @@ class DelayedPath(Effect):
     """A delayed path."""
 
     kind = "delay"
-    worth_with_others, is_like_own_error = 0.6, True
+    worth_with_others = 0.6
     path: str = text("DTF", "TDTF")
     delay_min: float = number(0.0, 1440.0)
     lag_min: float = number(0.0, 1440.0)
