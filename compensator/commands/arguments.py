@@ -14,6 +14,11 @@ def _column(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME", help=words)
 
 
+def _y_std(parser: argparse.ArgumentParser) -> None:
+    words = "standard deviation of one measured Y, um; needed where Y was measured now and then, as by a touch probe"
+    parser.add_argument("--y-std", type=float, metavar="UM", help=words)
+
+
 def _page(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--page",
@@ -85,6 +90,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html is written next to it")
     _page(parser)
     _column(parser)
+    _y_std(parser)
     add("--name", help="name of the model (default: the file name)")
     add = parser.add_argument_group("structure of the model").add_argument
     words = "heat: with a TTF; direct: from T_Q - AT to y; auto (the default): heat if heat_w is known"
@@ -118,6 +124,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
     _page(parser)
     _column(parser)
+    _y_std(parser)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
 
