@@ -37,6 +37,8 @@ STATE_PRIOR = 1e-3
 FASTEST, DECAY_RATIO = 2.0, 3.5
 #: Recordings are held out whole where the larger half of them has less than this share of the samples.
 LARGEST_GROUP = 0.75
+#: Fewest samples of a measured deformation, and fewest values where it was measured now and then.
+LEAST_SAMPLES, LEAST_VALUES = 60, 12
 #: Least noise of Y: a reading has digits.
 LEAST_NOISE_UM = 1e-3
 #: A displacement is an effect, never a cause: another probe follows Y whatever moves it.
@@ -91,6 +93,17 @@ class Evidence:
     def count(self) -> int:
         """Number of samples used."""
         return self.noise.count
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether every run has Y measured now and then only, as by a touch probe."""
+        return all(run.has_sparse_y for run in self.runs)
+
+    @property
+    def sparse(self) -> tuple[bool, ...]:
+        """Whether Y was measured now and then, for each record of signals; what follows the runs is like the last."""
+        runs = [run.has_sparse_y for run in self.runs]
+        return (*runs, *(runs[-1:] * (len(self.signals) - len(runs))))
 
     @property
     def y_um(self) -> Vector:
@@ -279,9 +292,13 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     ]
     residual = np.concatenate(parts)
     used = np.isfinite(residual)
-    if used.sum() < 60:
-        names = ", ".join(dict.fromkeys(run.name for run in runs))
-        raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
+    names, sparse = ", ".join(dict.fromkeys(run.name for run in runs)), all(run.has_sparse_y for run in runs)
+    if used.sum() < (LEAST_VALUES if sparse else LEAST_SAMPLES):
+        if sparse and used.any():
+            raise DataError(f"{names}: y_um has {int(used.sum())} values, expected at least {LEAST_VALUES}")
+        raise DataError(
+            f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least {LEAST_SAMPLES}"
+        )
     noise_um = math.hypot(noise_floor(model, runs), _late_error_um(model, courses, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)

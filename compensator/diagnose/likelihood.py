@@ -94,14 +94,23 @@ class Points:
         self.is_exact = not context.approximate
         stride = max(1, math.ceil(evidence.count / POINTS))
         starts = np.cumsum([0, *[record.size for record in evidence.signals[:-1]]])
-        edges = [np.arange(s, s + record.size, stride) for s, record in zip(starts, evidence.signals, strict=True)]
+        # A value measured now and then is a point of its own.
+        edges = [
+            s + np.flatnonzero(evidence.used[s : s + record.size]) if sparse else np.arange(s, s + record.size, stride)
+            for s, record, sparse in zip(starts.tolist(), evidence.signals, evidence.sparse, strict=True)
+        ]
         self._edges = np.concatenate(edges)
         self._weights = evidence.used.astype(float)
         counts = np.add.reduceat(self._weights, self._edges)
         self._counts = np.maximum(counts, 1.0)
-        self.used = counts >= max(1.0, stride / 2.0)
+        is_value = np.repeat(evidence.sparse, [e.size for e in edges])
+        self.used = counts >= np.where(is_value, 1.0, max(1.0, stride / 2.0))
         self.starts = np.cumsum([0, *[e.size for e in edges[:-1]]])
         self.period_min = context.period_min * stride
+        self._minutes = self.period_min * np.ones(self._edges.size)
+        if is_value.any():
+            self._minutes[:-1] = np.where(is_value[:-1], context.period_min * np.diff(self._edges), self.period_min)
+            self.period_min = max(self.period_min, float(np.median(self._minutes[:-1])))
         self.count = int(self.used.sum())
         #: Variance of the noise of each point, relative to a full one.
         self.relative_variance = stride / self._counts
@@ -124,6 +133,11 @@ class Points:
         nuisances = self.averaged(evidence.nuisances)
         is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
         self.zeros, self.starts_of_modes = ZERO_TIMES * self.spread_um * nuisances[:, is_zero], nuisances[:, ~is_zero]
+
+    def decays(self, tau_min: float) -> Vector:
+        """Return what is left of a slow process from each point to the next, shape (points,)."""
+        lengths, which = np.unique(self._minutes, return_inverse=True)
+        return np.array([math.exp(-length / tau_min) for length in lengths.tolist()])[which]
 
     def averaged(self, table: Matrix) -> Matrix:
         """Return the means of columns over the samples used of each point, shape (points, columns)."""
@@ -273,12 +287,12 @@ class Whitening:
 
     def __init__(self, points: Points, rest: Rest) -> None:
         self._used = points.used
-        phi = math.exp(-points.period_min / rest.tau_min)
+        phis = points.decays(rest.tau_min)
         stationary = (rest.slow_um / rest.noise_um) ** 2
         gains, variances = np.zeros(points.used.size), np.ones(points.used.size)
         begins, p = set(points.starts.tolist()), stationary
         noises = points.relative_variance.tolist()
-        for i, used in enumerate(points.used.tolist()):
+        for i, (used, phi) in enumerate(zip(points.used.tolist(), phis.tolist(), strict=True)):
             if i in begins:
                 p = stationary
             if used:
@@ -286,10 +300,10 @@ class Whitening:
                 gains[i] = p / variances[i]
                 p *= 1.0 - gains[i]
             p = phi * phi * p + stationary * (1.0 - phi * phi)
-        self._into = phi * gains
+        self._into = phis * gains
         self._into[points.starts[1:] - 1] = 0.0
         self._bands = np.ones((2, points.used.size))
-        self._bands[1] = -phi * (1.0 - gains)
+        self._bands[1] = -phis * (1.0 - gains)
         self._bands[1, points.starts[1:] - 1] = 0.0
         self._scale = 1.0 / (np.sqrt(variances[points.used]) * rest.noise_um)
         self.log_det = float(np.log(variances[points.used]).sum()) + 2.0 * points.count * math.log(rest.noise_um)
