@@ -161,12 +161,14 @@ class Evidence:
     def without(self, mask: Mask) -> Evidence:
         """Return the evidence without some of its samples."""
         used = self.used & ~mask
+        basis = _basis(self.nuisances, used)
+        freedom = _freedom(used, basis) if self.noise.freedom else 0
         return dataclasses.replace(
             self,
             residual=np.where(used, self.residual, 0.0),
             used=used,
-            basis=_basis(self.nuisances, used),
-            noise=dataclasses.replace(self.noise, count=int(used.sum())),
+            basis=basis,
+            noise=dataclasses.replace(self.noise, count=int(used.sum()), freedom=freedom),
         )
 
     def with_free_paths(self) -> Evidence:
@@ -303,6 +305,10 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)
     nuisances = np.asarray(block_diag(*(nuisances_of(record, context) for record in signals)))
+    basis = _basis(nuisances, used)
+    # The noise of a value that was measured now and then is none of the calibration's.
+    own_um = own_error(model, 0.0 if sparse else noise_um, spread_um)
+    count, freedom = int(used.sum()), _freedom(used, basis) if sparse else 0
     return Evidence(
         model=model,
         runs=tuple(runs),
@@ -310,9 +316,9 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         residual=np.where(used, residual, 0.0),
         used=used,
         nuisances=nuisances,
-        basis=_basis(nuisances, used),
+        basis=basis,
         context=context,
-        noise=NoiseTest(count=int(used.sum()), noise_um=noise_um, own_error_um=own_error(model, noise_um, spread_um)),
+        noise=NoiseTest(count=count, noise_um=noise_um, own_error_um=own_um, freedom=freedom),
         probe_um=max(noise_of(runs)["y_um"], LEAST_NOISE_UM),
     )
 
@@ -327,6 +333,11 @@ def _late_error_um(model: ThermalModel, runs: Sequence[Run], signals: Sequence[R
         seen = signals_of(prompt, run)
         errors.append(own.y_dtf_um - seen.y_dtf_um - late.columns(seen, ())[:, 0])
     return float(np.std(np.concatenate(errors)))
+
+
+def _freedom(used: Mask, basis: Matrix) -> int:
+    """Return the number of values less what the nuisances may absorb, at least 1."""
+    return max(int(used.sum()) - int(basis.shape[1]), 1)
 
 
 def _basis(nuisances: Matrix, used: Mask) -> Matrix:

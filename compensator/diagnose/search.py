@@ -73,11 +73,14 @@ class Selection:
         The fit of nothing, and of the effects found.
     rivals : tuple of tuple of Candidate
         For each effect, what else was fitted in its place, best first.
+    undecided : tuple of Fit
+        Where few values show that something acts and not what: the effects that come nearest, best first.
     """
 
     before: Fit
     fit: Fit
     rivals: tuple[tuple[Candidate, ...], ...] = ()
+    undecided: tuple[Fit, ...] = ()
 
 
 class Search:
@@ -95,6 +98,7 @@ class Search:
         self.hypotheses = [_above(hypothesis, ALIAS_FREE * self.points.period_min) for hypothesis in self.hypotheses]
         self._scan = Scan(self.points, self.hypotheses)
         self._forms = Counter(hypothesis.place for hypothesis in self.hypotheses)
+        self._something_acts = False
 
     def run(self, *, unobserved: bool = True) -> Selection:
         """Search what the inputs explain, and a source that no channel shows.
@@ -107,6 +111,8 @@ class Search:
         unobserved = unobserved and not self.evidence.free_paths
         rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
         before = best = fit_terms(Likelihood(self.points, rest), [])
+        self._something_acts = bool(self.evidence.noise.freedom) and not self._leaves_noise(before)
+        undecided: list[Fit] = []
         while len(best.terms) < MOST and not self._is_expected(best):
             proposed = self._proposed(best, unobserved=unobserved)
             # A source with many switchings looks poor until the rest is settled with it.
@@ -114,14 +120,25 @@ class Search:
             candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
             better = max(candidates, key=self.score, default=best)
             if self.score(better) <= self.score(best):
+                undecided = sorted(candidates, key=self.score, reverse=True) if self._something_acts else []
                 break
             best = self._exchanged(better)
         best = self._with_simpler_name(self._exchanged(self._pruned(best), len(best.terms)))
-        return Selection(before=before, fit=best, rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))))
+        return Selection(
+            before=before,
+            fit=best,
+            rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))),
+            undecided=() if best.terms else tuple(undecided),
+        )
 
     def score(self, fit: Fit) -> float:
-        """Return *J*."""
-        return fit.log_evidence - self.cost(fit)
+        """Return *J*.
+
+        Where few values are left with more than their stated noise, something acts, and effects that leave no more than
+        that are not charged for being there: one of them is, or a slow cause that has no name.
+        """
+        waived = self._something_acts and bool(fit.terms) and self._leaves_noise(fit)
+        return fit.log_evidence - self.cost(fit) + waived * self.price
 
     def cost(self, fit: Fit) -> float:
         """Return what the effects of a fit must add to the evidence."""
@@ -137,6 +154,11 @@ class Search:
         return float(np.sqrt(np.sum(self.left(fit) ** 2) / self.evidence.count))
 
     @property
+    def price(self) -> float:
+        """What a usual effect must add to the logarithm of the evidence."""
+        return MARGIN + math.log(len(self._forms) + 1)
+
+    @property
     def _typical(self) -> Rest:
         return self.points.typical_rest()
 
@@ -144,6 +166,9 @@ class Search:
         """Return what an effect must add to the evidence."""
         unseen = UNSEEN if self.evidence.context.approximate and not hypothesis.effect.observed else 0.0
         return unseen + MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
+
+    def _leaves_noise(self, fit: Fit) -> bool:
+        return self.evidence.noise.is_explained(self.rms(fit) ** 2 * self.evidence.count)
 
     # ------------------------------------------------------------------ steps
 

@@ -58,7 +58,7 @@ def test_a_standard_deviation_that_is_none_is_refused(std_um):
 
 
 def test_a_stated_noise_is_used_as_stated_where_neighbours_show_one():
-    measured, true, _ = record([], 1, 12.0)
+    measured, _, _ = record([], 1, 12.0)
     run = runs_from({"t_q_degc": measured["t_q_degc"], "at_degc": measured["at_degc"], "y_um": measured["y_um"]})[0]
     assert noise_of([run])["y_um"] == pytest.approx(0.3, rel=0.1)
     columns = {"t_s": run.t_s, "t_q_degc": run.t_q_degc, "at_degc": run.at_degc, "y_um": run.y_um}
