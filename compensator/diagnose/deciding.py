@@ -101,7 +101,7 @@ class Deciding:
     def __init__(self, trials: Trials) -> None:
         self.trials = trials
         self._joint: dict[tuple[int, float], _Joint] = {}
-        #: Time between two probes of a test, min: as in the record, or shorter where that does not decide; 0: all the time.
+        #: Time between two probes of a test, min: as in the record, or less where that does not decide. 0: always.
         self._every_min: tuple[float, ...] = (0.0,)
         if trials.evidence.noise.freedom:
             every = Points(trials.evidence).period_min

@@ -105,9 +105,9 @@ def diagnose(
         )
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
     verdict, ceiling = _verdict(found, held_out, extended), _ceiling(held_out)
-    could_hide, advice = hiding(found.selection.fit, found.search.price) if few else None, None
+    could_hide, advice = hiding(found.selection, found.search.price) if few else None, None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
-    hides = verdict == "adequate" and could_hide is not None and could_hide.is_too_much
+    hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
     if verdict != "adequate" or hides:
         tests = [rival.test for effect in effects for rival in effect.rivals if rival.test is not None]
         tests += _between_undecided(found, deciding)
@@ -140,14 +140,15 @@ def diagnose(
 
 
 def _between_undecided(found: Findings, deciding: Deciding) -> list[PlannedTest]:
-    """Return the test between the two effects that come nearest, where few values show only that something acts."""
-    if len(found.selection.undecided) < 2:
+    """Return the test between the two effects that come nearest, or of the one, where few values do not decide."""
+    undecided = found.selection.undecided
+    if not undecided:
         return []
-    first = found.selection.undecided[0]
-    others = [fit for fit in found.selection.undecided if fit.places != first.places]
-    if not others:
-        return []
-    test = deciding.best(first, others[0], (label(first.terms[-1]), label(others[0].terms[-1])))
+    first = undecided[0]
+    second = next((fit for fit in undecided if fit.places != first.places), found.selection.fit)
+    test = deciding.best(
+        first, second, (label(first.terms[-1]), label(second.terms[-1]) if second.terms else "nothing")
+    )
     return [test] if test is not None else []
 
 
@@ -295,8 +296,10 @@ def _refitted(old: ThermalModel, new: ThermalModel) -> str:
 def _how(evidence: Evidence) -> str:
     """Return how the errors are measured."""
     count = len(list(evidence.blocks(FOLDS)))
-    words = HELD_OUT_RECORDINGS.format(count=count) if evidence.holds_out_recordings else HELD_OUT
-    return words + WITH_PATHS * evidence.free_paths + HELD_OUT_VALUES * bool(evidence.noise.freedom)
+    words = HELD_OUT_VALUES if evidence.noise.freedom else HELD_OUT
+    if evidence.holds_out_recordings:
+        words = HELD_OUT_RECORDINGS.format(count=count)
+    return words + WITH_PATHS * evidence.free_paths
 
 
 def _ceiling(held_out: _HeldOut) -> Ceiling | None:

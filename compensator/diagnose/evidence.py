@@ -128,6 +128,8 @@ class Evidence:
     def blocks(self, count: int) -> Iterator[Mask]:
         """Yield masks of what is held out: whole recordings where there are several, or else blocks of time.
 
+        Of few values each takes every so many of them: a block of time would hold an event that the others lack.
+
         Parameters
         ----------
         count : int
@@ -137,6 +139,10 @@ class Evidence:
             yield from self._recordings(count)
             return
         at = np.flatnonzero(self.used)
+        if self.noise.freedom:
+            for first in range(count):
+                yield np.isin(np.arange(self.used.size), at[first::count])
+            return
         for low, high in itertools.pairwise(np.linspace(0, at.size, count + 1).astype(int).tolist()):
             block = np.zeros(self.used.size, dtype=bool)
             block[at[low:high]] = True

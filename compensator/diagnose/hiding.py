@@ -18,13 +18,15 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit
+from compensator.diagnose.search import Selection
 from compensator.model.effects.blocks import Lag
 
 #: What is named in 19 of 20 records is this many standard deviations larger than what is named on average.
 SURE = 1.645
 #: A model is adequate only where nothing could hide that moves Y by more than this share of its whole movement.
 MATTERS = 0.1
+#: Effects that are listed as undecided.
+UNDECIDED = 3
 #: Lag of a source that no channel shows, min, and the share of the record in which it acts.
 LAG_MIN, ACTS_SHARE = 60.0, 0.25
 
@@ -60,12 +62,15 @@ class Hiding:
         Number of measured values.
     every_min : float
         Median time between two of them, min: what comes and goes within it does not show.
+    undecided : tuple of str
+        Effects that may act, which the values do not decide.
     """
 
     what: tuple[Hidden, ...]
     matters_um: float
     values: int
     every_min: float
+    undecided: tuple[str, ...] = ()
 
     @property
     def is_too_much(self) -> bool:
@@ -78,16 +83,17 @@ class Hiding:
         return math.ceil(self.values * (self.what[0].size_um / self.matters_um) ** 2)
 
 
-def hiding(fit: Fit, cost: float) -> Hiding:
-    """Return how much could hide beside what a fit has.
+def hiding(selection: Selection, cost: float) -> Hiding:
+    """Return how much could hide beside what was found.
 
     Parameters
     ----------
-    fit : Fit
+    selection : Selection
         Effects and rest that were found.
     cost : float
         What an effect must add to the logarithm of the evidence.
     """
+    fit = selection.fit
     likelihood, points = fit.likelihood, fit.likelihood.points
     kept = likelihood.projected(fit.columns)
     inner = np.linalg.solve(np.eye(kept.shape[1]) + kept.T @ kept, kept.T)
@@ -100,12 +106,13 @@ def hiding(fit: Fit, cost: float) -> Hiding:
         square = float(white @ white - (white @ kept) @ (inner @ white))
         least = math.sqrt(2.0 * cost + math.log1p(square * points.spread_um**2)) + SURE
         found.append(Hidden(kind=kind, path=path, size_um=least / math.sqrt(max(square, 1e-9))))
-    measured = points.evidence.y_um
+    measured, undecided = points.evidence.y_um, selection.undecided[:UNDECIDED]
     return Hiding(
         what=tuple(sorted(found, key=lambda one: -one.size_um)),
         matters_um=MATTERS * float(np.nanmax(measured) - np.nanmin(measured)),
         values=points.count,
         every_min=points.period_min,
+        undecided=tuple(dict.fromkeys(" ".join(filter(None, other.terms[-1].hypothesis.place)) for other in undecided)),
     )
 
 

@@ -59,8 +59,6 @@ class NoiseTest:
 
     def is_expected(self, cost: float) -> bool:
         """Return whether what is left may come by itself on another day, so that nothing more is looked for in it."""
-        if self.freedom:
-            return self.is_explained(cost)
         return cost < self.count * (self.noise_um**2 + (EXPECTED_TIMES * self.own_error_um) ** 2)
 
     def is_explained(self, cost: float) -> bool:

@@ -34,7 +34,10 @@ HELD_OUT_RECORDINGS = (
     "each of {count} recordings or groups of them predicted after choosing and fitting on the others; its zero is its "
     "own mean"
 )
-HELD_OUT_VALUES = "; with so few values blocks differ by chance, so that the likelihood of all of them decides what is named and deployed"
+HELD_OUT_VALUES = (
+    f"each of {FOLDS} sets of every {FOLDS}rd value predicted after choosing and fitting on the others; what is named and "
+    "deployed is decided by the likelihood of all values"
+)
 REPLACED = " All channels together explain the data better, so the remainder is deployed in its place."
 #: Another explanation is a rival while it leaves no more than this many times as much.
 RIVAL_TIMES = 1.2

@@ -34,6 +34,8 @@ MOST = 4
 MARGIN = 4.0
 #: What a source that no channel shows must add beyond that where the base has an error of its own, whose form it takes.
 UNSEEN = 15.0
+#: Few values do not decide whether an effect acts that is not worth its price and adds as much as this.
+DOUBT = 4.5
 #: Hypotheses that are fitted after each scan, and how many of those are judged.
 FITTED, JUDGED = 6, 4
 #: Shortest period that averaged points show for what it is, points.
@@ -74,7 +76,7 @@ class Selection:
     rivals : tuple of tuple of Candidate
         For each effect, what else was fitted in its place, best first.
     undecided : tuple of Fit
-        Where few values show that something acts and not what: the effects that come nearest, best first.
+        Where few values do not decide: effects that may act, best first.
     """
 
     before: Fit
@@ -120,7 +122,7 @@ class Search:
             candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
             better = max(candidates, key=self.score, default=best)
             if self.score(better) <= self.score(best):
-                undecided = sorted(candidates, key=self.score, reverse=True) if self._something_acts else []
+                undecided = self._undecided(candidates, best)
                 break
             best = self._exchanged(better)
         best = self._with_simpler_name(self._exchanged(self._pruned(best), len(best.terms)))
@@ -132,13 +134,17 @@ class Search:
         )
 
     def score(self, fit: Fit) -> float:
-        """Return *J*.
+        """Return *J*."""
+        return fit.log_evidence - self.charge(fit)
+
+    def charge(self, fit: Fit) -> float:
+        """Return what the effects of a fit are charged.
 
         Where few values are left with more than their stated noise, something acts, and effects that leave no more than
         that are not charged for being there: one of them is, or a slow cause that has no name.
         """
         waived = self._something_acts and bool(fit.terms) and self._leaves_noise(fit)
-        return fit.log_evidence - self.cost(fit) + waived * self.price
+        return self.cost(fit) - waived * self.price
 
     def cost(self, fit: Fit) -> float:
         """Return what the effects of a fit must add to the evidence."""
@@ -169,6 +175,13 @@ class Search:
 
     def _leaves_noise(self, fit: Fit) -> bool:
         return self.evidence.noise.is_explained(self.rms(fit) ** 2 * self.evidence.count)
+
+    def _undecided(self, candidates: Sequence[Fit], best: Fit) -> list[Fit]:
+        """Return the effects that may act, best first, where few values do not decide it."""
+        if not self.evidence.noise.freedom:
+            return []
+        least = -math.inf if self._something_acts else best.log_evidence + DOUBT
+        return sorted((fit for fit in candidates if fit.log_evidence > least), key=self.score, reverse=True)
 
     # ------------------------------------------------------------------ steps
 
@@ -241,7 +254,11 @@ class Search:
     def _is_expected(self, fit: Fit) -> bool:
         """Return whether what is left may come by itself on another day, where the calibration states its error."""
         noise = self.evidence.noise
-        return noise.own_error_um > 0.0 and noise.is_expected(self.rms(fit) ** 2 * self.evidence.count)
+        return (
+            noise.own_error_um > 0.0
+            and not noise.freedom
+            and noise.is_expected(self.rms(fit) ** 2 * self.evidence.count)
+        )
 
     def _is_worth_naming(self, term: Term, without: Fit, fit: Fit) -> bool:
         """Return whether an effect is large enough beside what is left without it and the base model's own error."""

@@ -29,6 +29,8 @@ _CANNOT_SHOW = (
     "The residual is within the noise, but these values could not have shown what matters: they do not say whether the "
     "model is adequate."
 )
+#: The verdict if few values leave nothing but noise and an effect would explain some of it.
+_UNDECIDED = "The residual is within the noise, yet {names} may act: these values do not decide it."
 #: What could hide in few values.
 _HIDDEN = {
     "gain": "an error of the {path}'s gain",
@@ -103,6 +105,7 @@ def _could_hide(found: Hiding | None) -> dict[str, Any]:
         "every_min": found.every_min,
         "matters_um": found.matters_um,
         "too_much": found.is_too_much,
+        "undecided": list(found.undecided),
         "values_needed": max(needed, found.values),
         "what": [{"kind": one.kind, "path": one.path or None, "size_um": one.size_um} for one in found.what],
     }
@@ -138,7 +141,8 @@ def verdict(found: Mapping[str, Any]) -> str:
     if found["verdict"] == "adequate" and "could_hide" in found:
         words = _ADEQUATE_VALUES
     elif _cannot_show(found):
-        words = _CANNOT_SHOW
+        names = found["could_hide"]["undecided"]
+        words = _UNDECIDED.format(names=" or ".join(names)) if names else _CANNOT_SHOW
     if ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
     elif found["verdict"] == "explained" and falls_short(found):
@@ -156,10 +160,10 @@ def verdict(found: Mapping[str, Any]) -> str:
 
 
 def _cannot_show(found: Mapping[str, Any]) -> bool:
-    """Whether few values leave nothing but noise, and what matters could hide in it."""
+    """Whether few values leave nothing but noise, and something that matters could hide in it."""
     hides = found.get("could_hide")
     left = found["advice"]["unexplained"] if found.get("advice") else None
-    return hides is not None and bool(hides["too_much"]) and found["verdict"] == "unexplained" and left is None
+    return hides is not None and found["verdict"] == "unexplained" and not found["effects"] and left is None
 
 
 def hiding_lines(found: Mapping[str, Any]) -> list[str]:

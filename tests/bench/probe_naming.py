@@ -1,10 +1,12 @@
 """What `diagnose` names from two days of hourly probes: 47 values of 1.5 µm on machines with the published functions.
 
-Effects, duties, channels and sizes are those of `sim_hardware.drawn_machines` (published functions, clean data); of each
-machine the first 48 h of its record are used, and Y only once an hour, with noise of its own added.
+Effects, duties, channels and sizes are those of `sim_hardware.drawn_machines` (published functions, clean data); of
+each machine the first 48 h of its record are used, and Y only once an hour, with noise of its own added.
 
 python -m tests.bench probe_naming                   the development set
 python -m tests.bench.probe_naming judging           the set that judges: at most twice
+
+Only effects that move the model's residual by at least the noise of one value (rms over the 48 h) are drawn.
 
 named           a right name of the true effect, and no other effect; without an effect: nothing.
 undecided       nothing named, verdict `unexplained`: the values show that something acts, or could not have shown it.
@@ -30,11 +32,14 @@ FAST = ("period", "hidden")
 
 
 def machine(effect, seed):
-    """The first machine from a seed on whose record is long enough."""
+    """The first machine from a seed on whose record is long enough and shows the effect, and the size of that, µm."""
     while True:
         found = draw("transfer", seed, effect=effect, shop_floor=False, published=True)
         if found.record.hours >= HOURS:
-            return found
+            columns = {name: values[: HOURS * 60] for name, values in found.record.columns.items()}
+            size_um = float(np.nanstd(tc.simulate("quill", columns)["residual_um"]))
+            if effect == "none" or size_um >= STD_UM:
+                return found, size_um
         seed += 1
 
 
@@ -48,9 +53,8 @@ def probed(found, seed):
 
 def one(effect, seed):
     """Return named, undecided, false all-clear, and what was named with its sizes."""
-    found = machine(effect, seed)
+    found, size_um = machine(effect, seed)
     columns = probed(found, seed)
-    part = found.record.part_um[: HOURS * 60]
     why = tc.diagnose("quill", columns, y_std_um=STD_UM).to_dict()
     named = [tuple(each[key] or "" for key in ("kind", "path", "channel")) for each in why["effects"]]
     right = named[:1] == [p for p in found.truth.places if p in named[:1]] and len(named) == 1
@@ -58,7 +62,7 @@ def one(effect, seed):
         right = not named
     undecided = not named and why["verdict"] == "unexplained" and effect != "none"
     false = effect != "none" and why["verdict"] == "adequate"
-    return right, undecided, false, f"{np.std(part):.1f} µm {why['verdict']} {named}"
+    return right, undecided, false, f"{size_um:.1f} µm {why['verdict']} {named}"
 
 
 def table(which):
