@@ -35,8 +35,8 @@ HELD_OUT_RECORDINGS = (
     "own mean"
 )
 HELD_OUT_VALUES = (
-    f"each of {FOLDS} sets of every {FOLDS}rd value predicted after choosing and fitting on the others; what is named and "
-    "deployed is decided by the likelihood of all values"
+    f"each of {FOLDS} sets of every {FOLDS}rd value predicted after choosing and fitting on the others; what is named "
+    "and deployed is decided by the likelihood of all values"
 )
 REPLACED = " All channels together explain the data better, so the remainder is deployed in its place."
 #: Another explanation is a rival while it leaves no more than this many times as much.
