@@ -31,6 +31,8 @@ class EventKind(StrEnum):
     COMMAND_REFUSED = "command_refused"
     #: Another model was adopted or refused.
     ADOPT = "adopt"
+    #: A probe was taken or refused (`ProbeData`).
+    PROBE = "probe"
     #: A device stopped answering, or answers again.
     DEVICE = "device"
     #: The wall clock was set.
@@ -51,6 +53,8 @@ class CommandName(StrEnum):
     RESUME = "resume"
     ADOPT = "adopt"
     BACK = "back"
+    #: What a touch probe measured (`ProbeRequest`).
+    PROBE = "probe"
 
 
 class Note(NamedTuple):

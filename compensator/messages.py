@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from importlib import resources
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
 
 from compensator.codes import SampleQuality, State
 
@@ -193,6 +194,45 @@ class Status(Message, frozen=True, kw_only=True):
     recording: str
     devices: dict[str, str]
     effects: list[str] = []
+
+
+_Label = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+class ProbeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What a touch probe measured, the payload of the command `thermal/command/probe`.
+
+    Parameters
+    ----------
+    schema : int
+        `SCHEMA`.
+    time_utc_ns : int
+        When it was measured, ns since 1970 UTC.
+    axis : str
+        The axis, `y`.
+    measured_um : float
+        Where the feature was found minus where it belongs, with the offset acting, µm.
+    offset_applied_um : float
+        The offset that the control had applied then, µm.
+    std_um : float, optional
+        Standard deviation of the measured value, µm; by default `[probe] std_um`.
+    feature : str
+        Name of the feature; each has its own zero.
+    tool : str
+        Name of the probe.
+    stopped_s : float, optional
+        How long the spindle had been standing, s.
+    """
+
+    schema: int
+    time_utc_ns: Annotated[int, Meta(ge=0, lt=2**63)]
+    axis: _Label
+    measured_um: float
+    offset_applied_um: float
+    std_um: float | None = None
+    feature: _Label = ""
+    tool: _Label = ""
+    stopped_s: Annotated[float, Meta(ge=0)] | None = None
 
 
 class ChainPart(msgspec.Struct, frozen=True, kw_only=True):
