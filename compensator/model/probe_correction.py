@@ -356,6 +356,16 @@ class ProbeCorrection:
         found._mix()
         return found
 
+    def at_zero(self) -> ProbeCorrection:
+        """Return the correction after a zero: the gains stay, the offset and the zeros of the features start anew."""
+        self._absorb_time()
+        found, gains = ProbeCorrection(self.names), slice(1, 1 + len(self.names))
+        found._weights = list(self._weights)
+        found._x[:, gains] = self._x[:, gains]
+        found._P[:, gains, gains] = self._P[:, gains, gains]
+        found._mix()
+        return found
+
     def transferred(
         self,
         names: Sequence[str],
