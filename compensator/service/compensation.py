@@ -69,6 +69,7 @@ class Compensation:
         self.plausibility = PlausibilityCheck(config, model)
         self._decision = OffsetDecision(config, model, self._engine.channels)
         self._limiter = self._decision.limiter
+        self._probes: tuple[ReceivedProbe, ...] = ()
         self.probing = Probing.of(config, self._engine.contribution_names, model.period_s)
         self._zero = ZeroState(wanted=config.zero.at_start)
         self._memory = Memory()
@@ -103,6 +104,10 @@ class Compensation:
             self.plausibility.acknowledge()
             if self._engine.has_reference:
                 self._pass_cold(self._cold_samples)
+
+    def receive_probes(self, probes: Sequence[ReceivedProbe]) -> None:
+        """Receive the probes that the next sample decides; without `[probe]` they are ignored."""
+        self._probes = tuple(probes)
 
     def fail(self) -> None:
         """Hold the offset because of an internal error, until `resume`."""
@@ -266,15 +271,13 @@ class Compensation:
 
     # ------------------------------------------------------------------ one sample
 
-    def process(self, raw: Sample, probes: Sequence[ReceivedProbe] = ()) -> Outcome:
+    def process(self, raw: Sample) -> Outcome:
         """Process one sample.
 
         Parameters
         ----------
         raw : Sample
             Readings of the devices.
-        probes : sequence of ReceivedProbe
-            Probes that arrived since the last sample; without `[probe]` there are none.
 
         Returns
         -------
@@ -294,7 +297,7 @@ class Compensation:
             self._memory.rates = [*self._memory.rates[-MEAN_SAMPLES + 1 :], estimate.y_rate_um_per_min]
             self._memory.heats = [*self._memory.heats[-MEAN_SAMPLES + 1 :], estimate.heat_w]
             self._remember_sample(raw.time_utc_ns, estimate)
-        decided = self._decide_probes(raw, probes, notes)
+        decided = self._decide_probes(raw, notes)
         prediction = self._prediction() if estimate else Prediction()
         y_pred = prediction.y_um
         if math.isnan(self._zero.y_ref) and estimate is not None:
@@ -345,8 +348,9 @@ class Compensation:
                 )
             )
 
-    def _decide_probes(self, raw: Sample, probes: Sequence[ReceivedProbe], notes: list[Note]) -> tuple[Probe, ...]:
+    def _decide_probes(self, raw: Sample, notes: list[Note]) -> tuple[Probe, ...]:
         """Decide the probes that arrived since the last sample, and add their events."""
+        probes, self._probes = self._probes, ()
         if self.probing is None or not probes:
             return ()
         decided, found = self.probing.decide(raw.machine, raw.seq, probes)

@@ -257,7 +257,8 @@ class Daemon:
             channels=self._sampler.close_sample(),
         )
         self._deciding, unread = self._commands.drain_probes()
-        outcome = self._compensation.process(raw, self._deciding)
+        self._compensation.receive_probes(self._deciding)
+        outcome = self._compensation.process(raw)
         self._failed_midway, self._deciding = False, []
         if failed_midway:  # once for all consecutive samples that failed
             self._journal.start_new_file()

@@ -240,9 +240,10 @@ def apply(
     if sample is None:
         assert held is not None
         return compensation.held(held.machine, held.seq, held.time_utc_ns)
+    compensation.receive_probes(step.received_probes(checked=checked) if commands else ())
     try:
         # The guards set `quality` again, from `device_quality` alone.
-        return compensation.process(sample, step.received_probes(checked=checked) if commands else ())
+        return compensation.process(sample)
     except (KeyError, AttributeError, TypeError) as error:
         raise DataError(
             f"{step.file}: /sample {sample.seq}: {type(error).__name__} {error}; expected the configured channels"

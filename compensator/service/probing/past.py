@@ -38,10 +38,9 @@ def predicted_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -
     if after == 0:
         return None
     before = samples[after - 1]
-    if after < len(samples):
-        later = samples[after]
-        if later.time_ns - before.time_ns > _GAP * period_ns:
-            return None
+    later = samples[after] if after < len(samples) else None
+    has_gap = later is not None and later.time_ns - before.time_ns > _GAP * period_ns
+    if later is not None and not has_gap:
         part = (middle_ns - before.time_ns) / (later.time_ns - before.time_ns)
         pairs = zip(before.contributions_um, later.contributions_um, strict=True)
         return Predicted(
@@ -50,7 +49,7 @@ def predicted_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -
             max(before.noise_um, later.noise_um),
         )
     ahead_ns = middle_ns - before.time_ns
-    if ahead_ns > _GAP * period_ns:
+    if ahead_ns > (1.0 if has_gap else _GAP) * period_ns:
         return None
     return Predicted(
         before.y_um + before.rate_um_per_min * ahead_ns / (60.0 * NS), before.contributions_um, before.noise_um

@@ -178,6 +178,7 @@ class Probing:
         if self._state.samples and sample.time_ns <= self._state.samples[-1].time_ns:
             # The clock was set back: which sample a time belongs to is not known any more.
             self._state.samples, self._state.zero_ns = [], 0
+            self._state.known = [known for known in self._state.known if known.time_ns < sample.time_ns]
         self._correction.step(sample.contributions_um, self._period_s / 60.0)
         self._state.samples = [*self._state.samples[1 - self._kept :], sample]
 
