@@ -493,6 +493,16 @@ class DataRemark(Code):
         "Single readings far from their neighbours were left out.",
         "Check the sensor for loose contacts and noise.",
     )
+    Y_REFUSED = (
+        "y_refused",
+        "Measured values of Y are further from the prediction than their noise allows and did not correct it.",
+        "Check these measurements: a chip on the feature, or another feature.",
+    )
+    Y_BELIEVED = (
+        "y_believed",
+        "Measured values of Y were far from the prediction and agreed with each other; the prediction follows them.",
+        "Find out what moved: a collision, a new clamping, or another feature.",
+    )
 
 
 class ServiceWarning(Code):
