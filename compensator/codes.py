@@ -286,7 +286,7 @@ class ProbeCode(Code):
     )
     BELIEVED = (
         "probe_believed",
-        "The probe did not fit the prediction, but agrees with refused ones before it; they are believed together.",
+        "The probe is taken against earlier ones: it agrees with refused ones, or the last one taken was wrong.",
         "Find out what moved: a clamping, a collision, the model (`compensator diagnose`).",
     )
     FIRST = (

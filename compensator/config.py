@@ -359,6 +359,9 @@ def _check(config: Config) -> None:
         raise ConfigError(
             f"plausibility.rest.channel = {rest.channel!r}: no such channel, expected one of: {', '.join(names)}"
         )
+    probe, offset_max = config.probe, config.limits.offset_max_um
+    if probe is not None and probe.largest_um > offset_max:
+        raise ConfigError(f"probe.largest_um = {probe.largest_um:g}, expected at most offset_max_um = {offset_max:g}")
     for key in ("t_q_degc", "at_degc"):
         _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key))
     _check_zenoh(config.zenoh)

@@ -165,6 +165,16 @@ class FilterBank:
         self.P = 0.5 * (self.P + self.P.transpose(0, 2, 1))
         self.weights = self.weigh(expected).weights
 
+    def weights_of_walks(self) -> list[float]:
+        """Return the weights with each walk's as it is, and every level as probable as before the first value."""
+        found = []
+        for walk in range(len(WALKS_UM)):
+            total = 0.0
+            for start in _GROUPS:
+                total += self.weights[start + walk]
+            found.append(total / len(LEVELS_UM))
+        return found * len(LEVELS_UM)
+
     def copy(self) -> FilterBank:
         """Return a bank in the same state."""
         found = FilterBank((), ())

@@ -31,6 +31,8 @@ GAIN_WALK = 0.001
 AGREEING = 3
 #: Refused probes that lie further apart than this do not support each other, min.
 AGREEING_WITHIN_MIN = 720.0
+#: So many refused probes are kept.
+REFUSED_KEPT = 20
 #: Refused probes agree within this many standard deviations of their difference.
 AGREEMENT = 3.0
 
@@ -194,7 +196,7 @@ class ProbeCorrection:
             if len(agreeing) + 1 < min(AGREEING, self._probes + 2):
                 for bank in self._banks():
                     bank.weights = self._weigh(bank, probe).weights
-                self._refused.append(probe)
+                self._refused = [*self._refused[1 - REFUSED_KEPT :], probe]
                 self._mix()
                 return ProbeVerdict(False, OUTLIER, innovation, math.sqrt(variance))
             reason = BELIEVED
@@ -337,12 +339,13 @@ class ProbeCorrection:
         return found
 
     def at_zero(self) -> ProbeCorrection:
-        """Return the correction after a zero: the gains stay, the offset and the zeros of the features start anew."""
-        self._absorb_time()
+        """Return the correction after a zero: the gains and walks stay, the offset and the zeros start anew."""
         found, gains = ProbeCorrection(self.names), slice(1, 1 + len(self.names))
-        found._weights = list(self._weights)
-        found._x[:, gains] = self._x[:, gains]
-        found._P[:, gains, gains] = self._P[:, gains, gains]
+        before = self._bank.copy()
+        before.advance(self._waiting)
+        found._bank.x[:, gains] = before.x[:, gains]
+        found._bank.P[:, gains, gains] = before.P[:, gains, gains]
+        found._bank.weights = before.weights_of_walks()
         found._mix()
         return found
 

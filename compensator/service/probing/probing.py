@@ -34,7 +34,7 @@ _MORE_SAMPLES = 4
 _KNOWN = 100
 #: Refusals after which no other probe is wanted: the same value is known already, or none can be used.
 _NOT_ASKED = (ProbeCode.DUPLICATE, ProbeCode.TOO_MANY_FEATURES, ProbeCode.AXIS)
-_WORDS = {"": "taken", ProbeCode.OUTLIER: "refused", ProbeCode.BELIEVED: "taken with those before it that agree"}
+_WORDS = {"": "taken", ProbeCode.OUTLIER: "refused", ProbeCode.BELIEVED: "taken against earlier ones"}
 #: How far ahead the next probe is foreseen, min, and the step of the forecast.
 _AHEAD_MIN, _FORECAST_MIN = 1440.0, 60.0
 
