@@ -21,6 +21,7 @@ from compensator.messages import ProbeRequest, number
 from compensator.recording.container import Container
 from compensator.recording.reading import recordings
 from compensator.service.command_client import send_probe
+from compensator.service.compensation import Compensation
 from compensator.service.probing.received import ProbeRefused, read_probe
 from compensator.service.publisher import Publisher
 from compensator.service.state import decode_state
@@ -302,6 +303,24 @@ async def test_a_lost_temperature_makes_a_probe_weigh_less(tmp_path: Path) -> No
         stds.append(number(machine.recorded()[-1].innovation_std_um))
         assert nothing_jumped(machine)
     assert stds[1] > 1.2 * stds[0]
+
+
+async def test_a_probe_of_a_sample_that_failed_is_recorded_as_undecided(tmp_path: Path, monkeypatch: Any) -> None:
+    """And the next one is taken once an operator has looked."""
+    machine, process, defects = ProbedMachine(tmp_path), Compensation.process, [ZeroDivisionError("a defect")]
+
+    def fail_once(compensation: Compensation, raw: Any) -> Any:
+        if len(machine.outcomes) == 60 and defects:
+            raise defects.pop()
+        return process(compensation, raw)
+
+    monkeypatch.setattr(Compensation, "process", fail_once)
+    machine.at_sample[60] = machine.probe
+    machine.at_sample[61] = lambda: machine.command("resume")
+    machine.at_sample[65] = machine.probe
+    await machine.run(80)
+    assert not defects and machine.codes() == ["internal_error", "taken"]
+    assert look(machine).clean
 
 
 # ---------------------------------------------------------------------- restarts and other models
