@@ -57,6 +57,9 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     add("data", type=Path, metavar="DATA", help="CSV or MAT file, or recording")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="CSV")
+    words = "correct each row by the measured Y of earlier rows, as the service does by probes (default: run free)"
+    add("--correct", action="store_true", help=words)
+    _y_std(parser)
     _column(parser)
 
 
