@@ -483,6 +483,11 @@ class DataRemark(Code):
         "T_Q or AT is missing for too long to interpolate: the gap is not fitted, and predictions are less certain.",
         "Check the sensor and the logger.",
     )
+    FEATURES_LEFT_OUT = (
+        "features_left_out",
+        "Probes of several features are in a recording; each has a zero of its own, so only one of them is used.",
+        "Probe one feature in a calibration.",
+    )
     VARIABLES_LEFT_OUT = (
         "variables_left_out",
         "Variables of a MAT file that do not have one value per row, such as matrices, are not read.",

@@ -216,9 +216,10 @@ def measurements(
                 f"{name}: {type(source).__name__}, expected a path, a DataFrame, a dict of arrays, or a list of those"
             )
     if recordings:
-        table = read_recordings(recordings, roles)
+        table, left_out = read_recordings(recordings, roles)
         origins = tuple(_origin(path, path.read_bytes()) for path in recordings)
-        found.append(Measurement(table=table, label=recordings[0].name, origins=origins, roles=roles))
+        label = recordings[0].name
+        found.append(Measurement(table=table, label=label, origins=origins, roles=roles, remarks=left_out))
     return found
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Mask, Vector
+from compensator.codes import DataRemark, Remark
 from compensator.data.runs import Run, noise_of, noise_std, walk_std
 from compensator.data.screening import screen
 from compensator.errors import DataError
@@ -29,6 +30,8 @@ LEAST_AT_WALK_K = 0.1
 ZERO_S = 3600.0
 #: Where Y is measured now and then, at least so many values make the zero.
 ZERO_VALUES = 5
+#: There, a value so many deviations away from the fit is a chip on the feature.
+CHIP_DEVIATIONS = 5.0
 #: How far the range of validity exceeds the data: share of its range, and at least, K.
 BEYOND_SHARE, BEYOND_K = 0.33, 2.0
 
@@ -218,6 +221,11 @@ def calibrate(
         )
     drives = [_drive(run, temperature, settings) for run in runs]
     deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
+    chips = _chips(runs, deformation)
+    if any(chip.any() for chip in chips):
+        used = [mask & ~chip for mask, chip in zip(used, chips, strict=True)]
+        remarks = (*remarks, _left_out(data, chips))
+        deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
     chosen = next(c for c in deformation.candidates if c.chosen)
     noise = noise_of(runs)
     noise |= {name: max(noise[name], LEAST_NOISE_K) for name in ("t_q_degc", "at_degc")}
@@ -252,6 +260,24 @@ def calibrate(
         noise=noise,
         remarks=(*remarks, *fixed, *deformation.remarks),
     )
+
+
+def _chips(runs: Sequence[Run], deformation: DeformationFit) -> list[Mask]:
+    """Return the values of a deformation measured now and then that lie far from the fit: a chip, a wrong feature."""
+    if not any(run.has_sparse_y for run in runs):
+        return [np.zeros(run.t_s.size, dtype=bool) for run in runs]
+    residuals = [
+        np.where(s.used, r, 0.0) for s, r in zip(deformation.segments, deformation.main.residuals, strict=True)
+    ]
+    left = np.concatenate([r[s.used] for s, r in zip(deformation.segments, residuals, strict=True)])
+    noise = (*(run.y_noise_um for run in runs), float(np.median(np.abs(left))) / 0.6745)
+    limit = CHIP_DEVIATIONS * max(noise)
+    return [np.asarray(np.abs(residual) > limit) for residual in residuals]
+
+
+def _left_out(data: str, chips: Sequence[Mask]) -> Remark:
+    count = sum(int(chip.sum()) for chip in chips)
+    return Remark(DataRemark.WILD_READINGS, f"{data}: y_um: {count} value(s) far from all others left out.")
 
 
 def _own_error_um(deformation: DeformationFit, rms_um: float, noise_um: float) -> float:

@@ -23,7 +23,7 @@ from tests.identify.quill_runs import fit_pct, runs_from
 STD_UM = 1.5
 #: Hours, and minutes between two probes.
 PLANS = ((36.0, 10), (72.0, 30))
-SETS = {"development": (100, 12), "judging": (880_000, 24)}
+SETS = {"development": (100, 12), "judging": (880_000, 16)}
 
 
 def probed(seed, hours, every_min, *, heat):

@@ -132,6 +132,17 @@ def test_sparse_validation_is_zeroed_by_several_values(found):
     assert part.model.rms_um < 2.2
 
 
+def test_chips_are_left_out_and_said_so(found):
+    columns = probed()
+    at = np.flatnonzero(np.isfinite(columns["y_um"]))[5::40]
+    columns["y_um"][at] += 20.0
+    chipped = tc.identify(columns, y_std_um=STD_UM, order=(3, 3, 2))
+    assert f"y_um: {at.size} value(s) far from all others left out" in " ".join(chipped.to_dict()["remarks"])
+    gain, clean = (one.calibration.deformation.main.gain(0)[0] for one in (chipped, found))
+    assert gain == pytest.approx(clean, abs=0.02)
+    assert "far from all others" not in " ".join(found.to_dict()["remarks"])
+
+
 def test_the_command_takes_the_standard_deviation(tmp_path, capsys):
     from compensator.cli import main
 
