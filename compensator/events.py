@@ -31,6 +31,8 @@ class EventKind(StrEnum):
     COMMAND_REFUSED = "command_refused"
     #: Another model was adopted or refused.
     ADOPT = "adopt"
+    #: A probe was taken or refused (`ProbeData`).
+    PROBE = "probe"
     #: A device stopped answering, or answers again.
     DEVICE = "device"
     #: The wall clock was set.
@@ -51,6 +53,8 @@ class CommandName(StrEnum):
     RESUME = "resume"
     ADOPT = "adopt"
     BACK = "back"
+    #: What a touch probe measured (`ProbeRequest`).
+    PROBE = "probe"
 
 
 class Note(NamedTuple):
@@ -108,6 +112,35 @@ class PauseData(_Data, frozen=True, kw_only=True):
     minutes: float | None
     bridged: bool
     y_std_um: float | None
+
+
+class ProbeData(_Data, frozen=True, kw_only=True):
+    """A probe that was taken or refused; the recording contains all of it (`/probe`).
+
+    Parameters
+    ----------
+    taken : bool
+        Whether it corrects the prediction.
+    code : str
+        Why it was refused, or a remark.
+    probe_utc_ns : int
+        When it was measured, ns since 1970 UTC.
+    feature : str
+        The feature.
+    innovation_um, innovation_std_um : float, optional
+        Measured less predicted deformation, and the standard deviation expected of it, µm.
+    by, by_proof : str
+        The sender, as in the event of a command.
+    """
+
+    taken: bool
+    code: str = ""
+    probe_utc_ns: int
+    feature: str = ""
+    innovation_um: float | None = None
+    innovation_std_um: float | None = None
+    by: str
+    by_proof: str
 
 
 class RecordingCode(StrEnum):

@@ -20,7 +20,7 @@ from compensator.atomic_write import require_folder
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import Remark
 from compensator.data.measurement import DataLike, Measurement, measurements, runs_in
-from compensator.data.screening import screen_temperatures
+from compensator.data.screening import require_y_noise, screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.outcome import Diagnosis, FoundEffect
 from compensator.diagnose.summary import contents, figures
@@ -125,6 +125,7 @@ def diagnose(
     data: DataLike,
     *,
     columns: Mapping[str, str] | None = None,
+    y_std_um: float | None = None,
     progress: Progress = unreported,
     executor: Executor | None = None,
 ) -> DiagnosisResult:
@@ -138,6 +139,9 @@ def diagnose(
         Measured Y with every channel that was logged.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
+    y_std_um : float, optional
+        Standard deviation of one measured Y, µm. Needed where Y was measured now and then, as by a touch probe;
+        elsewhere neighbouring values show it.
     progress : callable
         Called with the steps done and their number.
     executor : concurrent.futures.Executor, optional
@@ -155,8 +159,10 @@ def diagnose(
     """
     base = model_of(model)
     measured = measurements(data, "data", columns, needed=True)
-    runs, remarks = runs_in(measured, base.period_s)
-    screen_temperatures(", ".join(dict.fromkeys(run.name for run in runs)), runs, quiet_air=True)
+    runs, remarks = runs_in(measured, base.period_s, y_std_um=y_std_um)
+    name = ", ".join(dict.fromkeys(run.name for run in runs))
+    screen_temperatures(name, runs, quiet_air=True)
+    require_y_noise(name, runs)
 
     def executor_map(function: Callable[..., Any], *values: Iterable[Any]) -> Iterable[Any]:
         return executor.map(partial(in_one_thread, function), *values) if executor else map(function, *values)

@@ -11,7 +11,7 @@ from compensator.api.files import ModelLike, as_in_file, model_of
 from compensator.api.identification_result import IdentificationResult
 from compensator.blas import one_thread
 from compensator.data.measurement import PERIOD_S, DataLike, Measurement, measurements, runs_in
-from compensator.data.screening import screen_temperatures
+from compensator.data.screening import require_y_noise, screen_temperatures
 from compensator.errors import UsageError
 from compensator.identify.calibration import calibrate
 from compensator.identify.comparison import compare
@@ -42,6 +42,7 @@ def identify(
     drive: Literal["ttf", "known"] = "ttf",
     folds: int = _DEFAULT.folds,
     fit_until_h: float | None = None,
+    y_std_um: float | None = None,
     reference: ModelLike | None = None,
     progress: Progress = unreported,
 ) -> IdentificationResult:
@@ -75,6 +76,9 @@ def identify(
         Number of held-out blocks.
     fit_until_h : float, optional
         Fit up to this hour; the rest is held out.
+    y_std_um : float, optional
+        Standard deviation of one measured Y, µm. Needed where Y was measured now and then, as by a touch probe;
+        elsewhere neighbouring values show it.
     reference : model, optional
         Another model for a comparison of the coefficients.
     progress : callable
@@ -108,8 +112,9 @@ def identify(
     remarks: list[str] = []
     runs = {}
     for role, measured in sources.items():
-        runs[role], corrected = runs_in(measured, PERIOD_S)
+        runs[role], corrected = runs_in(measured, PERIOD_S, y_std_um=y_std_um)
         remarks += corrected
+    require_y_noise(", ".join(dict.fromkeys(run.name for run in runs["etve"])), runs["etve"])
     for run in runs["validation"]:
         screen_temperatures(run.name, [run], quiet_air=True)
     calibration = calibrate(
@@ -120,7 +125,7 @@ def identify(
         etve=runs["etve"],
         validation=runs["validation"],
         fit_until_s=None if fit_until_h is None else fit_until_h * 3600.0,
-        provenance=_provenance(sources, settings, columns or {}, fit_until_h),
+        provenance=_provenance(sources, settings, columns or {}, {"fit_until_h": fit_until_h, "y_std_um": y_std_um}),
         remarks=remarks,
         progress=progress,
     )
@@ -166,12 +171,11 @@ def _provenance(
     sources: Mapping[str, Sequence[Measurement]],
     settings: Settings,
     columns: Mapping[str, str],
-    fit_until_h: float | None,
+    numbers: Mapping[str, float | None],
 ) -> dict[str, Any]:
     """Return the provenance of a model: every source with its hash, and the options."""
     asked = {name: value for name, value in dataclasses.asdict(settings).items() if value is not None}
-    if fit_until_h is not None:
-        asked["fit_until_h"] = float(fit_until_h)
+    asked |= {name: float(value) for name, value in numbers.items() if value is not None}
     every = [(role, measured) for role, group in sources.items() for measured in group]
     roles = [*columns.items(), *(pair for _, measured in every for pair in measured.roles.items())]
     asked["columns"] = [f"{role}={name}" for role, name in dict.fromkeys(roles)]

@@ -14,6 +14,11 @@ def _column(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME", help=words)
 
 
+def _y_std(parser: argparse.ArgumentParser) -> None:
+    words = "standard deviation of one measured Y, um; needed where Y was measured now and then, as by a touch probe"
+    parser.add_argument("--y-std", type=float, metavar="UM", help=words)
+
+
 def _page(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--page",
@@ -52,6 +57,9 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     add("data", type=Path, metavar="DATA", help="CSV or MAT file, or recording")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="CSV")
+    words = "correct each row by the measured Y of earlier rows, as the service does by probes (default: run free)"
+    add("--correct", action="store_true", help=words)
+    _y_std(parser)
     _column(parser)
 
 
@@ -85,6 +93,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html is written next to it")
     _page(parser)
     _column(parser)
+    _y_std(parser)
     add("--name", help="name of the model (default: the file name)")
     add = parser.add_argument_group("structure of the model").add_argument
     words = "heat: with a TTF; direct: from T_Q - AT to y; auto (the default): heat if heat_w is known"
@@ -118,6 +127,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
     _page(parser)
     _column(parser)
+    _y_std(parser)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 
 

@@ -25,7 +25,13 @@ def run(arguments: argparse.Namespace) -> Answer:
     given = arguments
     page = checked_page(given.page)
     return diagnose_files(
-        given.data, given.model, given.out, columns=roles_of(given.column), scheduler=given.scheduler, also=page
+        given.data,
+        given.model,
+        given.out,
+        columns=roles_of(given.column),
+        y_std_um=given.y_std,
+        scheduler=given.scheduler,
+        also=page,
     )
 
 
@@ -35,6 +41,7 @@ def diagnose_files(
     out: Path,
     *,
     columns: Mapping[str, str] | None = None,
+    y_std_um: float | None = None,
     scheduler: str | None = None,
     also: Path | None = None,
 ) -> Answer:
@@ -44,7 +51,7 @@ def diagnose_files(
     measured = measurements(data, "data", columns)
     values = sum(one.hours * 3600.0 / base.period_s * len(one.table.columns) for one in measured)
     with progress_bar("searching") as progress, workers(FOLDS if values > ALONE else 1, scheduler) as executor:
-        found = diagnose(base, measured, progress=progress, executor=executor)
+        found = diagnose(base, measured, y_std_um=y_std_um, progress=progress, executor=executor)
     found.save_all(out, also=also)
     model_file, page = out / FILES[0], out / FILES[2]
     paths = {"model": str(model_file), "model_sha256": found.model.sha256, "report": str(page)}

@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> Answer:
             drive=given.drive,
             folds=given.folds,
             fit_until_h=given.fit_until,
+            y_std_um=given.y_std,
             reference=given.reference,
             progress=progress,
         )

@@ -6,17 +6,18 @@ import csv
 import math
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from compensator.codes import DataRemark, Remark
+from compensator.codes import DataRemark, ProbeCode, Remark
 from compensator.config import ROLES
 from compensator.data.table import TIMES, Table, table_of, time_names
 from compensator.errors import DataError
-from compensator.messages import number
+from compensator.messages import Probe, number
 from compensator.recording.reading import messages
 
 #: First bytes of files that are mistaken for tables, and what to do with such a file.
@@ -135,8 +136,10 @@ def _fields(value: Any) -> Mapping[str, Any]:
     return {name: value[name].item() for name in names} if names and value.size == 1 else {}
 
 
-def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> Table:
+def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Table, tuple[Remark, ...]]:
     """Read recordings that follow each other as one table; each has the columns that the roles name.
+
+    Where no displacement sensor measured Y, the values of touch probes are `y_um`, each in a row of its own.
 
     Raises
     ------
@@ -146,29 +149,62 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> Table:
     for role in TIMES:
         if role in roles:
             raise DataError(f"{paths[0]}: --column {role}={roles[role]}: a recording has a time of its own")
-    tables = [_read_recording(path).with_roles(roles) for path in paths]
+    parts = [_read_recording(path) for path in paths]
+    tables = [table.with_roles(roles) for table, _ in parts]
     names = dict.fromkeys(name for table in tables for name in table.columns)
     t_s = np.concatenate([table.t_s for table in tables])
-    order = np.argsort(t_s, kind="stable")
     columns = {
-        name: np.concatenate([table.columns.get(name, np.full(table.t_s.size, np.nan)) for table in tables])[order]
+        name: np.concatenate([table.columns.get(name, np.full(table.t_s.size, np.nan)) for table in tables])
         for name in names
     }
-    t_s = t_s[order]
-    return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
+    remarks: tuple[Remark, ...] = ()
+    if np.isnan(columns.get("y_um", np.array([np.nan]))).all():
+        probes, remarks = _of_one_feature(str(paths[0]), [probe for _, some in parts for probe in some])
+        if probes:
+            blank = np.full(len(probes), np.nan)
+            columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
+            values = [number(probe.deformation_um) for probe in probes]
+            columns["y_um"] = np.concatenate([np.full(t_s.size, np.nan), values])
+            t_s = np.concatenate([t_s, [probe.time_utc_ns / 1e9 for probe in probes]])
+    order = np.argsort(t_s, kind="stable")
+    columns, t_s = {name: values[order] for name, values in columns.items()}, t_s[order]
+    return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks
 
 
-def _read_recording(path: Path) -> Table:
-    """Return the samples of a recording; their time counts from 1970."""
+def _of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tuple[Remark, ...]]:
+    """Return the probes of the feature that has most: each feature has a zero of its own."""
+    counts = Counter(probe.feature for probe in probes)
+    if len(counts) < 2:
+        return list(probes), ()
+    feature, count = counts.most_common(1)[0]
+    words = f"{name}: y_um is that of feature {feature!r}, {count} probe(s); {len(probes) - count} of others left out."
+    return [probe for probe in probes if probe.feature == feature], (Remark(DataRemark.FEATURES_LEFT_OUT, words),)
+
+
+def _shows_deformation(probe: Probe) -> bool:
+    """Whether a probe is a measured Y: it was taken, or refused only because the control applied nothing."""
+    if probe.deformation_um is None:
+        return False
+    applied_nothing = probe.code in (ProbeCode.MISMATCH, ProbeCode.DURING_HOLD) and probe.offset_applied_um == 0.0
+    return probe.taken or applied_nothing
+
+
+def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
+    """Return the samples of a recording, whose time counts from 1970, and its probes."""
     times: list[int] = []
     samples: list[dict[str, float]] = []
-    for sample in messages(path, ("sample",)):
-        times.append(sample.time_utc_ns)
+    probes: list[Probe] = []
+    for message in messages(path, ("sample", "probe")):
+        if isinstance(message, Probe):
+            probes += [message] if _shows_deformation(message) else []
+            continue
+        times.append(message.time_utc_ns)
         samples.append(
-            {name: number(channel.mean) if channel.is_good else math.nan for name, channel in sample.channels.items()}
+            {name: number(channel.mean) if channel.is_good else math.nan for name, channel in message.channels.items()}
         )
     if not samples:
         raise DataError(f"{path}: no samples in it")
     names = dict.fromkeys(name for row in samples for name in row)
     columns = {name: np.array([row.get(name, math.nan) for row in samples]) for name in names}
-    return Table(name=str(path), t_s=np.array(times) / 1e9, columns=columns, rows=range(2, len(times) + 2))
+    table = Table(name=str(path), t_s=np.array(times) / 1e9, columns=columns, rows=range(2, len(times) + 2))
+    return table, probes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -215,9 +216,10 @@ def measurements(
                 f"{name}: {type(source).__name__}, expected a path, a DataFrame, a dict of arrays, or a list of those"
             )
     if recordings:
-        table = read_recordings(recordings, roles)
+        table, left_out = read_recordings(recordings, roles)
         origins = tuple(_origin(path, path.read_bytes()) for path in recordings)
-        found.append(Measurement(table=table, label=recordings[0].name, origins=origins, roles=roles))
+        label = recordings[0].name
+        found.append(Measurement(table=table, label=label, origins=origins, roles=roles, remarks=left_out))
     return found
 
 
@@ -254,7 +256,9 @@ def _origin(path: Path, data: bytes) -> Origin:
     return Origin(name=path.name, sha256=hashlib.sha256(data).hexdigest(), path=path)
 
 
-def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[list[Run], list[Remark]]:
+def runs_in(
+    data: Sequence[Measurement], period_s: float = PERIOD_S, *, y_std_um: float | None = None
+) -> tuple[list[Run], list[Remark]]:
     """Return the runs of measurements, and what had to be corrected.
 
     Parameters
@@ -263,12 +267,18 @@ def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[li
         With T_Q, AT and Y.
     period_s : float
         Sample period of the model, s.
+    y_std_um : float, optional
+        Standard deviation of one measured value of Y, µm; by default what neighbouring values show.
 
     Raises
     ------
     DataError
         If a column is missing, or there is no stretch long enough for a run.
+    UsageError
+        If the standard deviation is none.
     """
+    if y_std_um is not None and not 0.0 < y_std_um < math.inf:
+        raise UsageError(f"--y-std {y_std_um:g}: expected the standard deviation of one measured Y, above 0 µm")
     gridded = [(measured, measured.at_period(period_s)) for measured in data]
     runs: list[Run] = []
     remarks: list[Remark] = []
@@ -277,7 +287,7 @@ def runs_in(data: Sequence[Measurement], period_s: float = PERIOD_S) -> tuple[li
         for record in part.records:
             require(measured.name, record, _NEEDED)
             for run, corrected in runs_of(measured.label, record):
-                runs.append(dataclasses.replace(run, recording=number))
+                runs.append(dataclasses.replace(run, recording=number, y_std_um=y_std_um))
                 remarks += corrected
     if not runs and gridded:
         raise DataError(_without_runs(gridded[0][0].name, gridded[0][1], period_s))

@@ -19,6 +19,8 @@ REST_SAMPLES = 30
 NOISE_ALONE = 1.5
 #: Shortest stretch between two long gaps that makes a run, samples.
 SHORTEST_RUN = 30
+#: Four values that follow each other within so many samples are neighbours: they show the noise of a slow signal.
+NEIGHBOURS_SAMPLES = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +45,8 @@ class Run:
         Every other column, gaps bridged.
     recording : int
         Which of several recordings it is a part of.
+    y_std_um : float, optional
+        Standard deviation of one measured value of the deformation as it was stated, µm.
     """
 
     name: str
@@ -54,6 +58,25 @@ class Run:
     reference: tuple[float, float]
     channels: dict[str, Vector]
     recording: int = 0
+    y_std_um: float | None = None
+
+    @property
+    def has_sparse_y(self) -> bool:
+        """Whether Y was measured now and then, as by a touch probe."""
+        return is_sparse(self.y_um)
+
+    @property
+    def y_noise_um(self) -> float:
+        """White noise of the measured deformation: as stated, or from neighbouring values, µm."""
+        return noise_std(self.y_um) if self.y_std_um is None else self.y_std_um
+
+    def covered(self, mask: Mask) -> Mask:
+        """Return the samples that measured values stand for: where Y is sparse, all from the first to the last."""
+        if not self.has_sparse_y or not mask.any():
+            return mask
+        at, covered = np.flatnonzero(mask), np.zeros(mask.size, dtype=bool)
+        covered[at[0] : at[-1] + 1] = True
+        return covered
 
     @property
     def t_q_degc(self) -> Vector:
@@ -194,15 +217,32 @@ def noise_std(values: Vector) -> float:
     return max(typical, float(np.sqrt(np.mean(lower**2) / 0.6107)) if typical == 0.0 else typical)
 
 
-def is_noise(values: Vector) -> bool:
-    """Whether a signal holds nothing but white noise; NaN is left out."""
+def is_sparse(values: Vector) -> bool:
+    """Whether most values have no neighbours from which their noise could be seen; NaN is missing.
+
+    Examples
+    --------
+    >>> hourly = np.full(600, np.nan)
+    >>> hourly[::60] = 1.0
+    >>> is_sparse(hourly), is_sparse(np.ones(600))
+    (True, False)
+    """
+    known = np.flatnonzero(~np.isnan(values))
+    if known.size < 4:
+        return bool(0 < known.size < values.size)
+    return bool(np.mean(known[3:] - known[:-3] > NEIGHBOURS_SAMPLES) > 0.5)
+
+
+def is_noise(values: Vector, noise: float | None = None) -> bool:
+    """Whether a signal holds nothing but white noise, by default that which its neighbours show; NaN is left out."""
     known = values[~np.isnan(values)]
-    return float(np.std(known)) < NOISE_ALONE * noise_std(known)
+    return float(np.std(known)) < NOISE_ALONE * (noise_std(known) if noise is None else noise)
 
 
 def noise_of(runs: Sequence[Run]) -> dict[str, float]:
     """Return the noise of `t_q_degc`, `at_degc` and `y_um`, in their units: the largest of all runs."""
-    return {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc", "y_um")}
+    temperatures = {name: max(noise_std(getattr(run, name)) for run in runs) for name in ("t_q_degc", "at_degc")}
+    return temperatures | {"y_um": max(run.y_noise_um for run in runs)}
 
 
 def walk_std(values: Sequence[Vector], noise: float) -> float:

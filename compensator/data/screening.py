@@ -12,6 +12,10 @@ from compensator.errors import DataError
 
 #: Shortest data for a fit, min.
 SHORTEST_MIN = 120.0
+#: Fewest values of a deformation that was measured now and then.
+LEAST_VALUES = 30
+#: With fewer values no noise can be computed at all.
+FEW_VALUES = 8
 #: Share of samples of a column that may be missing.
 MISSING_SHARE = 0.5
 #: Air in a shop above this is °F, kelvin or a wrong scale, °C.
@@ -63,9 +67,37 @@ def screen(name: str, runs: Sequence[Run], period_s: float, *, needs_heat: bool,
     for run in runs:
         _check_alive(run, "y_um", run.y_um)
     if needs_y:
-        _check_deformation(name, _joined(run.y_um for run in runs))
+        require_y_noise(name, runs)
+        _check_deformation(name, runs)
     if needs_heat:
         _check_heat(name, runs)
+
+
+def require_y_noise(name: str, runs: Sequence[Run]) -> None:
+    """Refuse a deformation that was measured now and then, if the noise of one value is not stated.
+
+    Parameters
+    ----------
+    name : str
+        File or files, for the message.
+    runs : sequence of Run
+        The data.
+
+    Raises
+    ------
+    DataError
+        Asking for it in one line.
+    """
+    counts = {id(run): int(np.isfinite(run.y_um).sum()) for run in runs}
+    # A few values beside a run that shows the noise do no harm.
+    few = max(counts.values(), default=0) < FEW_VALUES
+    for run in runs:
+        count = counts[id(run)]
+        if count and run.y_std_um is None and run.has_sparse_y and (few or count >= FEW_VALUES):
+            raise DataError(
+                f"{name}: y_um has {count} value(s) in {run.t_s.size} samples, so its noise does not show; expected "
+                "--y-std UM (y_std_um in Python), the standard deviation of one measured value, such as 1.5"
+            )
 
 
 def screen_temperatures(name: str, runs: Sequence[Run], *, quiet_air: bool = False) -> None:
@@ -202,9 +234,12 @@ def _check_pair(name: str, t_q: Vector, at: Vector) -> None:
         raise DataError(f"{name}: t_q_degc and at_degc are the same in every row, expected two sensors")
 
 
-def _check_deformation(name: str, y: Vector) -> None:
-    known = y[~np.isnan(y)]
-    if known.size < (1.0 - MISSING_SHARE) * y.size:
+def _check_deformation(name: str, runs: Sequence[Run]) -> None:
+    y = _joined(run.y_um for run in runs)
+    known, sparse = y[~np.isnan(y)], any(run.has_sparse_y for run in runs)
+    if sparse and known.size < LEAST_VALUES:
+        raise DataError(f"{name}: y_um has {known.size} values, expected at least {LEAST_VALUES} for a model")
+    if not sparse and known.size < (1.0 - MISSING_SHARE) * y.size:
         raise DataError(f"{name}: y_um is missing in {y.size - known.size} of {y.size} samples, expected at least half")
     spread = float(np.ptp(known))
     if spread == 0.0:
@@ -216,10 +251,11 @@ def _check_deformation(name: str, y: Vector) -> None:
         )
     if spread > high:
         raise DataError(f"{name}: y_um moves by {spread:.4g} in all: nanometres? expected µm, at most {high:g} of them")
-    if is_noise(known):
+    stated = runs[0].y_std_um
+    if is_noise(known, stated):
         raise DataError(
-            f"{name}: y_um moves by {spread:.3g} µm and its noise alone is {noise_std(known):.2g} µm: "
-            "no deformation in it to make a model from"
+            f"{name}: y_um moves by {spread:.3g} µm and its noise alone is "
+            f"{noise_std(known) if stated is None else stated:.2g} µm: no deformation in it to make a model from"
         )
 
 

@@ -97,4 +97,4 @@ def _test(test: PlannedTest) -> dict[str, Any]:
         "expected_evidence": test.expected_evidence,
         "decides": test.decides,
         "between": list(test.between),
-    }
+    } | ({"probes": test.probes} if test.probes else {})

@@ -32,6 +32,8 @@ DECIDES = 5.0
 HOURS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 #: The explanations between which a test decides that shows a hidden source again.
 SHOWN = ("a source that the new sensor shows", "no source")
+#: Where probes as often as in the record do not decide, they are made this often in a test, min.
+PROBED_MIN = 10.0
 #: Step of a searched parameter, as a share of its value.
 STEP = 1e-2
 #: What happened once does not come again by itself in a test.
@@ -54,6 +56,8 @@ class PlannedTest:
         Expected change of the logarithm of the evidence at that duration.
     between : tuple of str
         The two explanations.
+    every_min : float
+        Where Y is measured now and then: time between two probes, min; 0 elsewhere.
     """
 
     words: str
@@ -61,6 +65,7 @@ class PlannedTest:
     hours: float
     expected_evidence: float
     between: tuple[str, str]
+    every_min: float = 0.0
 
     @property
     def decides(self) -> bool:
@@ -68,9 +73,16 @@ class PlannedTest:
         return self.expected_evidence >= DECIDES
 
     @property
+    def probes(self) -> int:
+        """Number of probes in it; 0 where Y is measured all the time."""
+        return math.ceil(self.hours * 60.0 / self.every_min) if self.every_min else 0
+
+    @property
     def sentence(self) -> str:
         """What to do, how long, and by how much it decides."""
         change = f"expected change of the log evidence {self.expected_evidence:.3g}, {DECIDES:g} decides"
+        if self.probes:
+            change = f"{self.probes} more probes, one each {self.every_min:g} min; {change}"
         if self.decides:
             return f"{self.words}; {self.hours:g} h are enough, the first {REST_H:g} h at rest ({change})."
         words = self.words[:1].lower() + self.words[1:]
@@ -88,7 +100,12 @@ class Deciding:
 
     def __init__(self, trials: Trials) -> None:
         self.trials = trials
-        self._joint: dict[int, _Joint] = {}
+        self._joint: dict[tuple[int, float], _Joint] = {}
+        #: Time between two probes of a test, min: as in the record, or less where that does not decide. 0: always.
+        self._every_min: tuple[float, ...] = (0.0,)
+        if trials.evidence.noise.freedom:
+            every = Points(trials.evidence).period_min
+            self._every_min = (every, PROBED_MIN) if every > PROBED_MIN else (every,)
 
     def best(
         self, first: Fit, second: Fit, between: tuple[str, str], *, drivers: tuple[str, ...] = ()
@@ -115,9 +132,12 @@ class Deciding:
             for trial in self.trials.of(filter(None, (*channels, *drivers)))
             if not drivers or trial.driver in drivers
         ]
-        planned = [self._planned(trial, first, second, between) for trial in trials if not trial.by_itself]
-        if not any(test.decides for test in planned):
-            planned += [self._planned(trial, first, second, between) for trial in trials if trial.by_itself]
+        planned: list[PlannedTest] = []
+        for every_min in self._every_min:
+            for by_itself in (False, True):
+                if not any(test.decides for test in planned):
+                    some = [trial for trial in trials if trial.by_itself is by_itself]
+                    planned += [self._planned(trial, first, second, between, every_min) for trial in some]
         # Of tests that decide equally soon, the surer one.
         return max(planned, key=_soonest, default=None)
 
@@ -138,13 +158,13 @@ class Deciding:
         trials = [trial for trial in self.trials.of([event]) if event and trial.driver == event]
         planned = []
         for trial in trials or [trial for trial in self.trials.of(()) if not trial.driver]:
-            joint = self._of(trial)
+            joint = self._of(trial, self._every_min[0])
             lag = Lag(tau_min, trial.signals.period_min)
             level: Vector = (
                 _level(trial) if trials else np.asarray(trial.signals.minutes > 60.0 * REST_H, dtype=np.float64)
             )
             course = size_um * lag.filter(level)
-            planned.append(self._test(trial, joint.change_by(others, course), SHOWN))
+            planned.append(self._test(trial, joint.change_by(others, course), SHOWN, joint.every_min))
         best = max(planned, key=_soonest)
         if trials:
             return best
@@ -154,16 +174,20 @@ class Deciding:
         hours = max(24.0 if event == DAY else 0.0, math.ceil(2.0 * (wait_h + best.hours)) / 2.0)
         return dataclasses.replace(best, words=words, hours=hours)
 
-    def _planned(self, trial: Trial, first: Fit, second: Fit, between: tuple[str, str]) -> PlannedTest:
-        return self._test(trial, self._of(trial).change(first, second), between)
+    def _planned(
+        self, trial: Trial, first: Fit, second: Fit, between: tuple[str, str], every_min: float
+    ) -> PlannedTest:
+        joint = self._of(trial, every_min)
+        return self._test(trial, joint.change(first, second), between, joint.every_min)
 
-    def _of(self, trial: Trial) -> _Joint:
-        if id(trial) not in self._joint:
-            self._joint[id(trial)] = _Joint(self.trials.evidence, trial)
-        return self._joint[id(trial)]
+    def _of(self, trial: Trial, every_min: float) -> _Joint:
+        key = id(trial), every_min
+        if key not in self._joint:
+            self._joint[key] = _Joint(self.trials.evidence, trial, every_min)
+        return self._joint[key]
 
     @staticmethod
-    def _test(trial: Trial, change: Vector, between: tuple[str, str]) -> PlannedTest:
+    def _test(trial: Trial, change: Vector, between: tuple[str, str], every_min: float) -> PlannedTest:
         enough = np.flatnonzero(change >= DECIDES)
         at = int(enough[0]) if enough.size else int(np.argmax(change))
         return PlannedTest(
@@ -172,27 +196,32 @@ class Deciding:
             hours=HOURS[at],
             expected_evidence=float(change[at]),
             between=between,
+            every_min=every_min,
         )
 
 
 class _Joint:
     """A record with a test after it."""
 
-    def __init__(self, evidence: Evidence, trial: Trial) -> None:
+    def __init__(self, evidence: Evidence, trial: Trial, every_min: float) -> None:
         self.record_period_min = evidence.context.period_min * max(1, math.ceil(evidence.count / POINTS))
-        n = trial.signals.size
+        n, samples = trial.signals.size, 1
+        self.every_min = every_min
+        if every_min:
+            samples = max(1, round(every_min / evidence.context.period_min))
+        measured = (np.arange(n) + 1) % samples == 0
         rest = nuisances_of(trial.signals, evidence.context)
         self.evidence = dataclasses.replace(
             evidence,
             signals=(*evidence.signals, trial.signals),
             residual=np.concatenate([evidence.residual, np.zeros(n)]),
-            used=np.concatenate([evidence.used, np.ones(n, dtype=bool)]),
+            used=np.concatenate([evidence.used, measured]),
             nuisances=np.asarray(block_diag(evidence.nuisances, rest)),
-            noise=dataclasses.replace(evidence.noise, count=evidence.count + n),
+            noise=dataclasses.replace(evidence.noise, count=evidence.count + int(measured.sum())),
         )
         self.points = Points(self.evidence)
         self.before = int(self.points.used[: self.points.starts[-1]].sum())
-        self.ends = np.ceil(np.array(HOURS) * 60.0 / self.points.period_min).astype(int)
+        self.ends = np.ceil(np.array(HOURS) * 60.0 / (every_min or self.points.period_min)).astype(int)
         self._known: dict[int, tuple[Fit, Vector, Matrix, Matrix]] = {}
 
     def change(self, first: Fit, second: Fit) -> Vector:
@@ -212,7 +241,7 @@ class _Joint:
 
     def _whitening(self, rest: Rest) -> Whitening:
         # The noise of a point is that of its samples' mean; with the test there may be more of them in a point.
-        share = self.record_period_min / self.points.period_min if self.points.is_exact else 1.0
+        share = self.record_period_min / self.points.period_min if self.points.is_exact and not self.every_min else 1.0
         return Whitening(self.points, dataclasses.replace(rest, noise_um=rest.noise_um * float(np.sqrt(share))))
 
     def _prediction(self, fit: Fit, rest: Rest) -> tuple[Vector, Matrix, Matrix]:

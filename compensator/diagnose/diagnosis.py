@@ -20,10 +20,12 @@ from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, with_paths
 from compensator.diagnose.fit import Term, standard_errors
+from compensator.diagnose.hiding import hiding
 from compensator.diagnose.outcome import (
     FOLDS,
     HELD_OUT,
     HELD_OUT_RECORDINGS,
+    HELD_OUT_VALUES,
     Ceiling,
     Diagnosis,
     FoundEffect,
@@ -89,7 +91,8 @@ def diagnose(
         found = dataclasses.replace(found, remainder=None)
         held_out = dataclasses.replace(held_out, whole=held_out.named)
     # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
-    contradicted = not evidence.free_paths and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
+    few = bool(evidence.noise.freedom)
+    contradicted = not (few or evidence.free_paths) and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
     extended, remarks = (model, ()) if contradicted else _extended(model, found, effects, held_out)
     remainder = None
     if found.remainder is not None:
@@ -101,15 +104,18 @@ def diagnose(
         )
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
     verdict, ceiling = _verdict(found, held_out, extended), _ceiling(held_out)
-    advice = None
-    if verdict != "adequate":
+    could_hide, advice = hiding(found.selection, found.search.price) if few else None, None
+    # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
+    hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
+    if verdict != "adequate" or hides:
         tests = [rival.test for effect in effects for rival in effect.rivals if rival.test is not None]
-        explained_pct, is_explained = ceiling.explained_pct if ceiling else None, verdict == "explained"
+        tests += _between_undecided(found, deciding)
+        explained_pct, is_explained = ceiling.explained_pct if ceiling else None, verdict == "explained" or hides
         advice = advice_of(
             found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained
         )
     return Diagnosis(
-        verdict=verdict,
+        verdict="unexplained" if hides else verdict,
         effects=effects,
         held_out=_how(evidence),
         model=extended,
@@ -120,12 +126,29 @@ def diagnose(
         held_out_named=held_out.named,
         held_out_after=held_out.whole,
         tried=_ranked(found),
-        warnings=(*remarks, *warnings_of(effects, held_out.nothing, held_out.whole, deployed=extended is not model)),
+        warnings=(
+            *remarks,
+            *warnings_of(effects, held_out.nothing, held_out.whole, deployed=extended is not model, few=few),
+        ),
         steps=held_out.steps,
         remainder=remainder,
         ceiling=ceiling,
         advice=advice,
+        could_hide=could_hide,
     )
+
+
+def _between_undecided(found: Findings, deciding: Deciding) -> list[PlannedTest]:
+    """Return the test between the two effects that come nearest, or of the one, where few values do not decide."""
+    undecided = found.selection.undecided
+    if not undecided:
+        return []
+    first = undecided[0]
+    second = next((fit for fit in undecided if fit.places != first.places), found.selection.fit)
+    test = deciding.best(
+        first, second, (label(first.terms[-1]), label(second.terms[-1]) if second.terms else "nothing")
+    )
+    return [test] if test is not None else []
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -248,7 +271,7 @@ def _extended(
     kept_out = [effect.signal[evidence.used] for effect in effects if not effect.effect.deployable]
     left = found.rest_um**2 + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
     extended = dataclasses.replace(base, effects=(*model.effects, *deployed), sha256="")
-    if not kept_out:
+    if not kept_out and not evidence.noise.freedom:
         # Half what the fit expects, half what held-out blocks show: the one is too small, the other has few blocks.
         shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
         left = 0.5 * (left + shown)
@@ -272,7 +295,9 @@ def _refitted(old: ThermalModel, new: ThermalModel) -> str:
 def _how(evidence: Evidence) -> str:
     """Return how the errors are measured."""
     count = len(list(evidence.blocks(FOLDS)))
-    words = HELD_OUT_RECORDINGS.format(count=count) if evidence.holds_out_recordings else HELD_OUT
+    words = HELD_OUT_VALUES if evidence.noise.freedom else HELD_OUT
+    if evidence.holds_out_recordings:
+        words = HELD_OUT_RECORDINGS.format(count=count)
     return words + WITH_PATHS * evidence.free_paths
 
 
@@ -306,5 +331,5 @@ def _verdict(found: Findings, held_out: _HeldOut, extended: ThermalModel) -> Ver
         return "adequate" if is_noise and not evidence.free_paths else "unexplained"
     if not any(observed):
         return "unexplained"
-    holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)
+    holds = bool(evidence.noise.freedom) or rms_of(held_out.whole) <= rms_of(held_out.nothing)
     return "explained" if is_noise and holds and all(observed) and found.explains else "partly_explained"

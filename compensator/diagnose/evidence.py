@@ -37,6 +37,8 @@ STATE_PRIOR = 1e-3
 FASTEST, DECAY_RATIO = 2.0, 3.5
 #: Recordings are held out whole where the larger half of them has less than this share of the samples.
 LARGEST_GROUP = 0.75
+#: Fewest samples of a measured deformation, and fewest values where it was measured now and then.
+LEAST_SAMPLES, LEAST_VALUES = 60, 12
 #: Least noise of Y: a reading has digits.
 LEAST_NOISE_UM = 1e-3
 #: A displacement is an effect, never a cause: another probe follows Y whatever moves it.
@@ -93,6 +95,17 @@ class Evidence:
         return self.noise.count
 
     @property
+    def is_sparse(self) -> bool:
+        """Whether every run has Y measured now and then only, as by a touch probe."""
+        return all(run.has_sparse_y for run in self.runs)
+
+    @property
+    def sparse(self) -> tuple[bool, ...]:
+        """Whether Y was measured now and then, for each record of signals; what follows the runs is like the last."""
+        runs = [run.has_sparse_y for run in self.runs]
+        return (*runs, *(runs[-1:] * (len(self.signals) - len(runs))))
+
+    @property
     def y_um(self) -> Vector:
         """Measured deformation on every sample of all runs, shape (n,), µm; NaN where it is missing."""
         return np.concatenate([run.y_um for run in self.runs])
@@ -115,6 +128,8 @@ class Evidence:
     def blocks(self, count: int) -> Iterator[Mask]:
         """Yield masks of what is held out: whole recordings where there are several, or else blocks of time.
 
+        Of few values each takes every so many of them: a block of time would hold an event that the others lack.
+
         Parameters
         ----------
         count : int
@@ -124,6 +139,10 @@ class Evidence:
             yield from self._recordings(count)
             return
         at = np.flatnonzero(self.used)
+        if self.noise.freedom:
+            for first in range(count):
+                yield np.isin(np.arange(self.used.size), at[first::count])
+            return
         for low, high in itertools.pairwise(np.linspace(0, at.size, count + 1).astype(int).tolist()):
             block = np.zeros(self.used.size, dtype=bool)
             block[at[low:high]] = True
@@ -148,12 +167,14 @@ class Evidence:
     def without(self, mask: Mask) -> Evidence:
         """Return the evidence without some of its samples."""
         used = self.used & ~mask
+        basis = _basis(self.nuisances, used)
+        freedom = _freedom(used, basis) if self.noise.freedom else 0
         return dataclasses.replace(
             self,
             residual=np.where(used, self.residual, 0.0),
             used=used,
-            basis=_basis(self.nuisances, used),
-            noise=dataclasses.replace(self.noise, count=int(used.sum())),
+            basis=basis,
+            noise=dataclasses.replace(self.noise, count=int(used.sum()), freedom=freedom),
         )
 
     def with_free_paths(self) -> Evidence:
@@ -279,13 +300,21 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     ]
     residual = np.concatenate(parts)
     used = np.isfinite(residual)
-    if used.sum() < 60:
-        names = ", ".join(dict.fromkeys(run.name for run in runs))
-        raise DataError(f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least 60")
+    names, sparse = ", ".join(dict.fromkeys(run.name for run in runs)), all(run.has_sparse_y for run in runs)
+    if used.sum() < (LEAST_VALUES if sparse else LEAST_SAMPLES):
+        if sparse and used.any():
+            raise DataError(f"{names}: y_um has {int(used.sum())} values, expected at least {LEAST_VALUES}")
+        raise DataError(
+            f"{names}: {int(used.sum())} samples of {model.period_s:g} s with y_um, expected at least {LEAST_SAMPLES}"
+        )
     noise_um = math.hypot(noise_floor(model, runs), _late_error_um(model, courses, signals))
     spread_um = float(np.nanstd(np.concatenate([run.y_um for run in runs])))
     context = _context(model, runs, signals)
     nuisances = np.asarray(block_diag(*(nuisances_of(record, context) for record in signals)))
+    basis = _basis(nuisances, used)
+    # The noise of a value that was measured now and then is none of the calibration's.
+    own_um = own_error(model, 0.0 if sparse else noise_um, spread_um)
+    count, freedom = int(used.sum()), _freedom(used, basis) if sparse else 0
     return Evidence(
         model=model,
         runs=tuple(runs),
@@ -293,9 +322,9 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
         residual=np.where(used, residual, 0.0),
         used=used,
         nuisances=nuisances,
-        basis=_basis(nuisances, used),
+        basis=basis,
         context=context,
-        noise=NoiseTest(count=int(used.sum()), noise_um=noise_um, own_error_um=own_error(model, noise_um, spread_um)),
+        noise=NoiseTest(count=count, noise_um=noise_um, own_error_um=own_um, freedom=freedom),
         probe_um=max(noise_of(runs)["y_um"], LEAST_NOISE_UM),
     )
 
@@ -310,6 +339,11 @@ def _late_error_um(model: ThermalModel, runs: Sequence[Run], signals: Sequence[R
         seen = signals_of(prompt, run)
         errors.append(own.y_dtf_um - seen.y_dtf_um - late.columns(seen, ())[:, 0])
     return float(np.std(np.concatenate(errors)))
+
+
+def _freedom(used: Mask, basis: Matrix) -> int:
+    """Return the number of values less what the nuisances may absorb, at least 1."""
+    return max(int(used.sum()) - int(basis.shape[1]), 1)
 
 
 def _basis(nuisances: Matrix, used: Mask) -> Matrix:

@@ -140,7 +140,7 @@ def _remainder(
     points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
     beside = background.fitted(points, fit.added, fit.rest) if fit.terms else ceiling
     known = refitted.log_evidence if refitted else _log_evidence(fit)
-    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - search.cost(fit):
+    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - search.charge(fit):
         return ceiling, False
     size = float(np.std(beside.added[evidence.used]))
     least = LEAST * np.hypot(evidence.noise.noise_um, evidence.noise.own_error_um)

@@ -98,26 +98,35 @@ class Points:
         self.is_exact = not context.approximate or evidence.free_paths
         stride = max(1, math.ceil(evidence.count / POINTS))
         starts = np.cumsum([0, *[record.size for record in evidence.signals[:-1]]])
-        edges = [np.arange(s, s + record.size, stride) for s, record in zip(starts, evidence.signals, strict=True)]
+        # A value measured now and then is a point of its own.
+        edges = [
+            s + np.flatnonzero(evidence.used[s : s + record.size]) if sparse else np.arange(s, s + record.size, stride)
+            for s, record, sparse in zip(starts.tolist(), evidence.signals, evidence.sparse, strict=True)
+        ]
         self._edges = np.concatenate(edges)
         self._weights = evidence.used.astype(float)
         counts = np.add.reduceat(self._weights, self._edges)
         self._counts = np.maximum(counts, 1.0)
-        self.used = counts >= max(1.0, stride / 2.0)
+        is_value = np.repeat(evidence.sparse, [e.size for e in edges])
+        self.used = counts >= np.where(is_value, 1.0, max(1.0, stride / 2.0))
         self.starts = np.cumsum([0, *[e.size for e in edges[:-1]]])
         self.period_min = context.period_min * stride
+        self._minutes = self.period_min * np.ones(self._edges.size)
+        if is_value.any():
+            self._minutes[:-1] = np.where(is_value[:-1], context.period_min * np.diff(self._edges), self.period_min)
+            self.period_min = max(self.period_min, float(np.median(self._minutes[:-1])))
         self.count = int(self.used.sum())
         #: Variance of the noise of each point, relative to a full one, infinite where it is not used; where runs begin;
-        #: stretches of points with equal noise: begin, end, variance.
+        #: stretches of points with equal noise and times between them: begin, end, variance.
         self.relative_variance = np.where(self.used, stride / self._counts, np.inf)
         self.begins = frozenset(self.starts.tolist())
-        self.stretches = _stretches(self.relative_variance, self.starts)
+        self.stretches = _stretches(self.relative_variance, self._minutes, self.starts)
         self.spread_um = max(evidence.spread_um, 1e-9)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
         self.own_um = (
             self.spread_um
             if evidence.free_paths
-            else max(noise.own_error_um, (EXACT_OWN if self.is_exact else 1.0) * evidence.probe_um)
+            else max(noise.own_error_um, (EXACT_OWN if self.is_exact or noise.freedom else 1.0) * evidence.probe_um)
         )
         point_noise = evidence.probe_um / math.sqrt(stride)
         if not self.is_exact:
@@ -130,6 +139,11 @@ class Points:
         nuisances = self.averaged(evidence.nuisances)
         is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
         self.zeros, self.starts_of_modes = ZERO_TIMES * self.spread_um * nuisances[:, is_zero], nuisances[:, ~is_zero]
+
+    def decays(self, tau_min: float) -> Vector:
+        """Return what is left of a slow process from each point to the next, shape (points,)."""
+        lengths, which = np.unique(self._minutes, return_inverse=True)
+        return np.array([math.exp(-length / tau_min) for length in lengths.tolist()])[which]
 
     def averaged(self, table: Matrix) -> Matrix:
         """Return the means of columns over the samples used of each point, shape (points, columns)."""
@@ -212,7 +226,8 @@ class Points:
         table = np.column_stack([self.residual - fixed, self.random(unit), columns])
         ends = np.cumsum([self.zeros.shape[1], self.starts_of_modes.shape[1], self.fast.shape[1]]).tolist()
         sized = [slice(ends[0], ends[1]), slice(ends[1], ends[2])]
-        searched = np.arange(0 if self.is_exact else 1, 5)
+        # The noise of values measured now and then is stated.
+        searched = np.arange(0 if self.is_exact and not self.evidence.noise.freedom else 1, 5)
         at = np.clip(_logs(start), self._typical - FURTHEST, self._typical + FURTHEST)
 
         def solved(logs: Vector) -> RandomColumns:
@@ -287,19 +302,19 @@ class Whitening:
 
     def __init__(self, points: Points, rest: Rest) -> None:
         self._used = points.used
-        phi = math.exp(-points.period_min / rest.tau_min)
+        phis = points.decays(rest.tau_min)
         stationary = (rest.slow_um / rest.noise_um) ** 2
         predicted, p = np.empty(points.used.size), stationary
         for begin, end, noise in points.stretches:
             if begin in points.begins:
                 p = stationary
-            predicted[begin:end], p = _predicted_variances(p, end - begin, noise, phi, stationary)
+            predicted[begin:end], p = _predicted_variances(p, end - begin, noise, float(phis[begin]), stationary)
         variances = predicted + points.relative_variance
         gains = predicted / variances
-        self._into = phi * gains
+        self._into = phis * gains
         self._into[points.starts[1:] - 1] = 0.0
         self._bands = np.ones((2, points.used.size))
-        self._bands[1] = -phi * (1.0 - gains)
+        self._bands[1] = -phis * (1.0 - gains)
         self._bands[1, points.starts[1:] - 1] = 0.0
         self._scale = 1.0 / (np.sqrt(variances[points.used]) * rest.noise_um)
         self.log_det = float(np.log(variances[points.used]).sum()) + 2.0 * points.count * math.log(rest.noise_um)
@@ -389,9 +404,9 @@ def dense(likelihood: Likelihood) -> Matrix:
     return likelihood.projected(np.eye(likelihood.points.used.size))
 
 
-def _stretches(variance: Vector, starts: Indices) -> list[tuple[int, int, float]]:
-    """Return where equal variances begin and end, cut where runs begin."""
-    changes = np.flatnonzero(variance[1:] != variance[:-1]) + 1
+def _stretches(variance: Vector, minutes: Vector, starts: Indices) -> list[tuple[int, int, float]]:
+    """Return where equal variances and times to the next point begin and end, cut where runs begin."""
+    changes = np.flatnonzero((variance[1:] != variance[:-1]) | (minutes[1:] != minutes[:-1])) + 1
     edges = np.unique(np.concatenate([starts, changes, [variance.size]])).tolist()
     return [(a, b, float(variance[a])) for a, b in itertools.pairwise(edges)]
 

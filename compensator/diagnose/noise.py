@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from compensator.arrays import Vector
 from compensator.data.runs import Run, noise_of
@@ -23,6 +24,8 @@ OWN_TIMES = 1.3
 EXPECTED_TIMES = 1.4
 #: For the verdict, what is left counts as noise up to this many times its level (rms).
 VERDICT_TIMES = 1.5
+#: Few values whose noise is stated leave no more than this quantile of what chance makes of it.
+CHANCE = 0.99
 #: An impulse, as long as the slow modes need.
 _IMPULSE = np.concatenate(([1.0], np.zeros(2999)))
 
@@ -39,11 +42,15 @@ class NoiseTest:
         What the sensors' noise alone makes of the residual, µm rms.
     own_error_um : float
         The base model's own error as its calibration states it, µm rms; 0 where none is stated.
+    freedom : int
+        Where Y was measured now and then: number of values less what zeros and initial states may absorb. The noise of
+        a value is stated then, and what is left is compared with what chance makes of so few values. 0 elsewhere.
     """
 
     count: int
     noise_um: float
     own_error_um: float
+    freedom: int = 0
 
     @property
     def allowance(self) -> float:
@@ -56,6 +63,8 @@ class NoiseTest:
 
     def is_explained(self, cost: float) -> bool:
         """Return whether the verdict may say that what is left is noise."""
+        if self.freedom:
+            return cost < self.noise_um**2 * float(chi2.ppf(CHANCE, self.freedom)) + self.allowance
         return cost < VERDICT_TIMES**2 * (self.count * self.noise_um**2 + self.allowance)
 
 

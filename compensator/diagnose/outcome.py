@@ -15,6 +15,7 @@ from compensator.diagnose.advice import Advice, label
 from compensator.diagnose.deciding import PlannedTest
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Term
+from compensator.diagnose.hiding import Hiding
 from compensator.diagnose.search import Candidate
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Place
@@ -33,6 +34,10 @@ HELD_OUT = (
 HELD_OUT_RECORDINGS = (
     "each of {count} recordings or groups of them predicted after choosing and fitting on the others; its zero is its "
     "own mean"
+)
+HELD_OUT_VALUES = (
+    f"each of {FOLDS} sets of every {FOLDS}rd value predicted after choosing and fitting on the others; what is named "
+    "and deployed is decided by the likelihood of all values"
 )
 REPLACED = " All channels together explain the data better, so the remainder is deployed in its place."
 #: Another explanation is a rival while it leaves no more than this many times as much.
@@ -236,6 +241,8 @@ class Diagnosis:
         What all channels could explain; None where no linear use of them leaves less than the base model.
     advice : Advice, optional
         What to measure and to test next; None where the model is adequate.
+    could_hide : Hiding, optional
+        Where Y was measured now and then: how much could act without being seen.
     """
 
     verdict: Verdict
@@ -254,6 +261,7 @@ class Diagnosis:
     remainder: Remainder | None = None
     ceiling: Ceiling | None = None
     advice: Advice | None = None
+    could_hide: Hiding | None = None
 
     @property
     def before(self) -> Scores:
@@ -341,13 +349,27 @@ def rivals_of(
     return tuple(rivals.values())
 
 
-def warnings_of(effects: Sequence[FoundEffect], before: Vector, after: Vector, *, deployed: bool) -> tuple[Remark, ...]:
-    """Return what to know before relying on the effects that were found."""
+def warnings_of(
+    effects: Sequence[FoundEffect], before: Vector, after: Vector, *, deployed: bool, few: bool = False
+) -> tuple[Remark, ...]:
+    """Return what to know before relying on the effects that were found.
+
+    Parameters
+    ----------
+    effects : sequence of FoundEffect
+        Effects.
+    before, after : numpy.ndarray, shape (n,)
+        What is left on held-out data without and with them, µm.
+    deployed : bool
+        Whether the extended model has any.
+    few : bool
+        Whether Y was measured now and then, so that held-out blocks do not decide what is deployed.
+    """
     warnings = []
     rms_before, rms_after = rms_of(before), rms_of(after)
     if effects and rms_after > rms_before:
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
-        if deployed:
+        if deployed or few:
             text = (
                 f"The effects are clear in the data as a whole, but do not predict held-out blocks better {numbers}: "
                 "something happened only once. Check the extended model on another day."

@@ -34,6 +34,8 @@ MOST = 4
 MARGIN = 4.0
 #: What a source that no channel shows must add beyond that where the base has an error of its own, whose form it takes.
 UNSEEN = 15.0
+#: Few values do not decide whether an effect acts that is not worth its price and adds as much as this.
+DOUBT = 4.5
 #: Hypotheses that are fitted after each scan, and how many of those are judged.
 FITTED, JUDGED = 6, 4
 #: Shortest period that averaged points show for what it is, points.
@@ -73,11 +75,14 @@ class Selection:
         The fit of nothing, and of the effects found.
     rivals : tuple of tuple of Candidate
         For each effect, what else was fitted in its place, best first.
+    undecided : tuple of Fit
+        Where few values do not decide: effects that may act, best first.
     """
 
     before: Fit
     fit: Fit
     rivals: tuple[tuple[Candidate, ...], ...] = ()
+    undecided: tuple[Fit, ...] = ()
 
 
 class Search:
@@ -95,6 +100,7 @@ class Search:
         self.hypotheses = [_above(hypothesis, ALIAS_FREE * self.points.period_min) for hypothesis in self.hypotheses]
         self._scan = Scan(self.points, self.hypotheses)
         self._forms = Counter(hypothesis.place for hypothesis in self.hypotheses)
+        self._something_acts = False
 
     def run(self, *, unobserved: bool = True) -> Selection:
         """Search what the inputs explain, and a source that no channel shows.
@@ -107,16 +113,25 @@ class Search:
         unobserved = unobserved and not self.evidence.free_paths
         rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
         before = fit_terms(Likelihood(self.points, rest), [])
-        grown = self._grown(before, unobserved=unobserved)
+        self._something_acts = bool(self.evidence.noise.freedom) and not self._leaves_noise(before)
+        grown, undecided = self._grown(before, unobserved=unobserved)
         best = self._pruned(grown)
         if grown.terms and not best.terms:
             # What was too small to name must not keep out what is not.
-            best = self._pruned(self._grown(before, unobserved=unobserved, apart_from=grown.places))
+            grown, undecided = self._grown(before, unobserved=unobserved, apart_from=grown.places)
+            best = self._pruned(grown)
         best = self._with_simpler_name(self._exchanged(best, len(best.terms)))
-        return Selection(before=before, fit=best, rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))))
+        return Selection(
+            before=before,
+            fit=best,
+            rivals=tuple(self._rivals(best, i) for i in range(len(best.terms))),
+            undecided=() if best.terms else undecided,
+        )
 
-    def _grown(self, best: Fit, *, unobserved: bool, apart_from: frozenset[Place] = frozenset()) -> Fit:
-        """Add one effect after another while each is worth its cost.
+    def _grown(
+        self, best: Fit, *, unobserved: bool, apart_from: frozenset[Place] = frozenset()
+    ) -> tuple[Fit, tuple[Fit, ...]]:
+        """Add one effect after another while each is worth its cost; return what few values do not decide, too.
 
         Parameters
         ----------
@@ -134,13 +149,22 @@ class Search:
             candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
             better = max(candidates, key=self.score, default=best)
             if self.score(better) <= self.score(best):
-                break
+                return best, self._undecided(candidates, best)
             best = self._exchanged(better)
-        return best
+        return best, ()
 
     def score(self, fit: Fit) -> float:
         """Return *J*."""
-        return fit.log_evidence - self.cost(fit)
+        return fit.log_evidence - self.charge(fit)
+
+    def charge(self, fit: Fit) -> float:
+        """Return what the effects of a fit are charged.
+
+        Where few values are left with more than their stated noise, something acts, and effects that leave no more than
+        that are not charged for being there: one of them is, or a slow cause that has no name.
+        """
+        waived = self._something_acts and bool(fit.terms) and self._leaves_noise(fit)
+        return self.cost(fit) - waived * self.price
 
     def cost(self, fit: Fit) -> float:
         """Return what the effects of a fit must add to the evidence."""
@@ -156,6 +180,11 @@ class Search:
         return float(np.sqrt(np.sum(self.left(fit) ** 2) / self.evidence.count))
 
     @property
+    def price(self) -> float:
+        """What a usual effect must add to the logarithm of the evidence."""
+        return MARGIN + math.log(len(self._forms) + 1)
+
+    @property
     def _typical(self) -> Rest:
         return self.points.typical_rest()
 
@@ -163,6 +192,16 @@ class Search:
         """Return what an effect must add to the evidence."""
         unseen = UNSEEN if self.evidence.context.approximate and not hypothesis.effect.observed else 0.0
         return unseen + MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
+
+    def _leaves_noise(self, fit: Fit) -> bool:
+        return self.evidence.noise.is_explained(self.rms(fit) ** 2 * self.evidence.count)
+
+    def _undecided(self, candidates: Sequence[Fit], best: Fit) -> tuple[Fit, ...]:
+        """Return the effects that may act, best first, where few values do not decide it."""
+        if not self.evidence.noise.freedom:
+            return ()
+        least = -math.inf if self._something_acts else best.log_evidence + DOUBT
+        return tuple(sorted((f for f in candidates if f.log_evidence > least), key=self.score, reverse=True))
 
     # ------------------------------------------------------------------ steps
 
@@ -235,7 +274,11 @@ class Search:
     def _is_expected(self, fit: Fit) -> bool:
         """Return whether what is left may come by itself on another day, where the calibration states its error."""
         noise = self.evidence.noise
-        return noise.own_error_um > 0.0 and noise.is_expected(self.rms(fit) ** 2 * self.evidence.count)
+        return (
+            noise.own_error_um > 0.0
+            and not noise.freedom
+            and noise.is_expected(self.rms(fit) ** 2 * self.evidence.count)
+        )
 
     def _is_worth_naming(self, term: Term, without: Fit, fit: Fit) -> bool:
         """Return whether an effect is large enough beside what is left without it and the base model's own error."""

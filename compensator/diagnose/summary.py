@@ -11,6 +11,7 @@ from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
 from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_rms, remainder
 from compensator.diagnose.fit import Term
+from compensator.diagnose.hiding import Hiding
 from compensator.diagnose.outcome import Ceiling, Diagnosis, FoundEffect, Remainder
 from compensator.display import Table, Words, warnings_of, with_std
 from compensator.model.simulation import SCORE_HEAD, Scores
@@ -20,6 +21,22 @@ _VERDICTS = {
     "explained": "The missing effects were found; what remains is within the noise and the model's own error.",
     "partly_explained": "Some of the missing effects were found; part of the residual remains unexplained.",
     "unexplained": "The model lacks an effect that no channel shows.",
+}
+#: The same of Y that was measured now and then.
+_ADEQUATE_VALUES = "The model is adequate as far as so few values can show: the residual is within their noise."
+#: The verdict if few values leave nothing but noise and could not have shown what matters.
+_CANNOT_SHOW = (
+    "The residual is within the noise, but these values could not have shown what matters: they do not say whether the "
+    "model is adequate."
+)
+#: The verdict if few values leave nothing but noise and an effect would explain some of it.
+_UNDECIDED = "The residual is within the noise, yet {names} may act: these values do not decide it."
+#: What could hide in few values.
+_HIDDEN = {
+    "gain": "an error of the {path}'s gain",
+    "drift": "a drift",
+    "step": "a step",
+    "unobserved": "a source that no channel shows",
 }
 #: The verdict if the effects found increase the error on held-out data.
 _DOES_NOT_HOLD = (
@@ -74,7 +91,25 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
         "advice": advice_table(diagnosis.advice),
         "warnings": list(map(str, diagnosis.warnings)),
         "warning_codes": [warning.code for warning in diagnosis.warnings],
+        **_could_hide(diagnosis.could_hide),
     }
+
+
+def _could_hide(found: Hiding | None) -> dict[str, Any]:
+    """Return how much could hide under its key; nothing where Y was measured all the time."""
+    if found is None:
+        return {}
+    needed = found.values_needed if found.is_too_much else 0
+    table = {
+        "values": found.values,
+        "every_min": found.every_min,
+        "matters_um": found.matters_um,
+        "too_much": found.is_too_much,
+        "undecided": list(found.undecided),
+        "values_needed": max(needed, found.values),
+        "what": [{"kind": one.kind, "path": one.path or None, "size_um": one.size_um} for one in found.what],
+    }
+    return {"could_hide": table}
 
 
 def _table(found: Remainder | Ceiling | None) -> dict[str, Any] | None:
@@ -103,6 +138,11 @@ def verdict(found: Mapping[str, Any]) -> str:
         Result of :func:`figures`, or content of `diagnosis.json`.
     """
     words = _VERDICTS[found["verdict"]]
+    if found["verdict"] == "adequate" and "could_hide" in found:
+        words = _ADEQUATE_VALUES
+    elif _cannot_show(found):
+        names = found["could_hide"]["undecided"]
+        words = _UNDECIDED.format(names=" or ".join(names)) if names else _CANNOT_SHOW
     if ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
     elif found["verdict"] == "explained" and falls_short(found):
@@ -111,11 +151,43 @@ def verdict(found: Mapping[str, Any]) -> str:
     share = f" {sentence}" if (sentence := explained(found)) else ""
     with_remainder = f", {after:.2f} with the remainder" if found.get("remainder") else ""
     if not found["effects"]:
-        return f"{words} Residual {before:.2f} µm rms{with_remainder}, sensor noise {noise:.2f}.{share}"
+        hidden = "".join(f" {line}" for line in hiding_lines(found)[:1])
+        return f"{words} Residual {before:.2f} µm rms{with_remainder}, sensor noise {noise:.2f}.{hidden}{share}"
     return (
         f"{words} {_names(found['effects'])}. On held-out data the residual was {before:.2f} µm rms without and is "
         f"{named_rms(found):.2f} µm rms with them{with_remainder} (sensor noise {noise:.2f}).{share}"
     )
+
+
+def _cannot_show(found: Mapping[str, Any]) -> bool:
+    """Whether few values leave nothing but noise, and something that matters could hide in it."""
+    hides = found.get("could_hide")
+    left = found["advice"]["unexplained"] if found.get("advice") else None
+    return hides is not None and found["verdict"] == "unexplained" and not found["effects"] and left is None
+
+
+def hiding_lines(found: Mapping[str, Any]) -> list[str]:
+    """Return how much could hide in few values, in sentences.
+
+    Empty where Y was measured all the time, and where the values show that something acts without a name.
+    """
+    hides = found.get("could_hide")
+    if not hides or (found["verdict"] == "unexplained" and not _cannot_show(found)):
+        return []
+    first, *others = [f"{_HIDDEN[one['kind']].format(**one)} of {one['size_um']:.1f} µm" for one in hides["what"]]
+    beside = " beside the effects found" if found["effects"] else ""
+    lines = [
+        f"With {hides['values']} values, one each {hides['every_min']:g} min, {first} (peak to peak over the record) "
+        f"could act{beside} without being seen."
+    ]
+    if others:
+        lines.append(f"Or {', '.join(others)}. What comes and goes between two values does not show at all.")
+    if hides["too_much"]:
+        lines.append(
+            f"That is more than {hides['matters_um']:.1f} µm, a tenth of Y's movement: about {hides['values_needed']} "
+            "values like these are needed, or as many with less noise."
+        )
+    return lines
 
 
 def _names(effects: Sequence[Mapping[str, Any]]) -> str:
@@ -144,6 +216,8 @@ def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | 
         if effect.rivals:
             yield rivals(effect)
     yield from remainder(found)
+    if hidden := hiding_lines(found):
+        yield Words(title="What could hide", lines=hidden)
     if advice := advice_lines(diagnosis.advice):
         yield Words(title="What to measure and test next", lines=advice)
     yield from warnings_of(diagnosis.warnings)

@@ -75,6 +75,8 @@ class _Pursuit:
         self._cost = math.log(points.count) + 2.0
         context = points.evidence.context
         self._period = context.period_min
+        # Between two values measured now and then a lag does not show.
+        self._at_once = max(AT_ONCE * self._period, points.period_min if points.evidence.noise.freedom else 0.0)
         self._tau = context.tau()
         self._longest = max(context.minutes * LONGEST_SHARE, 2.0 * self._tau.low)
         self._grid: list[Time] = [
@@ -100,7 +102,7 @@ class _Pursuit:
         if best is None:
             return None
         _, times, lag = best
-        if len(times) == 1 and lag < AT_ONCE * self._period:
+        if len(times) == 1 and lag < self._at_once:
             return None
         hypothesis = Hypothesis(
             effect=Unobserved(times=tuple(sorted(times)), sizes_um=(1.0,) * len(times)),

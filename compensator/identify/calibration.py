@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Mask, Vector
+from compensator.codes import DataRemark, Remark
 from compensator.data.runs import Run, noise_of, noise_std, walk_std
 from compensator.data.screening import screen
 from compensator.errors import DataError
@@ -27,6 +28,10 @@ LEAST_NOISE_K = 0.005
 LEAST_AT_WALK_K = 0.1
 #: Zero of a run that was not fitted: the mean of its first hour.
 ZERO_S = 3600.0
+#: Where Y is measured now and then, at least so many values make the zero.
+ZERO_VALUES = 5
+#: There, a value so many deviations away from the fit is a chip on the feature.
+CHIP_DEVIATIONS = 5.0
 #: How far the range of validity exceeds the data: share of its range, and at least, K.
 BEYOND_SHARE, BEYOND_K = 0.33, 2.0
 
@@ -43,6 +48,8 @@ class Part:
         Whether it was used for fitting or selection.
     t_s, y_um, y_pred_um : numpy.ndarray, shape (n,)
         Time, s; measured deformation and the engine's prediction from T_Q and AT (zeroed), µm.
+    hours : float
+        Length of its samples, h; where Y is measured now and then, from the first value to the last.
     model, nothing, persistence : Scores
         Of the model, of no compensation (y counted from the run's start), and of the last value measured before
         the part.
@@ -53,6 +60,7 @@ class Part:
     t_s: Vector
     y_um: Vector
     y_pred_um: Vector
+    hours: float
     model: Scores
     nothing: Scores
     persistence: Scores
@@ -201,7 +209,7 @@ def calibrate(
     data = ", ".join(dict.fromkeys(run.name for run in runs)) or name
     screen(data, runs, period_s, needs_heat=kind == "heat")
     used = [_mask(run, fit_until_s) for run in runs]
-    if sum(int(mask.sum()) for mask in used) * period_s < 7200.0:
+    if sum(int(run.covered(mask).sum()) for run, mask in zip(runs, used, strict=True)) * period_s < 7200.0:
         raise DataError(f"{data}: less than 2 h of samples left for the fit")
     # A run that starts after the hours of the fit is held out completely.
     later = [run for run, mask in zip(runs, used, strict=True) if not mask.any() and np.isfinite(run.y_um).any()]
@@ -213,9 +221,16 @@ def calibrate(
         )
     drives = [_drive(run, temperature, settings) for run in runs]
     deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
+    chips = _chips(runs, deformation)
+    if any(chip.any() for chip in chips):
+        used = [mask & ~chip for mask, chip in zip(used, chips, strict=True)]
+        remarks = (*remarks, _left_out(data, chips))
+        deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
     chosen = next(c for c in deformation.candidates if c.chosen)
     noise = noise_of(runs)
     noise |= {name: max(noise[name], LEAST_NOISE_K) for name in ("t_q_degc", "at_degc")}
+    sparse = any(run.has_sparse_y for run in runs)
+    own_um = _own_error_um(deformation, chosen.rms, noise["y_um"]) if sparse else chosen.rms
     model = ThermalModel(
         name=name,
         kind=kind,
@@ -225,8 +240,10 @@ def calibrate(
         tdtf=_path("TDTF", kind, deformation.tdtf),
         estimator=_estimator(runs, drives, noise, kind),
         validity=_validity(runs, used, kind),
-        y_std_um=float(np.sqrt(max(chosen.rms**2 - noise["y_um"] ** 2, (0.3 * noise["y_um"]) ** 2))),
-        held_out_rms_um=chosen.rms,
+        y_std_um=own_um
+        if sparse
+        else float(np.sqrt(max(chosen.rms**2 - noise["y_um"] ** 2, (0.3 * noise["y_um"]) ** 2))),
+        held_out_rms_um=own_um if sparse else chosen.rms,
         provenance=dict(provenance or {}),
     )
     fixed = (temperature.remark,) if temperature and temperature.remark else ()
@@ -243,6 +260,38 @@ def calibrate(
         noise=noise,
         remarks=(*remarks, *fixed, *deformation.remarks),
     )
+
+
+def _chips(runs: Sequence[Run], deformation: DeformationFit) -> list[Mask]:
+    """Return the values of a deformation measured now and then that lie far from the fit: a chip, a wrong feature."""
+    if not any(run.has_sparse_y for run in runs):
+        return [np.zeros(run.t_s.size, dtype=bool) for run in runs]
+    residuals = [
+        np.where(s.used, r, 0.0) for s, r in zip(deformation.segments, deformation.main.residuals, strict=True)
+    ]
+    left = np.concatenate([r[s.used] for s, r in zip(deformation.segments, residuals, strict=True)])
+    noise = (*(run.y_noise_um for run in runs), float(np.median(np.abs(left))) / 0.6745)
+    limit = CHIP_DEVIATIONS * max(noise)
+    return [np.asarray(np.abs(residual) > limit) for residual in residuals]
+
+
+def _left_out(data: str, chips: Sequence[Mask]) -> Remark:
+    count = sum(int(chip.sum()) for chip in chips)
+    return Remark(DataRemark.WILD_READINGS, f"{data}: y_um: {count} value(s) far from all others left out.")
+
+
+def _own_error_um(deformation: DeformationFit, rms_um: float, noise_um: float) -> float:
+    """Return the model's own error where Y was measured now and then, µm rms.
+
+    What the standard errors of the parameters make of the prediction, and what held-out blocks show beyond the noise of
+    the values by more than chance: a probe's noise is none of the model.
+    """
+    count = sum(int(segment.used.sum()) for segment in deformation.segments)
+    parts = [deformation.main.simulate_with_std(segment.inputs)[1] for segment in deformation.segments]
+    by_parameters = float(np.mean(np.concatenate(parts) ** 2))
+    excess = rms_um**2 - noise_um**2
+    by_blocks = excess if excess > 2.0 * noise_um**2 * np.sqrt(2.0 / count) else 0.0
+    return float(np.sqrt(max(by_parameters, by_blocks)))
 
 
 def _kind(runs: Sequence[Run], settings: Settings) -> Kind:
@@ -302,6 +351,7 @@ def _validity(runs: Sequence[Run], used: Sequence[Mask], kind: Kind) -> dict[str
         beyond = max(BEYOND_SHARE * (high - low), least)
         return round(low - beyond, 3), round(high + beyond, 3)
 
+    used = [run.covered(mask) for run, mask in zip(runs, used, strict=True)]
     ranges = {
         "t_q_degc": widened(np.concatenate([r.t_q_degc[m] for r, m in zip(runs, used, strict=True)]), BEYOND_K),
         "at_degc": widened(np.concatenate([r.at_degc[m] for r, m in zip(runs, used, strict=True)]), BEYOND_K),
@@ -326,16 +376,25 @@ def _parts(
     for i, (run, mask) in enumerate(zip(runs, used, strict=True)):
         predicted = predict(model, run) + deformation.main.free_decay(i, run.t_s.size)
         predicted += float(np.mean((run.y_um - predicted)[mask]))
-        parts.append(_part(run, predicted, mask, "fitted"))
+        parts.append(_part(run, predicted, mask, "fitted", model.period_s))
         rest = np.isfinite(run.y_um) & ~mask
         if rest.any():
-            parts.append(_part(run, predicted, rest, "held out"))
+            parts.append(_part(run, predicted, rest, "held out", model.period_s))
     for run in validation:
         predicted = predict(model, run)
-        first = np.isfinite(run.y_um) & (run.t_s < run.t_s[0] + ZERO_S)
-        predicted += float(np.mean((run.y_um - predicted)[first]))
-        parts.append(_part(run, predicted, np.isfinite(run.y_um), "held out"))
+        predicted += float(np.mean((run.y_um - predicted)[_zero_of(run)]))
+        parts.append(_part(run, predicted, np.isfinite(run.y_um), "held out", model.period_s))
     return parts
+
+
+def _zero_of(run: Run) -> Mask:
+    """Return the samples whose mean is the zero of a run that was not fitted."""
+    known = np.isfinite(run.y_um)
+    if not run.has_sparse_y:
+        return np.asarray(known & (run.t_s < run.t_s[0] + ZERO_S))
+    first = np.flatnonzero(known)
+    until = max(run.t_s[first[0]] + ZERO_S, run.t_s[first[:ZERO_VALUES][-1]])
+    return np.asarray(known & (run.t_s <= until))
 
 
 def predict(model: ThermalModel, run: Run) -> Vector:
@@ -345,11 +404,11 @@ def predict(model: ThermalModel, run: Run) -> Vector:
     return np.array([e.y_um for e in engine.run(run.t_q_degc, run.at_degc, run.channels)])
 
 
-def _part(run: Run, predicted: Vector, mask: Mask, role: str) -> Part:
+def _part(run: Run, predicted: Vector, mask: Mask, role: str, period_s: float) -> Part:
     known = np.flatnonzero(np.isfinite(run.y_um))
     y = run.y_um[mask]
     before = known[known < np.argmax(mask)]
-    start = float(np.mean(run.y_um[known[:5]]))
+    start = float(np.mean(run.y_um[known[: 1 if run.has_sparse_y else 5]]))
     held = float(run.y_um[before[-1]]) if before.size else start
     return Part(
         name=run.name,
@@ -357,6 +416,7 @@ def _part(run: Run, predicted: Vector, mask: Mask, role: str) -> Part:
         t_s=run.t_s[mask],
         y_um=y,
         y_pred_um=predicted[mask],
+        hours=float(run.covered(mask).sum()) * period_s / 3600.0,
         model=scores(y, predicted[mask]),
         nothing=scores(y, np.full(y.size, start)),
         persistence=scores(y, np.full(y.size, held)),

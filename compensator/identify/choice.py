@@ -3,11 +3,15 @@
 A fold is a block of time whose measured deformation is held out while the model is fitted to the other blocks; the
 model runs through it, because its inputs are known. The simplest structure is chosen whose held-out error exceeds the
 smallest by at most one standard error. Structures whose amplitudes the data do not determine are excluded.
+
+Where Y was measured now and then, blocks have few values and differ by chance; the structure is then chosen by Akaike's
+information criterion, corrected for few values (Hurvich and Tsai, Biometrika 1989).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -35,6 +39,12 @@ class Candidate:
         The same for each fold.
     supported : bool
         Whether the data determines all of its amplitudes.
+    squares : float
+        Sum of squares of the residual of the fit to everything.
+    parameters : int
+        Number of parameters of that fit, with initial states and zeros.
+    information : float
+        Akaike's criterion where it chooses; NaN elsewhere.
     chosen : bool
         Whether it was chosen.
     """
@@ -43,6 +53,9 @@ class Candidate:
     rms: float
     fold_rms: tuple[float, ...]
     supported: bool
+    squares: float
+    parameters: int
+    information: float = math.nan
     chosen: bool = False
 
 
@@ -121,12 +134,30 @@ def choose(
             continue
     if not candidates:
         raise DataError(f"too little data for the smallest structure ({structures[0]})")
+    prior = structures[0].prior
+    if prior is not None:
+        candidates = _with_information(candidates, sum(int(s.used.sum()) for s in segments), prior.noise)
     among = [c for c in candidates if c.supported] or candidates
+    if prior is not None:
+        least = min(among, key=lambda c: c.information)
+        return [dataclasses.replace(c, chosen=c is least) for c in candidates]
     best = min(among, key=lambda c: c.rms)
     simplest = min(
         (c for c in among if no_worse(c.fold_rms, best.fold_rms)), key=lambda c: (c.structure.parameters, c.rms)
     )
     return [dataclasses.replace(c, chosen=c is simplest) for c in candidates]
+
+
+def _with_information(candidates: Sequence[Candidate], count: int, noise: float) -> list[Candidate]:
+    """Return candidates with Akaike's criterion, corrected for few values."""
+    # A noise that was stated too small must not ask for more and more parameters.
+    variance = max(noise**2, min(c.squares / (count - c.parameters) for c in candidates))
+    return [
+        dataclasses.replace(
+            c, information=c.squares / variance + 2.0 * c.parameters * count / max(count - c.parameters - 1, 1)
+        )
+        for c in candidates
+    ]
 
 
 def _candidate(segments: Sequence[Segment], structure: Structure, period_s: float, folds: int) -> Candidate:
@@ -137,6 +168,8 @@ def _candidate(segments: Sequence[Segment], structure: Structure, period_s: floa
         rms=float(np.sqrt(np.mean(np.concatenate(errors) ** 2))),
         fold_rms=tuple(float(np.sqrt(np.mean(e**2))) for e in errors),
         supported=whole.rank_deficit == 0,
+        squares=float(sum(np.sum(r[s.used] ** 2) for r, s in zip(whole.residuals, segments, strict=True))),
+        parameters=structure.parameters + sum(own.size for own in whole.nuisances),
     )
 
 

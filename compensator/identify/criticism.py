@@ -11,7 +11,7 @@ from scipy.special import gammaincc
 
 from compensator.arrays import ComplexVector, Mask, Vector
 from compensator.codes import ModelWarning, Remark
-from compensator.data.runs import Run
+from compensator.data.runs import Run, is_sparse
 from compensator.display import with_std
 from compensator.identify.calibration import Calibration
 from compensator.identify.deformation import PathFit
@@ -83,6 +83,8 @@ class ResidualView:
         Probability of at least this autocorrelation in white noise (Ljung and Box).
     cross : dict of str to (numpy.ndarray, float)
         Correlation with each input at lags −LAGS … LAGS and its 99 % limit, which allows for both autocorrelations.
+    lag_unit : str
+        What a lag counts: samples, or measured values where Y is measured now and then.
     """
 
     name: str
@@ -90,6 +92,7 @@ class ResidualView:
     limit: float
     white_chance: float
     cross: dict[str, tuple[Vector, float]]
+    lag_unit: str = "samples"
 
 
 def view_path(path: PathFit, unit: str, period_s: float) -> PathView:
@@ -151,10 +154,17 @@ def view_residual(name: str, residuals: Sequence[Vector], inputs: dict[str, Sequ
     inputs : dict of str to sequence of numpy.ndarray
         Inputs on the same samples.
     """
+    sparse = any(is_sparse(r) for r in residuals)
+    if sparse:
+        known = [np.isfinite(r) for r in residuals]
+        inputs = {key: [v[k] for v, k in zip(values, known, strict=True)] for key, values in inputs.items()}
+        residuals = [r[k] for r, k in zip(residuals, known, strict=True)]
     filled = [np.where(np.isfinite(r), r - np.nanmean(r), 0.0) for r in residuals]
     count = sum(int(np.isfinite(r).sum()) for r in residuals)
     own = _correlation(filled, filled)[LAGS:]
-    statistic = count * (count + 2) * float(np.sum(own[1:] ** 2 / (count - np.arange(1, LAGS + 1))))
+    # A lag that few pairs of values have shows nothing.
+    lags = min(LAGS, count // 4) if sparse else LAGS
+    statistic = count * (count + 2) * float(np.sum(own[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))))
     cross = {}
     for input_name, values in inputs.items():
         moved = [v - np.mean(v) for v in values]
@@ -165,8 +175,9 @@ def view_residual(name: str, residuals: Sequence[Vector], inputs: dict[str, Sequ
         name=name,
         autocorrelation=own[1:],
         limit=float(NORMAL_99 / np.sqrt(count)),
-        white_chance=float(gammaincc(LAGS / 2.0, statistic / 2.0)),
+        white_chance=float(gammaincc(lags / 2.0, statistic / 2.0)),
         cross=cross,
+        lag_unit="measured values" if sparse else "samples",
     )
 
 
@@ -232,7 +243,7 @@ class _Warnings:
     def __init__(self, calibration: Calibration, paths: Sequence[PathView], residuals: Sequence[ResidualView]) -> None:
         self.calibration, self.residuals = calibration, residuals
         self.paths = {path.name: path for path in paths}
-        self.hours = [float(np.sum(mask)) * calibration.model.period_s / 3600.0 for mask in calibration.used]
+        self.hours = [float(np.sum(mask)) * calibration.model.period_s / 3600.0 for _, mask in self._pairs()]
 
     def all(self) -> tuple[Remark, ...]:
         found = [
@@ -301,7 +312,7 @@ class _Warnings:
         )
 
     def common_cause(self) -> Remark | None:
-        drives = np.concatenate([d[m] for d, m in zip(self.calibration.drives, self.calibration.used, strict=True)])
+        drives = np.concatenate([d[m] for d, (_, m) in zip(self.calibration.drives, self._pairs(), strict=True)])
         ambient = np.concatenate([run.ambient_k[mask] for run, mask in self._pairs()])
         if np.ptp(ambient) == 0.0 or np.ptp(drives) == 0.0:
             return None
@@ -407,7 +418,9 @@ class _Warnings:
         )
 
     def _pairs(self) -> list[tuple[Run, Mask]]:
-        return list(zip(self.calibration.runs, self.calibration.used, strict=True))
+        """Return each run with the samples that its measured values stand for."""
+        pairs = zip(self.calibration.runs, self.calibration.used, strict=True)
+        return [(run, run.covered(mask)) for run, mask in pairs]
 
 
 def _peak(path: PathView) -> float:

@@ -10,6 +10,7 @@ end, III), and fit the DTF to the rest. Method IV fits both together, with a com
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,7 +20,7 @@ from compensator.arrays import Mask, Vector
 from compensator.data.runs import Run
 from compensator.errors import DataError
 from compensator.identify.choice import Candidate, choose, fit
-from compensator.identify.output_error import OutputErrorFit, Segment, Structure
+from compensator.identify.output_error import OutputErrorFit, Prior, Segment, Structure
 from compensator.identify.rest import settle_starts
 from compensator.identify.settings import Settings
 from compensator.model.transfer_function import SampledTransferFunction, TransferFunction
@@ -27,6 +28,9 @@ from compensator.progress import Progress, unreported
 
 #: Numbers of modes considered for an ETVE; the paper's had five.
 ETVE_ORDERS = (1, 2, 3, 4, 5)
+#: What is known before few values of Y: the gain of the drive is no more than about this many times the ratio of the
+#: spreads, that of the air no more than about a column of two metres of steel has, µm/K.
+DRIVE_TIMES, AMBIENT_UM_PER_K = 5.0, 20.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,8 +126,9 @@ def fit_deformation(
     DataError
         If the method needs an ETVE and none is given, or an order cannot be fitted.
     """
+    prior = _prior(runs, used, drives)
     if settings.method == "IV":
-        return _together(runs, used, drives, settings, period_s, progress)
+        return _together(runs, used, drives, settings, period_s, prior, progress)
     etve_candidates: tuple[Candidate, ...] = ()
     if settings.method == "I":
         assert settings.given_tdtf is not None
@@ -134,10 +139,13 @@ def fit_deformation(
         Segment.of(drive, run.y_um - tdtf.function.response(run.ambient_k), mask)
         for run, mask, drive in zip(runs, used, drives, strict=True)
     ]
+    if prior is not None:
+        prior = dataclasses.replace(prior, gains=prior.gains[:1])
     if settings.order is not None:
-        structures = [Structure(order=settings.order[0], terms=(settings.order[1],))]
+        structures = [Structure(order=settings.order[0], terms=(settings.order[1],), prior=prior)]
     else:
-        structures = [Structure(order=n, terms=(m,)) for n in range(1, settings.max_order + 1) for m in _terms(n)]
+        orders = range(1, settings.max_order + 1)
+        structures = [Structure(order=n, terms=(m,), prior=prior) for n in orders for m in _terms(n)]
     segments, candidates, result = _chosen(rest, structures, settings, period_s, progress)
     return DeformationFit(
         dtf=PathFit.of("DTF", result),
@@ -154,6 +162,7 @@ def _together(
     drives: Sequence[Vector],
     settings: Settings,
     period_s: float,
+    prior: Prior | None,
     progress: Progress,
 ) -> DeformationFit:
     data = [
@@ -161,10 +170,10 @@ def _together(
     ]
     if settings.order is not None:
         n, nb_dtf, nb_tdtf = settings.order
-        structures = [Structure(order=n, terms=(nb_dtf, nb_tdtf))]
+        structures = [Structure(order=n, terms=(nb_dtf, nb_tdtf), prior=prior)]
     else:
         structures = [
-            Structure(order=n, terms=(m, k))
+            Structure(order=n, terms=(m, k), prior=prior)
             for n in range(1, settings.max_order + 1)
             for m in _terms(n)
             for k in range(1, n + 1)
@@ -176,6 +185,17 @@ def _together(
         segments=tuple(segments),
         candidates=tuple(candidates),
     )
+
+
+def _prior(runs: Sequence[Run], used: Sequence[Mask], drives: Sequence[Vector]) -> Prior | None:
+    """Return what is known of the amplitudes before the data, where Y was measured now and then; None elsewhere."""
+    if not any(run.has_sparse_y for run in runs):
+        return None
+    measured = [run.y_um[mask] - np.mean(run.y_um[mask]) for run, mask in zip(runs, used, strict=True) if mask.any()]
+    driven = [drive[run.covered(mask)] for run, mask, drive in zip(runs, used, drives, strict=True) if mask.any()]
+    spread = float(np.std(np.concatenate(measured)))
+    gain = DRIVE_TIMES * spread / max(float(np.std(np.concatenate(driven))), 1e-9)
+    return Prior(noise=max(run.y_noise_um for run in runs), gains=(gain, AMBIENT_UM_PER_K), spread=spread)
 
 
 def _terms(order: int) -> tuple[int, ...]:
@@ -215,6 +235,10 @@ def _from_etve(
         data.append(Segment.of(run.ambient_k, run.y_um, used))
     orders = ETVE_ORDERS if settings.order is None else (settings.order[0],)
     terms = None if settings.order is None else settings.order[2]
-    structures = [Structure(order=n, terms=(terms or m,)) for n in orders for m in ((n, 1) if n > 1 else (1,))]
+    prior = _prior(etve, [np.isfinite(run.y_um) for run in etve], [run.ambient_k for run in etve])
+    if prior is not None:
+        prior = dataclasses.replace(prior, gains=prior.gains[1:])
+    each = ((n, m) for n in orders for m in ((n, 1) if n > 1 else (1,)))
+    structures = [Structure(order=n, terms=(terms or m,), prior=prior) for n, m in each]
     _, candidates, result = _chosen(data, structures, settings, period_s, progress)
     return PathFit.of("TDTF", result), tuple(candidates)

@@ -74,6 +74,28 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Prior:
+    """What is known of the amplitudes before few or noisy data: what these do not determine stays near it.
+
+    The gain of an input at rest has a normal distribution about 0 with a standard deviation that no machine exceeds by
+    much; what each further amplitude adds to the output is about as large as the output at most.
+
+    Parameters
+    ----------
+    noise : float
+        Standard deviation of one measured output, which weighs the prior against the data.
+    gains : tuple of float
+        Standard deviation of the gain at rest of each input.
+    spread : float
+        Standard deviation of the measured output.
+    """
+
+    noise: float
+    gains: tuple[float, ...]
+    spread: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
     """Structure of a fit: common denominator order, and numerator terms and delay of each input.
 
@@ -85,11 +107,14 @@ class Structure:
         Numerator terms of each input, nb.
     offset : bool
         Whether the output has an unknown zero.
+    prior : Prior, optional
+        What is known of the amplitudes; by default nothing.
     """
 
     order: int
     terms: tuple[int, ...]
     offset: bool = True
+    prior: Prior | None = None
 
     def __post_init__(self) -> None:
         if self.order < 0 or not self.terms or min(self.terms) < 1:
@@ -281,6 +306,13 @@ def _nuisance_columns(segment: Segment, poles: Vector, structure: Structure) -> 
     return table
 
 
+def _prior_weights(prior: Prior, terms: Sequence[int], columns: Matrix) -> Vector:
+    """Return the noise over the standard deviation of each amplitude; columns are those on the samples used."""
+    weights: Vector = prior.noise * np.sqrt(np.mean(columns**2, axis=0)) / prior.spread
+    weights[np.cumsum([0, *terms[:-1]])] = prior.noise / np.array(prior.gains)
+    return weights
+
+
 def _sensitivities(output: Vector, poles: Vector, slopes: Vector) -> Matrix:
     """Return ∂ŷ / ∂ log τ at fixed amplitudes of a whole dynamic output, shape (n, order)."""
     table = np.empty((output.size, poles.size))
@@ -297,7 +329,7 @@ class _Problem:
         self.segments, self.structure, self.period_s = segments, structure, period_s
         self.rows = [int(segment.used.sum()) for segment in segments]
         self.states = [0 if segment.rest else structure.order for segment in segments]
-        prior = np.zeros(sum(self.states))
+        prior = np.zeros(sum(self.states) + (structure.amplitudes if structure.prior else 0))
         self.y = np.concatenate([*(segment.y[segment.used] for segment in segments), prior])
         self.count = self.y.size - prior.size
         self.evaluations = 0
@@ -327,6 +359,9 @@ class _Problem:
                 table[prior, column + k] = STATE_PRIOR * np.max(np.abs(nuisance[:, k]))
                 prior += 1
             row, column = row + count, column + nuisance.shape[1]
+        if self.structure.prior is not None:
+            measured = table[: self.count, :width]
+            table[prior:, :width] = np.diag(_prior_weights(self.structure.prior, self.structure.terms, measured))
         return table
 
     def solve(self, log_taus: Vector) -> None:

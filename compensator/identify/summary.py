@@ -156,13 +156,12 @@ def parameter_table(calibration: Calibration, criticism: Criticism) -> Table:
 
 def error_table(calibration: Calibration) -> Table:
     """Return the errors in free run: a row for each part of the data, one for the folds and one for the ARX fit."""
-    period_h = calibration.model.period_s / 3600.0
     arx_rms = f"{calibration.arx_rms_um:.2f}" if math.isfinite(calibration.arx_rms_um) else "unstable"
     rows = [
         [
             part.name,
             part.role,
-            f"{part.y_um.size * period_h:.1f}",
+            f"{part.hours:.1f}",
             f"{part.model.fit_pct:.2f}",
             f"{part.model.rms_um:.2f}",
             f"{part.model.peak_to_peak_um:.2f}",

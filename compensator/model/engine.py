@@ -72,6 +72,11 @@ class Estimate:
     y_std_um: float
     y_rate_um_per_min: float
 
+    @property
+    def contributions_um(self) -> tuple[float, ...]:
+        """Share of each path and effect, µm, in the order of `Engine.contribution_names`; their sum is `y_um`."""
+        return (self.y_dtf_um, self.y_tdtf_um, *self.y_effects_um)
+
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
@@ -197,6 +202,17 @@ class Engine:
     def has_reference(self) -> bool:
         """Whether the inputs have a reference yet."""
         return not (math.isnan(self._reference.t_q_degc) or math.isnan(self._reference.at_degc))
+
+    @property
+    def contribution_names(self) -> tuple[str, ...]:
+        """Names of what adds to the deformation: the two paths, and each effect with its number and label."""
+        effects = (f"{number} {effect.label}" for number, effect in enumerate(self.model.effects, start=1))
+        return ("DTF", "TDTF", *effects)
+
+    @property
+    def y_noise_std_um(self) -> float:
+        """Standard deviation of y that sensor noise and missing samples cause, µm; a part of `Estimate.y_std_um`."""
+        return math.sqrt(self._observer.y_variance_um2)
 
     def set_reference(self, t_q_degc: float, at_degc: float) -> None:
         """Start at rest, with these temperatures as zero (ignored where the model's inputs are absolute).

@@ -15,6 +15,7 @@ from compensator.diagnose.summary import (
     error_table,
     explanation,
     figures,
+    hiding_lines,
     name,
     parameter_table,
     rivals,
@@ -70,6 +71,8 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
     blocks += [_before_and_after(time, diagnosis), error_table(diagnosis)]
     blocks += [_effect(time, diagnosis, effect) for effect in diagnosis.effects]
     blocks += remainder(found)
+    if hidden := hiding_lines(found):
+        blocks.append(Words(title="What could hide", lines=hidden))
     blocks += advice_blocks(diagnosis)
     blocks += warnings_of(diagnosis.warnings)
     if diagnosis.tried:

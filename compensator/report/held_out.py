@@ -116,6 +116,9 @@ class TimeAxis:
         changes = used[1:][np.diff(block[used]) != 0]
         # Where whole runs are held out, their starts are the edges.
         changes = changes[~np.isin(changes, starts)]
+        if diagnosis.could_hide is not None and not diagnosis.evidence.holds_out_recordings:
+            # Every so many values are held out: there are no blocks of time.
+            changes = changes[:0]
         return cls(
             hours=np.asarray(hours),
             run=run,

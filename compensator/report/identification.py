@@ -153,7 +153,7 @@ def _path_section(view: PathView) -> Block:
 def _correlations(view: ResidualView) -> Block:
     def plot(name: str, stems: Stems, limit: float, note: str = "") -> Figure:
         title, limits = f"{view.name}: {name}", (-limit, limit)
-        axes: dict[str, Any] = {"x_label": "lag, samples", "y_label": "correlation", "height": 3.0}
+        axes: dict[str, Any] = {"x_label": f"lag, {view.lag_unit}", "y_label": "correlation", "height": 3.0}
         return Figure(title=title, stems=(stems,), limits=limits, note=note, **axes)
 
     lags = np.arange(1, view.autocorrelation.size + 1, dtype=np.float64)
@@ -172,6 +172,13 @@ def _probability(p: float) -> str:
 
 
 def _choice(calibration: Calibration) -> Block:
+    by_blocks = "Chosen: the simplest structure whose held-out error is within one standard error of the best."
+    by_information = (
+        "Chosen: the structure with the best information criterion (Akaike's, for few values), as blocks with few "
+        "values differ by chance."
+    )
+    sparse = any(run.has_sparse_y for run in calibration.runs)
+
     def table(title: str, candidates: Sequence[Candidate]) -> Table:
         return Table(
             title=title,
@@ -185,7 +192,7 @@ def _choice(calibration: Calibration) -> Block:
                 ]
                 for c in candidates
             ],
-            note="Chosen: the simplest structure whose held-out error is within one standard error of the best.",
+            note=by_information if sparse else by_blocks,
         )
 
     blocks = [

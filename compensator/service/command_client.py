@@ -13,6 +13,8 @@ import zenoh
 from compensator.certificates import check_files, common_name_of
 from compensator.config import Zenoh
 from compensator.errors import ConfigError, ServiceError, UsageError
+from compensator.events import CommandName
+from compensator.messages import ProbeRequest, encode
 from compensator.service.publisher import SENDER
 from compensator.service.session import (
     ALIVE,
@@ -156,3 +158,35 @@ def ask(
             f"{operator.name or 'this command'}"
         )
     raise NotReached(f"{unreached}: no service with that prefix at {where}; {services_text(alive)}")
+
+
+def send_probe(
+    settings: Zenoh, probe: ProbeRequest, *, timeout_s: float = 10.0, operator: Operator | None = None
+) -> dict[str, Any]:
+    """Send what a touch probe measured to the running service.
+
+    The reply comes at once. It refuses what the service can refuse from what it has published; a probe that passes is
+    compared with the prediction at the next sample, and an event and the recording contain the verdict.
+
+    Parameters
+    ----------
+    settings : Zenoh
+        Settings of the service, as in `ask`.
+    probe : ProbeRequest
+        The measured value.
+    timeout_s : float
+        How long to wait for the reply, s.
+    operator : Operator, optional
+        Sender; derived from the settings by default.
+
+    Returns
+    -------
+    dict
+        `ok`, `text`, and `code`, which is empty or why the probe is refused (`compensator explain` explains it).
+
+    Raises
+    ------
+    NotReached, ServiceError
+        As `ask`. After these errors the probe may be sent again: the service refuses a duplicate.
+    """
+    return ask(settings, CommandName.PROBE, encode(probe), timeout_s=timeout_s, operator=operator)

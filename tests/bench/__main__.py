@@ -8,7 +8,20 @@ python -m tests.bench drawn --help       drawn machines, with options of their o
 import sys
 
 from compensator.blas import in_one_thread
-from tests.bench import audit, diagnosis, drawn, faults, hidden, identification, machines, shop, speed, spindle
+from tests.bench import (
+    audit,
+    diagnosis,
+    drawn,
+    faults,
+    hidden,
+    identification,
+    machines,
+    probe_calibration,
+    probe_naming,
+    shop,
+    speed,
+    spindle,
+)
 from tests.bench.figures import surroundings, table
 
 AREAS = {
@@ -17,6 +30,8 @@ AREAS = {
     "diagnosis": diagnosis.report,
     "machines": machines.report,
     "drawn": drawn.report,
+    "probe_calibration": probe_calibration.report,
+    "probe_naming": probe_naming.report,
     "spindle": spindle.report,
     "hidden": hidden.report,
     "faults": faults.report,

@@ -1,0 +1,64 @@
+"""The probes of a recording are its measured Y where no displacement sensor is; refused ones are not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import compensator as tc
+from compensator.data.runs import is_sparse
+from compensator.recording.reading import recordings
+from tests.service.living import MACHINE
+from tests.service.probed import PROBED, ProbedMachine
+
+
+def read(machine):
+    return tc.read(recordings(machine.recordings, MACHINE))
+
+
+async def test_probes_are_the_measured_y_of_a_recording(tmp_path: Path) -> None:
+    machine = ProbedMachine(tmp_path, noise_um=0.0)
+    machine.each_hour(400, every=30)
+    machine.at_sample[200] = lambda: machine.probe(25.0)  # a chip
+    truth = {}
+    for sample in range(60, 400, 30):
+        machine.at_sample[sample] = lambda: (
+            truth.update({machine.clock.utc_ns(): machine.truth_um()}),
+            machine.probe(),
+        )
+    await machine.run(420)
+    table = read(machine).table
+    known = np.isfinite(table.columns["y_um"])
+    assert known.sum() == len(truth) == machine.codes().count("taken")
+    assert table.columns["y_um"][known] == pytest.approx(list(truth.values()))
+    assert "probe_outlier" in machine.codes()
+    (record,) = read(machine).at_period(60.0).records
+    assert is_sparse(record.columns["y_um"]) and np.isfinite(record.columns["t_q_degc"]).mean() > 0.99
+
+
+async def test_a_control_that_applied_nothing_shows_the_whole_deformation(tmp_path: Path) -> None:
+    """As during a calibration: the service refuses such a probe for its own use, and the recording has it."""
+    config = PROBED.replace(b"measured_max_um = 60.0", b"measured_max_um = 200.0")
+    machine = ProbedMachine(tmp_path, noise_um=0.0, config=config)
+    grown = []
+
+    def probe() -> None:
+        grown.append(machine.truth_um())
+        machine.probe(measured_um=machine.truth_um(), offset_applied_um=0.0)
+
+    for sample in range(60, 150, 30):
+        machine.at_sample[sample] = probe
+    await machine.run(160)
+    assert set(machine.codes()) == {"probe_mismatch"}
+    y = read(machine).table.columns["y_um"]
+    assert y[np.isfinite(y)] == pytest.approx(grown)
+
+
+async def test_only_one_feature_is_used_and_said_so(tmp_path: Path) -> None:
+    machine = ProbedMachine(tmp_path, noise_um=0.0)
+    machine.each_hour(400)
+    machine.at_sample[200] = lambda: machine.probe(feature="bore")
+    await machine.run(420)
+    found = read(machine)
+    assert np.isfinite(found.table.columns["y_um"]).sum() == 6
+    assert [remark.code for remark in found.remarks] == ["features_left_out"]

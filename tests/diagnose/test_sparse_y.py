@@ -1,0 +1,169 @@
+"""Diagnosis from Y measured now and then: named, or undecided with what would decide; never a false all-clear."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import compensator as tc
+from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.hiding import hiding
+from compensator.diagnose.likelihood import Likelihood, Points, Rest, Whitening
+from compensator.diagnose.search import Search
+from compensator.errors import DataError
+from compensator.model.model_file import load_model
+from tests.diagnose.scenarios import draw, record
+from tests.identify.quill_runs import runs_from
+
+QUILL = load_model("quill")
+STD_UM = 1.5
+
+
+def probed(kind, seed, *, hours=48.0, every=60, std_um=STD_UM, size_um=4.0):
+    """Two days with an effect, Y once an hour."""
+    columns, true, _ = record([draw(kind, seed, size_um)], 1000 + seed, hours)
+    y, at = np.full(true.size, np.nan), np.arange(every, true.size, every)
+    y[at] = true[at] + np.random.default_rng([seed, 5]).normal(0.0, std_um, at.size)
+    return {"t_s": np.arange(true.size) * 60.0} | columns | {"y_um": y}
+
+
+def runs(columns, std_um=STD_UM):
+    return [
+        dataclasses.replace(run, y_std_um=std_um) for run in runs_from({k: v for k, v in columns.items() if k != "t_s"})
+    ]
+
+
+@pytest.fixture(scope="module")
+def quiet():
+    return tc.diagnose("quill", probed("none", 1), y_std_um=STD_UM)
+
+
+@pytest.fixture(scope="module")
+def gain():
+    return tc.diagnose("quill", probed("gain DTF", 1), y_std_um=STD_UM)
+
+
+def test_the_noise_is_asked_for_and_nothing_is_called_adequate_without_it():
+    with pytest.raises(DataError, match=r"47 value\(s\) in 2880 samples.*--y-std UM"):
+        tc.diagnose("quill", probed("gain DTF", 1))
+    with pytest.raises(DataError, match="y_um has 7 values, expected at least 12"):
+        tc.diagnose("quill", probed("none", 1, every=360), y_std_um=STD_UM)
+
+
+def test_no_effect_is_adequate_with_how_much_could_hide(quiet):
+    found = quiet.to_dict()
+    assert (found["verdict"], found["effects"]) == ("adequate", [])
+    hides = found["could_hide"]
+    assert (hides["values"], hides["every_min"], hides["too_much"]) == (47, 60.0, False)
+    sizes = [one["size_um"] for one in hides["what"]]
+    assert sizes == sorted(sizes, reverse=True)
+    assert 0.0 < sizes[0] <= hides["matters_um"]
+    assert "could act without being seen" in quiet.summary()
+    assert "What could hide" in quiet._repr_html_() or "What could hide" in quiet.summary()
+
+
+def test_the_page_says_how_much_could_hide(quiet, tmp_path):
+    quiet.page(tmp_path / "page.html")
+    assert "What could hide" in (tmp_path / "page.html").read_text()
+
+
+def test_a_gain_is_named_from_47_hourly_probes(gain):
+    effect = gain.to_dict()["effects"][0]
+    assert (effect["kind"], effect["path"]) == ("gain", "DTF")
+    assert len(gain.effects) == 1
+    assert gain.verdict == "explained"
+    assert gain.model.effects  # deployed: blocks of 16 values do not contradict by chance
+
+
+def test_tests_are_counted_in_probes(gain):
+    tests = [test for rival in gain.effects[0].rivals if (test := rival.test)]
+    assert tests
+    for test in tests:
+        assert test.probes == int(np.ceil(test.hours * 60.0 / test.every_min))
+        assert f"{test.probes} more probes" in test.sentence
+    assert gain.to_dict()["advice"]["tests"][0]["probes"] == tests[0].probes
+
+
+@pytest.mark.parametrize("kind", ["drift", "step", "input", "gain TDTF", "late path"])
+def test_effects_are_named_beside_a_rest_that_walks(kind):
+    search = Search(evidence_of(QUILL, runs(probed(kind, 1))))
+    assert [term.hypothesis.place for term in search.run().fit.terms] == [draw(kind, 1, 4.0).place]
+
+
+@pytest.mark.parametrize("kind", ["unobserved", "periodic"])
+def test_what_comes_and_goes_between_two_probes_is_no_all_clear(kind):
+    found = tc.diagnose("quill", probed(kind, 1), y_std_um=STD_UM).to_dict()
+    assert found["verdict"] == "unexplained"
+    assert found["effects"] == []
+    assert found["advice"]["tests"][0]["probes"] > 0
+
+
+def test_values_that_could_not_show_what_matters_are_no_all_clear():
+    why = tc.diagnose("quill", probed("none", 1, every=210), y_std_um=STD_UM)
+    found = why.to_dict()
+    assert found["verdict"] == "unexplained"
+    assert found["could_hide"]["too_much"]
+    assert found["could_hide"]["values_needed"] > found["could_hide"]["values"]
+    assert "do not say whether the model is adequate" in why.summary()
+    assert "lacks an effect" not in why.summary()
+
+
+def test_a_size_that_could_hide_is_one_that_is_just_named():
+    """Twice that size is named; a quarter of it is not."""
+    columns = probed("none", 3)
+    search = Search(evidence_of(QUILL, runs(columns)))
+    size = next(
+        one.size_um for one in hiding(search.run(), search.price).what if (one.kind, one.path) == ("gain", "DTF")
+    )
+    share = np.concatenate([r.share("DTF") for r in search.evidence.signals])
+    for times, named in ((2.0, [("gain", "DTF", "")]), (0.25, [])):
+        acted = columns | {"y_um": columns["y_um"] + times * size / np.ptp(share) * share}
+        terms = Search(evidence_of(QUILL, runs(acted))).run().fit.terms
+        assert [term.hypothesis.place for term in terms] == named
+
+
+def test_a_stated_noise_that_is_too_small_is_no_all_clear_and_a_large_one_hides_more():
+    columns = probed("none", 2)
+    assert tc.diagnose("quill", columns, y_std_um=0.5).verdict != "adequate"
+    sizes = []
+    for std_um in (1.5, 3.0):
+        search = Search(evidence_of(QUILL, runs(columns, std_um)))
+        sizes.append(hiding(search.run(), search.price).what[0].size_um)
+    assert sizes[1] > 1.4 * sizes[0]
+
+
+def test_a_value_is_a_point_and_the_rest_decays_by_the_time_between():
+    """Against the covariance written out: irregular times, an Ornstein–Uhlenbeck rest, white noise."""
+    columns = probed("none", 1)
+    keep = np.flatnonzero(np.isfinite(columns["y_um"]))[[0, 1, 2, 5, 6, 11, 12, 13, 20, 21, 22, 30, 31, 44]]
+    columns["y_um"] = np.where(np.isin(np.arange(2880), keep), columns["y_um"], np.nan)
+    points = Points(evidence_of(QUILL, runs(columns)))
+    assert points.count == keep.size
+    rest = Rest(1.5, 2.0, 150.0, 0.0, 0.0, 0.0)
+    apart = np.abs(keep[:, None] - keep[None, :])
+    covariance = 1.5**2 * np.eye(keep.size) + 2.0**2 * np.exp(-apart / 150.0)
+    y = points.residual
+    white = Whitening(points, rest)
+    assert float(np.sum(white.of(y[:, None]) ** 2)) == pytest.approx(float(y @ np.linalg.solve(covariance, y)))
+    assert white.log_det == pytest.approx(float(np.linalg.slogdet(covariance)[1]))
+
+
+def test_points_do_not_grow_with_the_samples_between_two_probes():
+    week = Points(evidence_of(QUILL, runs(probed("none", 1, hours=96.0))))
+    assert week.used.size == week.count == 95
+    assert Likelihood(week, week.typical_rest()).target.size < 200
+
+
+def test_dense_data_say_nothing_of_hiding_and_no_probes():
+    columns, _, _ = record([draw("gain DTF", 1, 4.0)], 1001, 24.0)
+    found = tc.diagnose("quill", {"t_s": np.arange(1440) * 60.0} | columns).to_dict()
+    assert "could_hide" not in found
+    assert all("probes" not in test for test in found["advice"]["tests"])
+
+
+def test_a_model_from_probes_grants_no_error_of_the_size_of_their_noise():
+    """Calibrated with an error of its own of 0.3 µm, diagnosed with probes of 1.5 µm: 0.3 µm it is."""
+    model = dataclasses.replace(QUILL, held_out_rms_um=0.3)
+    evidence = evidence_of(model, runs(probed("none", 1)))
+    assert evidence.noise.own_error_um == pytest.approx(0.3)
+    assert Points(evidence).own_um < 0.5
