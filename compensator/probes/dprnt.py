@@ -166,6 +166,8 @@ def _printed_at(words: dict[str, str]) -> datetime.datetime | None:
     if "D" not in words:
         return None
     date, time = (int(_number(word, words[word])) for word in "DH")
+    if date < 1_000_000:  # some controls have a year of two digits
+        date += 20_000_000
     try:
         return datetime.datetime.strptime(f"{date:08d} {time:06d}", "%Y%m%d %H%M%S")
     except ValueError:
