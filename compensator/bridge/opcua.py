@@ -132,7 +132,9 @@ class Bridge:
 
     async def _cycle(self, nodes: dict[str, tuple[Any, ua.VariantType]]) -> None:
         node, kind = nodes["offset_node"]
-        may_move = self.register.check(monotonic_s(), float(await node.read_value()))
+        found = float(await node.read_value())
+        self._receiver.record(found * self._settings.sign * self._settings.unit_um)
+        may_move = self.register.check(monotonic_s(), found)
         enabled = "enable_node" not in nodes or bool(await nodes["enable_node"][0].read_value())
         if may_move and enabled:
             self._receiver.follower.follow()
