@@ -8,6 +8,7 @@ import logging
 from pathlib import Path
 
 import msgspec
+import zenoh
 
 from compensator.commands import Answer
 from compensator.commands.stopping import on_stop
@@ -17,7 +18,7 @@ from compensator.messages import SCHEMA, ProbeRequest
 from compensator.probes.probe import NotSent, Probe, Reply
 from compensator.probes.program import serve
 from compensator.probes.settings import ProbeSettings, Service, load_probes
-from compensator.service.command_client import Operator, operator_of_file, send_probe
+from compensator.service.command_client import operator_here, operator_of_file, send_probe
 
 log = logging.getLogger("compensator")
 
@@ -29,6 +30,8 @@ class CommandSink:
     ----------
     service : Service
         Prefix, addresses or certificates.
+    source : str
+        File, for messages.
 
     Raises
     ------
@@ -36,16 +39,18 @@ class CommandSink:
         If the Zenoh configuration cannot be used.
     """
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Service, source: str) -> None:
         self._timeout_s = service.timeout_s
-        self._operator: Operator | None = None
-        if service.zenoh_config:
-            self._operator = operator_of_file(Path(service.zenoh_config))
+        table = {"prefix": service.prefix, "connect": list(service.connect)}
         try:
-            table = {"prefix": service.prefix, "connect": list(service.connect)}
             self._zenoh = msgspec.convert(table, Zenoh)
-        except msgspec.ValidationError as error:
-            raise ConfigError(f"probes.prefix = {service.prefix!r}, connect = {service.connect}: {error}") from error
+            config = service.zenoh_config
+            self._operator = operator_of_file(Path(config)) if config else operator_here(self._zenoh)
+        except (msgspec.ValidationError, zenoh.ZError) as error:
+            raise ConfigError(
+                f"{source}: probes.prefix = {service.prefix!r}, connect = {list(service.connect)}: expected names "
+                f"separated by / and addresses such as 'tcp/127.0.0.1:7447'"
+            ) from error
 
     def send(self, probe: Probe) -> Reply:
         """Send a probe and wait for the answer.
@@ -76,7 +81,7 @@ class CommandSink:
 def run(arguments: argparse.Namespace) -> Answer | None:
     """Run the command."""
     settings = load_probes(arguments.config)
-    sink = CommandSink(settings.service)
+    sink = CommandSink(settings.service, arguments.config)
     if arguments.check:
         return _checked(arguments.config, settings)
     asyncio.run(_serve(settings, sink))
@@ -86,7 +91,7 @@ def run(arguments: argparse.Namespace) -> Answer | None:
 
 def _checked(config: str, settings: ProbeSettings) -> Answer:
     sources = [
-        *(f"{folder.path}/{folder.pattern}" for folder in settings.folders),
+        *(f"{one.path}/{one.pattern}, sign {one.sign:+d} ({one.sign_checked})" for one in settings.folders),
         *(f"{dprnt.name}, sign {dprnt.sign:+d} ({dprnt.sign_checked})" for dprnt in settings.dprnt),
         *(f"{file.file}, sign {file.sign:+d} ({file.sign_checked})" for file in settings.linuxcnc),
     ]

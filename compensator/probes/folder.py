@@ -14,7 +14,7 @@ from compensator.codes import ProbeSourceRemark, Remark
 from compensator.errors import ConfigError, UsageError
 from compensator.probes.probe import Probe
 from compensator.probes.sender import Outcome, Report, pause
-from compensator.probes.settings import Folder
+from compensator.probes.settings import Folder, convention
 from compensator.probes.table import BadLine, Row, columns, row
 
 #: Longest file, bytes; 100 000 lines.
@@ -203,8 +203,19 @@ class WatchedFolder:
             self._refuse(path, ProbeSourceRemark.LINE_OFFSET_UNKNOWN, text, "no offset_applied_um")
             return False
         self._pending[line.identity] = line.values
-        self._submit(_probe(line, offset_um), path.name, lambda _: self._done(line))
+        self._submit(self._probe(line, offset_um), path.name, lambda _: self._done(line))
         return False
+
+    def _probe(self, line: Row, offset_um: float) -> Probe:
+        return Probe(
+            time_utc_ns=line.time_utc_ns,
+            measured_um=convention(self._settings).measured_um(line.measured_um, offset_um),
+            offset_applied_um=offset_um,
+            feature=line.feature,
+            tool=line.tool,
+            std_um=line.std_um,
+            stopped_s=line.stopped_s,
+        )
 
     def _done(self, line: Row) -> None:
         """Keep a line as handled; until this is on disk, a restart sends it again, and the service refuses it twice."""
@@ -230,15 +241,3 @@ class WatchedFolder:
                 self._reported.clear()
             self._reported.add((path, words))
             self._report(words)
-
-
-def _probe(line: Row, offset_um: float) -> Probe:
-    return Probe(
-        time_utc_ns=line.time_utc_ns,
-        measured_um=line.measured_um,
-        offset_applied_um=offset_um,
-        feature=line.feature,
-        tool=line.tool,
-        std_um=line.std_um,
-        stopped_s=line.stopped_s,
-    )

@@ -52,9 +52,22 @@ class Service:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Folder:
-    """`[[folder]]`: CSV files; `pattern` selects them, `poll_s` is the interval of looking, s."""
+    """`[[folder]]`: CSV files.
+
+    Parameters
+    ----------
+    path, pattern : str
+        The folder, and which files in it.
+    sign, includes_offset, sign_checked
+        As in `Dprnt`, for the column `measured_um`.
+    poll_s : float
+        Interval of looking, s.
+    """
 
     path: str
+    sign: int
+    sign_checked: str
+    includes_offset: bool = False
     pattern: str = "*.csv"
     poll_s: float = 2.0
 
@@ -225,7 +238,9 @@ def _service(path: Path, table: Mapping[str, Any]) -> Service:
 
 
 def _folder(path: Path, table: Mapping[str, Any]) -> Folder:
+    _require_sign(f"{path}: folder", table)
     folder = read_table(Folder, table, source=str(path), name="folder")
+    _check_sign(f"{path}: folder", folder)
     _within(folder, {"poll_s": (0.02, 600.0)}, f"{path}: folder")
     if not folder.pattern or "/" in folder.pattern:
         raise ReceiverError(f"{path}: folder.pattern = {folder.pattern!r}: expected a name such as '*.csv'")

@@ -37,7 +37,7 @@ class Row(NamedTuple):
     time_utc_ns : int
         When it was measured, ns since 1970 UTC.
     measured_um : float
-        As in the contract, µm.
+        Where the feature was found minus where it belongs, in the direction of the file, µm.
     offset_applied_um, std_um, stopped_s : float or None
         None where empty.
     feature, tool : str

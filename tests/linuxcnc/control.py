@@ -163,7 +163,14 @@ def linuxcnc(folder: Path, settings: str, *, hal: str = "", **ini: str) -> Itera
     """
     folder.mkdir(mode=0o777, exist_ok=True)
     folder.chmod(0o777)
-    for name in ("machine.hal", "thermal.hal", "thermal_offset.py", "reconcile.py", "thermal_probe.ngc"):
+    for name in (
+        "machine.hal",
+        "thermal.hal",
+        "thermal_offset.py",
+        "reconcile.py",
+        "thermal_probe.ngc",
+        "thermal_probe.hal",
+    ):
         shutil.copy(SHIPPED / name, folder / name)
     text = (SHIPPED / "machine.ini").read_text(encoding="utf-8")
     panel = folder / "panel.py"

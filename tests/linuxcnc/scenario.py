@@ -384,6 +384,7 @@ def service(folder: Path) -> None:
 #: Where the feature is, mm, and a switch that closes where the tip (the slide and the deformation) touches it.
 FEATURE_MM = 50.0
 TOUCH = """
+source thermal_probe.hal
 loadrt sum2
 addf sum2.0 servo-thread
 loadrt comp
@@ -412,9 +413,17 @@ sign_checked = "the simulated machine, two offsets"
 """
 
 
+def probing_settings() -> str:
+    return changed(settings(), {"# applied_file": "applied_file"})
+
+
 def probing(folder: Path) -> None:
     """The cycle probes where it is wanted; the value shows the deformation, whatever the offset."""
-    with router(PORT), ScriptedService(PORT) as service, linuxcnc(folder, settings(), hal=TOUCH) as (control, _):
+    with (
+        router(PORT),
+        ScriptedService(PORT) as service,
+        linuxcnc(folder, probing_settings(), hal=TOUCH) as (control, _),
+    ):
         bench = Bench(control)
         bench.on()
         control.do("home")

@@ -18,6 +18,7 @@ from compensator.probes.probe import Probe
 from compensator.probes.sender import Outcome
 from compensator.probes.settings import Folder
 from compensator.probes.table import BadLine, columns, row
+from tests.probes.helpers import touch_um
 
 HEADER = "time_utc,measured_um,offset_applied_um,feature,tool,std_um,stopped_s\n"
 T0 = datetime.datetime(2026, 3, 2, 10, 0, tzinfo=datetime.UTC)
@@ -42,11 +43,14 @@ class Bench:
         self.answers = True
         self.minute = 2.0
         self.applied_um = applied_um
+        self.sign, self.includes_offset = 1, False
         self.restart()
 
     def restart(self) -> None:
         self.watched = WatchedFolder(
-            Folder(path=str(self.folder)),
+            Folder(
+                path=str(self.folder), sign=self.sign, sign_checked="simulated", includes_offset=self.includes_offset
+            ),
             Handled(self.state, 90000.0),
             self._submit,
             lambda _: self.applied_um,
@@ -162,6 +166,15 @@ def test_the_offset_from_the_receivers_record(tmp_path: Path) -> None:
     bench = Bench(tmp_path, applied_um=4.0)
     bench.write(HEADER + line(1, offset=""), "b.csv")
     assert bench.probes[-1].offset_applied_um == 4.0
+
+
+@pytest.mark.parametrize("includes_offset", [False, True])
+def test_the_deformation_comes_out_by_geometry(tmp_path: Path, includes_offset: bool) -> None:
+    bench = Bench(tmp_path)
+    bench.sign, bench.includes_offset = -1, includes_offset
+    bench.restart()
+    bench.write(HEADER + line(0, touch_um(y_um=15.0, offset_um=-12.3, includes_offset=includes_offset)))
+    assert bench.probes[0].measured_um - bench.probes[0].offset_applied_um == pytest.approx(15.0)
 
 
 def test_folders_and_files_that_are_not_there(tmp_path: Path) -> None:

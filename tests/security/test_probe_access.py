@@ -22,7 +22,7 @@ STEM = "probe-probe-07"
 
 def sink(shop: Shop, prefix: str = PREFIX, stem: str = STEM) -> CommandSink:
     config = str(shop.client_file(stem))
-    return CommandSink(Service(prefix=prefix, send_within_s=900.0, zenoh_config=config, timeout_s=3.0))
+    return CommandSink(Service(prefix=prefix, send_within_s=900.0, zenoh_config=config, timeout_s=3.0), "probes.toml")
 
 
 def test_it_sends_probes_in_its_own_name(plant: Plant, shop: Shop) -> None:
