@@ -62,6 +62,7 @@ class ScriptedService:
         self._status_queryable = self.session.declare_queryable(self._status_key, self._answer_status)
         #: Payloads of the command `probe`.
         self.probes: list[dict[str, Any]] = []
+        self.probe_answer: dict[str, Any] = {"ok": True, "text": "heard", "code": ""}
         self._commands = self.session.declare_queryable(f"{prefix}/thermal/command/probe/*", self._answer_probe)
         self._token = self.session.liveliness().declare_token(f"{prefix}/thermal/alive")
 
@@ -85,7 +86,7 @@ class ScriptedService:
     def _answer_probe(self, query: Any) -> None:
         with query:
             self.probes.append(json.loads(query.payload.to_bytes()))
-            query.reply(query.key_expr, json.dumps({"ok": True, "text": "heard", "code": ""}))
+            query.reply(query.key_expr, json.dumps(self.probe_answer))
 
     def put_status(self, *, heard: bool = True, **changes: Any) -> None:
         """Publish a status with these keys."""
