@@ -191,6 +191,11 @@ class Reason(Code):
         "The disk is slow: the offset was published before its sample was on disk; the sample is written later.",
         "Check the disk: its health, other programs that write to it, a network share.",
     )
+    CORRECTION_LIMITED = (
+        "correction_limited",
+        "The correction that the probes ask for has reached its limit, probe.largest_um; the rest is not applied.",
+        "Check probe, feature and sign; if they are right, run `compensator diagnose`: the model lacks something.",
+    )
     INTERNAL_ERROR = (
         "internal_error",
         "An internal error occurred in the service; the offset is held.",
@@ -206,6 +211,94 @@ SUFFIXES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         Reason.IMPLAUSIBLE: ("t_q_degc", "at_degc", "y_um", "model"),
     }
 )
+
+
+class ProbeCode(Code):
+    """Why a probe is refused, a remark on one that is taken, and why another one is wanted."""
+
+    MALFORMED = (
+        "probe_malformed",
+        "The payload of the command is not a probe.",
+        "Compare it with the command in deploy/OPERATING.md; the reply names key and value.",
+    )
+    NOT_CONFIGURED = (
+        "probe_not_configured",
+        "The configuration has no table [probe], so probes are not used.",
+        "Add [probe] to the configuration (deploy/CONFIGURATION.md).",
+    )
+    TOO_MANY = (
+        "probe_too_many",
+        "More probes arrived between two samples than a machine can measure.",
+        "Find the program that sends them; a probe is sent once.",
+    )
+    AXIS = "probe_axis", "The probe is of another axis than Y.", "Send probes of Y only."
+    OUT_OF_BOUNDS = (
+        "probe_out_of_bounds",
+        "The measured value, its standard deviation or the applied offset is outside what is possible.",
+        "Check unit, sign, feature and tool length; then probe again.",
+    )
+    FUTURE = (
+        "probe_future",
+        "The probe is from the future.",
+        "Check the time service (NTP) of the control and of this computer.",
+    )
+    TOO_OLD = (
+        "probe_too_old",
+        "The probe arrived later than probe.oldest_min.",
+        "Send probes at once; check the clocks of the control and of this computer.",
+    )
+    DUPLICATE = ("probe_duplicate", "The same probe was received before.", "Nothing, if it was sent again on purpose.")
+    BEFORE_ZERO = (
+        "probe_before_zero",
+        "The probe was measured before the last zero, so it belongs to another reference.",
+        "Probe again.",
+    )
+    NO_OFFSET = (
+        "probe_no_offset",
+        "No offset had been published at the time of the probe.",
+        "Wait for the first zero; then probe again.",
+    )
+    TIME_UNKNOWN = (
+        "probe_time_unknown",
+        "The service has no prediction for the time of the probe: it was not running, samples are missing, or the "
+        "clock was set.",
+        "Probe again.",
+    )
+    DURING_HOLD = (
+        "probe_during_hold",
+        "The offset was held at the time of the probe.",
+        "Correct the cause of the hold; then probe again.",
+    )
+    MISMATCH = (
+        "probe_mismatch",
+        "The control had applied another offset at the time of the probe than was published.",
+        "Check that the control follows the offset, its sign and its unit, and the clocks.",
+    )
+    TOO_MANY_FEATURES = (
+        "probe_features",
+        "Probes of more features than the service distinguishes.",
+        "Use few features, always with the same names; a zero forgets them.",
+    )
+    OUTLIER = (
+        "probe_outlier",
+        "The probe does not fit the prediction: a chip, or another feature.",
+        "Clean the feature and probe again; if it is right, two more that agree with it are believed.",
+    )
+    BELIEVED = (
+        "probe_believed",
+        "The probe is taken against earlier ones: it agrees with refused ones, or the last one taken was wrong.",
+        "Find out what moved: a clamping, a collision, the model (`compensator diagnose`).",
+    )
+    FIRST = (
+        "probe_first",
+        "No probe has been taken since the zero, so nothing shows how far the model is off.",
+        "Probe once before the next tight feature.",
+    )
+    DEVIATION = (
+        "probe_deviation",
+        "The standard deviation exceeds the tolerance, probe.tolerance_um.",
+        "Probe before the next tight feature; other features need none.",
+    )
 
 
 class SampleQuality(Code):
@@ -399,6 +492,16 @@ class DataRemark(Code):
         "wild_readings",
         "Single readings far from their neighbours were left out.",
         "Check the sensor for loose contacts and noise.",
+    )
+    Y_REFUSED = (
+        "y_refused",
+        "Measured values of Y are further from the prediction than their noise allows and did not correct it.",
+        "Check these measurements: a chip on the feature, or another feature.",
+    )
+    Y_BELIEVED = (
+        "y_believed",
+        "Measured values of Y were far from the prediction and agreed with each other; the prediction follows them.",
+        "Find out what moved: a collision, a new clamping, or another feature.",
     )
 
 
@@ -745,7 +848,7 @@ class AuditFinding(Code):
 
 #: All domains; each code occurs in only one of them.
 DOMAINS: tuple[type[Code], ...] = (
-    *(State, Reason, SampleQuality, ModelWarning, ServiceWarning, BridgeTrouble, ProbeSourceRemark),
+    *(State, Reason, ProbeCode, SampleQuality, ModelWarning, ServiceWarning, BridgeTrouble, ProbeSourceRemark),
     *(DataRemark, WatchWarning, AuditRemark, RecordingEnd, AuditFinding),
 )
 

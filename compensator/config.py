@@ -146,6 +146,24 @@ class Plausibility(_Table, frozen=True, kw_only=True):
     rest: Rest | None = None
 
 
+class Probe(_Table, frozen=True, kw_only=True):
+    """`[probe]`: Y measured now and then by a touch probe; without this table no probe is used.
+
+    `std_um`: standard deviation of one measured value, unless the probe states its own. `measured_max_um`: a measured
+    value beyond this is impossible. `largest_um`: limit of the correction. `tolerance_um`: a probe is wanted once the
+    standard deviation exceeds this; without it only the first one and the one after a refused one are.
+    `oldest_min`: how late a probe may arrive. `match_um`: largest difference between the offset that the control had
+    applied and the published one.
+    """
+
+    std_um: Annotated[float, Meta(ge=0.01, le=100)]
+    measured_max_um: Positive
+    largest_um: Positive
+    tolerance_um: Positive | None = None
+    oldest_min: Annotated[float, Meta(ge=1, le=240)] = 30.0
+    match_um: Positive = 1.0
+
+
 class Zenoh(_Table, frozen=True, kw_only=True):
     """`[zenoh]`: where the offset is published. The service listens only on endpoints that are given here.
 
@@ -215,6 +233,7 @@ class Config(_Table, frozen=True, kw_only=True):
     sampling: Sampling = Sampling()
     restart: Restart = Restart()
     plausibility: Plausibility | None = None
+    probe: Probe | None = None
 
 
 class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -340,6 +359,9 @@ def _check(config: Config) -> None:
         raise ConfigError(
             f"plausibility.rest.channel = {rest.channel!r}: no such channel, expected one of: {', '.join(names)}"
         )
+    probe, offset_max = config.probe, config.limits.offset_max_um
+    if probe is not None and probe.largest_um > offset_max:
+        raise ConfigError(f"probe.largest_um = {probe.largest_um:g}, expected at most offset_max_um = {offset_max:g}")
     for key in ("t_q_degc", "at_degc"):
         _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key))
     _check_zenoh(config.zenoh)

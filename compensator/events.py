@@ -114,6 +114,34 @@ class PauseData(_Data, frozen=True, kw_only=True):
     y_std_um: float | None
 
 
+class ProbeData(_Data, frozen=True, kw_only=True):
+    """A probe that was taken or refused; the recording contains all of it (`/probe`).
+
+    Parameters
+    ----------
+    taken : bool
+        Whether it corrects the prediction.
+    code : str
+        Why it was refused, or a remark.
+    probe_utc_ns : int
+        When it was measured, ns since 1970 UTC.
+    feature : str
+        The feature.
+    innovation_um, innovation_std_um : float, optional
+        Measured less predicted deformation, and the standard deviation expected of it, µm.
+    by : str
+        The sender.
+    """
+
+    taken: bool
+    code: str = ""
+    probe_utc_ns: int
+    feature: str = ""
+    innovation_um: float | None = None
+    innovation_std_um: float | None = None
+    by: str = ""
+
+
 class RecordingCode(StrEnum):
     """Faults and actions of the recording."""
 

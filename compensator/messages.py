@@ -13,7 +13,7 @@ from importlib import resources
 from typing import Annotated, Any
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from compensator.codes import SampleQuality, State
 
@@ -182,6 +182,17 @@ class Status(Message, frozen=True, kw_only=True):
         `ok` or the last error of each device.
     effects : list of str
         Names of the model's effects, in the order of `y_effects_um`.
+    probe_wanted : bool, optional
+        Whether a probe is wanted now; this and the following only with `[probe]` in the configuration.
+    wanted_by_ns : int or None
+        When the standard deviation exceeds the tolerance, ns since 1970 UTC; the time of the message if a probe is
+        wanted already, null if none will be wanted within a day or there is no tolerance.
+    wanted_why : str
+        Code of why one is wanted (`compensator.codes.ProbeCode`), empty if none is.
+    wanted_std_um : float or None
+        The standard deviation that asks for it, µm.
+    wanted_tolerance_um : float or None
+        The tolerance with which it is compared, µm.
     """
 
     state: State
@@ -194,6 +205,11 @@ class Status(Message, frozen=True, kw_only=True):
     recording: str
     devices: dict[str, str]
     effects: list[str] = []
+    probe_wanted: bool | UnsetType = UNSET
+    wanted_by_ns: int | UnsetType | None = UNSET
+    wanted_why: str | UnsetType = UNSET
+    wanted_std_um: float | UnsetType | None = UNSET
+    wanted_tolerance_um: float | UnsetType | None = UNSET
 
 
 _Label = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
@@ -225,7 +241,7 @@ class ProbeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     """
 
     schema: int
-    time_utc_ns: Annotated[int, Meta(ge=0, lt=2**63)]
+    time_utc_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)]
     axis: _Label
     measured_um: float
     offset_applied_um: float
@@ -233,6 +249,57 @@ class ProbeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     feature: _Label = ""
     tool: _Label = ""
     stopped_s: Annotated[float, Meta(ge=0)] | None = None
+
+
+class Probe(Message, frozen=True, kw_only=True):
+    """A probe as it was received, and what was made of it, `/probe`; only with `[probe]` in the configuration.
+
+    Parameters
+    ----------
+    seq : int
+        Number of the sample with which it was decided; the record is before that `/sample`.
+    time_utc_ns, axis, measured_um, std_um, offset_applied_um, feature, tool, stopped_s
+        As received, see `ProbeRequest`; null or empty where the payload could not be read, with the time of arrival.
+    received_utc_ns : int
+        When it arrived, ns since 1970 UTC.
+    by, by_proof : str
+        The sender, see the event of a command.
+    taken : bool
+        Whether it corrects the prediction.
+    code : str
+        Why it was refused, or a remark; empty if there is none (`compensator.codes.ProbeCode`).
+    text : str
+        The verdict in one line.
+    deformation_um : float or None
+        Deformation that it shows: measured − applied offset, µm.
+    predicted_um : float or None
+        Deformation by the model alone at that time, µm; null if it was refused before it was compared.
+    innovation_um, innovation_std_um : float or None
+        Deformation less the corrected prediction, and the standard deviation expected of it, µm.
+    """
+
+    axis: str
+    measured_um: float | None
+    std_um: float | None
+    offset_applied_um: float | None
+    feature: str
+    tool: str
+    stopped_s: float | None
+    received_utc_ns: int
+    by: str
+    by_proof: str
+    taken: bool
+    code: str
+    text: str
+    deformation_um: float | None
+    predicted_um: float | None
+    innovation_um: float | None
+    innovation_std_um: float | None
+
+    @property
+    def is_read(self) -> bool:
+        """Whether the payload was a probe."""
+        return self.measured_um is not None
 
 
 class ChainPart(msgspec.Struct, frozen=True, kw_only=True):
@@ -322,6 +389,7 @@ MESSAGES: Mapping[str, type[msgspec.Struct]] = {
     "offset": Offset,
     "event": Event,
     "status": Status,
+    "probe": Probe,
     "chain": Chain,
     "seal": Seal,
 }

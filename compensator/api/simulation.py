@@ -1,8 +1,9 @@
-"""`tc.simulate`: a model in free run over measured data."""
+"""`tc.simulate`: a model over measured data, free or corrected by measured Y."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +12,14 @@ from compensator.api.files import ModelLike, model_of
 from compensator.api.simulation_result import SimulationResult
 from compensator.arrays import Vector
 from compensator.blas import one_thread
-from compensator.codes import Reason, Remark, SampleQuality
-from compensator.data.measurement import DataLike, measurements
+from compensator.codes import DataRemark, Reason, Remark, SampleQuality
+from compensator.data.measurement import DataLike, Measurement, measurements
 from compensator.data.record import SampledRecord, require
+from compensator.data.runs import is_sparse, noise_std
 from compensator.data.screening import DEAD_SAMPLES, check_scale
+from compensator.errors import UsageError
+from compensator.model.corrected_simulation import COLUMNS as CORRECTED_COLUMNS
+from compensator.model.corrected_simulation import CorrectedRun, compared, simulate_corrected
 from compensator.model.simulation import COLUMNS, Scores, scores
 from compensator.model.simulation import simulate as run_free
 from compensator.model.thermal_model import ThermalModel
@@ -22,12 +27,22 @@ from compensator.model.thermal_model import ThermalModel
 if TYPE_CHECKING:
     from compensator.api.simulation_frame import SimulationFrame
 
+#: Measured Y without any noise, as of a simulated sensor, is taken to have this standard deviation, µm.
+_LEAST_STD_UM = 0.01
+#: Number of rows that a remark lists.
+_SHOWN = 3
+
 
 @one_thread
 def simulate(
-    model: ModelLike, data: DataLike, *, columns: Mapping[str, str] | None = None
+    model: ModelLike,
+    data: DataLike,
+    *,
+    columns: Mapping[str, str] | None = None,
+    correct: bool = False,
+    y_std_um: float | None = None,
 ) -> SimulationResult | SimulationFrame:
-    """Run a model over measured data; measured Y is never fed back.
+    """Run a model over measured data, free or corrected by measured Y.
 
     Parameters
     ----------
@@ -37,6 +52,11 @@ def simulate(
         Data with T_Q and AT.
     columns : mapping of str to str, optional
         Column name for each role that has another name.
+    correct : bool
+        Whether each row's `y_pred_um` uses the measured Y of earlier rows, as the service uses probes; by default
+        measured Y is never fed back.
+    y_std_um : float, optional
+        Standard deviation of one measured value of Y, µm; by default what neighbouring values show.
 
     Returns
     -------
@@ -47,24 +67,37 @@ def simulate(
     Raises
     ------
     CompensatorError
-        If model or data cannot be read.
+        If model or data cannot be read, or Y is measured too sparsely to show its noise and `y_std_um` is missing.
     """
     what = model_of(model)
+    if y_std_um is not None and not 0.0 < y_std_um < math.inf:
+        raise UsageError(f"--y-std {y_std_um:g}: expected the standard deviation of one measured Y, above 0 µm")
     measured = measurements(data, "data", columns, needed=True)
     remarks: list[Remark] = []
-    parts = []
+    parts: list[dict[str, Vector]] = []
+    corrected: list[CorrectedRun] = []
     for one in measured:
         gridded = one.at_period(what.period_s)
         remarks += gridded.remarks
         for record in gridded.records:
             require(one.name, record, ("t_q_degc", "at_degc"))
             remarks += doubts(one.name, what, record)
-            parts.append(run_free(what, record, source=one.name))
+            if not correct:
+                parts.append(run_free(what, record, source=one.name))
+                continue
+            require(one.name, record, ("y_um",))
+            run = simulate_corrected(what, record, _y_std(one, record, what.period_s, y_std_um), source=one.name)
+            remarks += _remarks(one.name, run)
+            corrected.append(run)
+            parts.append(run.table)
+    order = CORRECTED_COLUMNS if correct else COLUMNS
+    methods = _methods(corrected)
     result = SimulationResult(
-        table={name: _joined(parts, name) for name in COLUMNS if any(name in part for part in parts)},
+        table={name: _joined(parts, name) for name in order if any(name in part for part in parts)},
         records=len(parts),
         remarks=tuple(remarks),
-        scores=_scores(parts),
+        scores=methods[-1][1] if correct else _scores(parts),
+        beside=dict(methods[:-1]),
     )
     if not any(one.in_frame for one in measured):
         return result
@@ -83,6 +116,53 @@ def _scores(parts: list[dict[str, Vector]]) -> Scores | None:
     if not any("y_um" in part for part in parts):
         return None
     return scores(_joined(parts, "y_um"), _joined(parts, "y_pred_um"))
+
+
+def _y_std(one: Measurement, record: SampledRecord, period_s: float, given: float | None) -> Vector:
+    """Return the standard deviation of the measured Y of each sample: of the mean of the values in it, µm.
+
+    Raises
+    ------
+    UsageError
+        If it is not given and Y has no neighbouring values that show it.
+    """
+    y = record.columns["y_um"]
+    known = np.isfinite(y)
+    if given is None:
+        if is_sparse(y) or not known.any():
+            raise UsageError(
+                f"{one.name}: y_um is measured in {np.sum(known)} of {y.size} samples, too sparsely to show its noise; "
+                "expected --y-std UM (y_std_um), the standard deviation of one measured value"
+            )
+        return np.full(y.size, max(noise_std(y), _LEAST_STD_UM))
+    t_s, values = one.table.t_s - one.table.t_s.min(), one.table.columns["y_um"]
+    inside = np.isfinite(values) & (t_s >= record.t_s[0]) & (t_s < record.t_s[-1] + period_s)
+    return np.full(y.size, given / math.sqrt(max(float(np.sum(inside)) / max(float(np.sum(known)), 1.0), 1.0)))
+
+
+def _remarks(name: str, run: CorrectedRun) -> Iterator[Remark]:
+    """Yield remarks on measured values that did not fit."""
+    t_s, y = run.table["t_s"], run.table["y_um"]
+    for code, rows, words in (
+        (DataRemark.Y_REFUSED, run.refused, "refused"),
+        (DataRemark.Y_BELIEVED, run.believed, "believed together with refused ones"),
+    ):
+        if rows.size:
+            where = ", ".join(f"{value:g}" for value in t_s[rows][:_SHOWN])
+            more = f" and {rows.size - _SHOWN} more" if rows.size > _SHOWN else ""
+            count = f"{rows.size} of {np.sum(np.isfinite(y))} measured y_um"
+            yield Remark(code, f"{name}: {count} {words}, at t_s = {where}{more}.")
+
+
+def _methods(runs: list[CorrectedRun]) -> list[tuple[str, Scores]]:
+    """Return the errors at the measured rows by method; that of the corrected model comes last."""
+    found: dict[str, list[tuple[Vector, Vector]]] = {}
+    for run in runs:
+        for name, pair in compared(run).items():
+            found.setdefault(name, []).append(pair)
+    return [
+        (name, scores(*(np.concatenate(side) for side in zip(*pairs, strict=True)))) for name, pairs in found.items()
+    ]
 
 
 def doubts(source: str, model: ThermalModel, record: SampledRecord) -> list[Remark]:

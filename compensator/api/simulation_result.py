@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
 class SimulationResult(Shown, Mapping[str, Vector]):
-    """Columns of a free run by name, as `compensator simulate` writes them.
+    """Columns of a free or corrected run by name, as `compensator simulate` writes them.
 
     Parameters
     ----------
@@ -33,12 +33,16 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         Remarks on the data, and on doubtful predictions.
     scores : Scores or None
         Fit, rms and peak to peak of the residual, if Y was measured.
+    beside : dict of str to Scores
+        Of a corrected run: the same without compensation, with the last measured Y held, and of the model alone.
+        All are then of the measured rows after the first, each predicted from earlier rows.
     """
 
     table: dict[str, Vector]
     records: int
     remarks: tuple[Remark, ...]
     scores: Scores | None
+    beside: dict[str, Scores] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Vector:
         return self.table[name]
@@ -53,14 +57,20 @@ class SimulationResult(Shown, Mapping[str, Vector]):
         """Return the figures, as `compensator simulate --json` prints them."""
         found: dict[str, Any] = {"samples": int(self["t_s"].size), "records": self.records}
         if self.scores is not None:
-            found |= {name: getattr(self.scores, name) for name in ("fit_pct", "rms_um", "peak_to_peak_um")}
+            found |= asdict(self.scores)
+        if self.beside:
+            found["beside"] = {name: asdict(row) for name, row in self.beside.items()}
         return found
 
     def contents(self) -> list[str | Table | Words]:
         """Return the content: size and columns, errors if Y was measured, remarks."""
         size = f"{self['t_s'].size} samples in {self.records} record(s), columns {', '.join(self)}"
         parts: list[str | Table | Words] = [size]
-        if self.scores is not None:
+        if self.scores is not None and self.beside:
+            rows = [[name, *row.cells()] for name, row in (*self.beside.items(), ("model corrected", self.scores))]
+            title = "Errors at the measured rows after the first, each predicted from earlier rows"
+            parts.append(Table(title=title, head=["", *SCORE_HEAD], rows=rows))
+        elif self.scores is not None:
             parts.append(Table(head=["", *SCORE_HEAD], rows=[["measured − predicted", *self.scores.cells()]]))
         return [*parts, *warnings_of(self.remarks, "Remarks")]
 

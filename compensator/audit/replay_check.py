@@ -103,6 +103,8 @@ class ReplayCheck:
             result.first_seq, result.first_ns = sample.seq, sample.time_utc_ns
         result.last_seq, result.last_ns = sample.seq, sample.time_utc_ns
         result.samples += 1
+        if not self._probes_match(step, outcome):
+            return
         offset = outcome.offset
         if "offset" in records:
             offset = self._as_published(offset, records["offset"].data)
@@ -117,6 +119,16 @@ class ReplayCheck:
         for note in outcome.notes:
             if not any(is_recorded(note, event) for event in step.events):
                 self._count(self._difference("event", sample, (_missing_note(note, step.events),)))
+
+    def _probes_match(self, step: RecordedStep, outcome: Outcome) -> bool:
+        """Compare the verdicts on the probes of a sample, up to the first difference."""
+        recorded = [raw for raw, probe in step.probes if probe.seq == outcome.sample.seq and probe.is_read]
+        if len(recorded) != len(outcome.probes):  # the configuration does not use probes
+            number = Field(name="number", recorded=len(recorded), recomputed=len(outcome.probes))
+            self._count(self._difference("probe", outcome.sample, (number,)))
+            return False
+        pairs = zip(outcome.probes, recorded, strict=True)
+        return all(self._matches("probe", probe, record) for probe, record in pairs)
 
     def _as_published(self, expected: Offset, recorded: bytes) -> Offset:
         """Return an offset with the disk's reason if it was published with one."""

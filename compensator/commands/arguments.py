@@ -14,6 +14,11 @@ def _column(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME", help=words)
 
 
+def _y_std(parser: argparse.ArgumentParser) -> None:
+    words = "standard deviation of one measured Y, µm; needed where Y is measured too sparsely to show it"
+    parser.add_argument("--y-std", type=float, metavar="UM", help=words)
+
+
 def _page(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--page",
@@ -52,6 +57,9 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     add("data", type=Path, metavar="DATA", help="CSV or MAT file, or recording")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="CSV")
+    words = "correct each row by the measured Y of earlier rows, as the service does by probes (default: run free)"
+    add("--correct", action="store_true", help=words)
+    _y_std(parser)
     _column(parser)
 
 

@@ -18,7 +18,8 @@ def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     given = arguments
     out = checked_file(given.out, "--out", read=(given.data, Path(given.model)), ending=".csv")
-    found = simulate(given.model, given.data, columns=roles_of(given.column))
+    columns = roles_of(given.column)
+    found = simulate(given.model, given.data, columns=columns, correct=given.correct, y_std_um=given.y_std)
     for remark in found.remarks:
         log.warning("%s", remark.marked)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -19,6 +19,8 @@ REST_SAMPLES = 30
 NOISE_ALONE = 1.5
 #: Shortest stretch between two long gaps that makes a run, samples.
 SHORTEST_RUN = 30
+#: Four values that follow each other within so many samples are neighbours: they show the noise of a slow signal.
+NEIGHBOURS_SAMPLES = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,6 +194,22 @@ def noise_std(values: Vector) -> float:
     lower = size[: max(1, int(0.9 * size.size))]
     # The mean square over the lower nine tenths of a normal's magnitudes is 0.6107 of its variance.
     return max(typical, float(np.sqrt(np.mean(lower**2) / 0.6107)) if typical == 0.0 else typical)
+
+
+def is_sparse(values: Vector) -> bool:
+    """Whether most values have no neighbours from which their noise could be seen; NaN is missing.
+
+    Examples
+    --------
+    >>> hourly = np.full(600, np.nan)
+    >>> hourly[::60] = 1.0
+    >>> is_sparse(hourly), is_sparse(np.ones(600))
+    (True, False)
+    """
+    known = np.flatnonzero(~np.isnan(values))
+    if known.size < 4:
+        return bool(0 < known.size < values.size)
+    return bool(np.mean(known[3:] - known[:-3] > NEIGHBOURS_SAMPLES) > 0.5)
 
 
 def is_noise(values: Vector) -> bool:

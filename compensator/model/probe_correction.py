@@ -1,12 +1,15 @@
-"""What probes of Y show about a model: an offset and slow relative gains, in a bank of Kalman filters.
+"""What probes of Y show about a model: an offset and slow relative gains of its paths and effects.
 
 With the shares c of the paths and effects in the deformation, a probe of feature f measures
 
     y − y_free = offset + Σ gain_i · c_i + zero_f + noise
 
-The offset and the gains walk. How fast the offset walks is not known: one filter for each of `WALKS_UM`, weighted by
-how well it predicted the probes. Only +, −, ·, / and square roots in a fixed order: the same probes give the same
-bits on every machine.
+The offset and the gains walk. The first feature's zero is in the offset; a further feature has its own, unknown at its
+first probe, so that it teaches only changes and makes no jump.
+
+A probe that is more probably wrong than right, by its innovation, is refused; so many refused ones that agree are
+believed. The most doubtful of those that were taken stays on probation: a second bank goes on without it, and takes
+over once the later probes make that more probable.
 """
 
 from __future__ import annotations
@@ -18,28 +21,20 @@ from typing import Any
 
 import numpy as np
 
-from compensator.arrays import Matrix, Vector
+from compensator.model.filter_bank import SIZE, Expected, FilterBank, Weighing, transformed
 
-#: Walks of the offset, one for each filter, µm/√min.
-WALKS_UM = (0.02, 0.042, 0.087, 0.18, 0.38, 0.8)
 #: Standard deviation of a relative gain before the first probe: of the DTF, of all others.
-DTF_GAIN_STD, GAIN_STD = 0.15, 0.3
-#: Walk of a relative gain, part of its standard deviation, 1/√min.
-GAIN_WALK = 0.0033
-#: Standard deviation of a zero that nothing has shown yet, µm: a first value sets it, whatever it is.
-ZERO_STD_UM = 1000.0
-#: A probe further off than this many standard deviations of its innovation is refused.
-GATE = 4.0
-#: So many refused probes that agree are believed; two where a single probe has been taken.
+DTF_GAIN_STD, GAIN_STD = 0.12, 0.2
+#: Walk of a relative gain, part of that, 1/√min.
+GAIN_WALK = 0.001
+#: So many refused probes that agree are believed; two before a second probe was taken.
 AGREEING = 3
 #: Refused probes that lie further apart than this do not support each other, min.
 AGREEING_WITHIN_MIN = 720.0
-#: Two refused probes agree within this many standard deviations of their difference.
+#: So many refused probes are kept.
+REFUSED_KEPT = 20
+#: Refused probes agree within this many standard deviations of their difference.
 AGREEMENT = 3.0
-#: Share of the weights that is spread evenly at each probe, so that a walk that changes is found.
-FORGETTING = 0.02
-#: Degrees of freedom of the t distribution that weighs the filters; odd, so that no power but whole ones is needed.
-_FREEDOM = 7
 
 #: Reasons of a verdict.
 OUTLIER, BELIEVED = "probe_outlier", "probe_believed"
@@ -54,8 +49,8 @@ class ProbeVerdict:
     taken : bool
         False where it was refused by its innovation.
     reason : str or None
-        `probe_outlier` where it was refused; `probe_believed` where it was taken together with refused ones that
-        agree with it.
+        `probe_outlier` where it was refused; `probe_believed` where it was taken against earlier ones: together with
+        refused ones that agree with it, or because the last one that was taken is more probably wrong.
     innovation_um : float
         Measured less predicted deformation, µm.
     innovation_std_um : float
@@ -69,11 +64,12 @@ class ProbeVerdict:
 
 
 @dataclass(frozen=True, slots=True)
-class _Refused:
-    """A refused probe: what it showed beyond the free run, and when."""
+class _Probe:
+    """A probe: when, what it showed beyond the free run and beyond the correction, and what of each state it shows."""
 
     minutes: float
     deviation_um: float
+    innovation_um: float
     std_um: float
     contributions_um: tuple[float, ...]
     feature: str
@@ -90,27 +86,25 @@ class ProbeCorrection:
     Examples
     --------
     >>> found = ProbeCorrection(["DTF", "TDTF"])
-    >>> found.update(13.0, 1.5, 10.0, [10.0, 0.0]).taken
+    >>> found.update(403.0, 1.0, 0.0, [0.0, 0.0]).taken
     True
-    >>> round(found.correction_um([10.0, 0.0]), 2)
-    3.0
+    >>> round(found.correction_um([0.0, 0.0]), 2)
+    403.0
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(names)
         self.active = False
         self._features: list[str] = []
-        self._refused: list[_Refused] = []
+        self._refused: list[_Probe] = []
         self._probes = 0
         self._minutes = 0.0
         self._waiting = 0.0
-        prior = np.array([ZERO_STD_UM, *(DTF_GAIN_STD if name == "DTF" else GAIN_STD for name in self.names)])
-        self._weights = [1.0 / len(WALKS_UM)] * len(WALKS_UM)
-        self._x: Matrix = np.zeros((len(WALKS_UM), prior.size))
-        self._P: Matrix = np.zeros((len(WALKS_UM), prior.size, prior.size))
-        self._P[:, np.arange(prior.size), np.arange(prior.size)] = prior**2
-        self._walks = np.tile((GAIN_WALK * prior) ** 2, (len(WALKS_UM), 1))
-        self._walks[:, 0] = np.array(WALKS_UM) ** 2
+        stds = [DTF_GAIN_STD if name == "DTF" else GAIN_STD for name in self.names]
+        self._bank = FilterBank(stds, [GAIN_WALK * std for std in stds])
+        # The bank without the last probe that was taken, and the probability that this probe was wrong.
+        self._without: FilterBank | None = None
+        self._doubt = 0.0
         self._mix()
 
     # ------------------------------------------------------------------ each sample
@@ -130,18 +124,19 @@ class ProbeCorrection:
         self._waiting += minutes
 
     def correction_um(self, contributions_um: Sequence[float]) -> float:
-        """Return what is to be added to the deformation of the free run, µm; 0 before the first probe."""
+        """Return what is to be added to the deformation of the free run, µm; 0 before the first probe was taken."""
         if not self.active:
             return 0.0
         total = self._mean[0]
-        for gain, share in zip(self._mean[1:], contributions_um, strict=False):
+        for gain, share in zip(self._mean[1:], contributions_um, strict=True):
             total += gain * share
         return total
 
     def std_um(self, contributions_um: Sequence[float]) -> float:
         """Return the standard deviation of the corrected deformation, µm: what the probes leave unknown.
 
-        Noise of the temperatures is not included; 0 before the first probe.
+        It takes the place of the model's own error; noise of the temperatures is not included. 0 before the first
+        probe was taken.
         """
         if not self.active:
             return 0.0
@@ -189,123 +184,112 @@ class ProbeCorrection:
             raise ValueError(
                 f"probe of {y_um} ± {std_um} µm at {predicted_um} µm, expected numbers and a deviation > 0"
             )
-        probe = _Refused(self._minutes, y_um - predicted_um, std_um, tuple(contributions_um), feature)
-        self._absorb_time()
-        h = self._row(probe)
-        innovation, variance = self._innovation(h, probe)
-        std = math.sqrt(variance)
-        reason = None
-        if abs(innovation) > GATE * std:
+        self._advance()
+        h = self._row(contributions_um, feature)
+        deviation = y_um - predicted_um
+        innovation, variance = self._bank.innovation(self._bank.expected(h, deviation, std_um))
+        probe = _Probe(self._minutes, deviation, innovation, std_um, tuple(contributions_um), feature)
+        reason = BELIEVED if self._reconsider(probe) else None
+        weighing = self._weigh(self._bank, probe)
+        if weighing.right < 0.5:
             agreeing = self._agreeing(probe)
-            if len(agreeing) < min(AGREEING, self._probes + 1):
-                self._refused = [*self._refused, probe]
+            if len(agreeing) + 1 < min(AGREEING, self._probes + 2):
+                for bank in self._banks():
+                    bank.weights = self._weigh(bank, probe).weights
+                self._refused = [*self._refused[1 - REFUSED_KEPT :], probe]
                 self._mix()
-                return ProbeVerdict(False, OUTLIER, innovation, std)
+                return ProbeVerdict(False, OUTLIER, innovation, math.sqrt(variance))
             reason = BELIEVED
-            self._widen(innovation)
-            for earlier in agreeing[:-1]:
-                self._correct(self._row(earlier), earlier)
-        self._correct(h, probe)
-        self._refused = []
-        self._probes += 1
-        self.active = True
-        self._mix()
-        return ProbeVerdict(True, reason, innovation, std)
+            self._believe(agreeing, probe)
+        self._accept(probe, 1.0 - weighing.right)
+        return ProbeVerdict(True, reason, innovation, math.sqrt(variance))
 
     def _expect(self, contributions_um: Sequence[float]) -> None:
         if len(contributions_um) != len(self.names):
             raise ValueError(f"{len(contributions_um)} contributions, expected one for each of {list(self.names)}")
 
-    def _absorb_time(self) -> None:
-        """Let the covariances grow by the time since they were last used."""
-        states = np.arange(self._walks.shape[1])
-        self._P[:, states, states] += self._waiting * self._walks
+    def _advance(self) -> None:
+        """Let the states walk for the time since they were last used."""
+        for bank in self._banks():
+            bank.advance(self._waiting)
         self._waiting = 0.0
 
-    def _row(self, probe: _Refused) -> list[float]:
-        """Return what of each state the probe shows; a feature that is new gets a zero of its own."""
-        if probe.feature not in self._features:
+    def _banks(self) -> list[FilterBank]:
+        return [self._bank, *([self._without] if self._without is not None else [])]
+
+    def _row(self, contributions_um: Sequence[float], feature: str) -> list[float]:
+        """Return what of each state a probe shows; a feature that is new gets a zero of its own."""
+        if feature not in self._features:
             if self._features:  # The zero of the first feature is in the offset.
-                n = self._x.shape[1]
-                self._x = np.pad(self._x, ((0, 0), (0, 1)))
-                self._P = np.pad(self._P, ((0, 0), (0, 1), (0, 1)))
-                self._P[:, n, n] = ZERO_STD_UM**2
-                self._walks = np.pad(self._walks, ((0, 0), (0, 1)))
-            self._features.append(probe.feature)
-        zeros = [1.0 if name == probe.feature else 0.0 for name in self._features[1:]]
-        return [1.0, *probe.contributions_um, *zeros]
+                for bank in self._banks():
+                    bank.add_zero()
+            self._features.append(feature)
+        return [1.0, *contributions_um, *(1.0 if name == feature else 0.0 for name in self._features[1:])]
 
-    def _expected(self, h: list[float], probe: _Refused) -> tuple[Vector, Vector, Matrix]:
-        """Return for each filter: innovation, its variance, and the covariance of the states with it."""
-        innovation = np.full(len(WALKS_UM), probe.deviation_um)
-        column = np.zeros_like(self._x)
-        for i, weight in enumerate(h):
-            innovation = innovation - weight * self._x[:, i]
-            column = column + weight * self._P[:, :, i]
-        # A refused probe that is believed later was measured when the offset had not yet walked as far.
-        variance = probe.std_um**2 + (self._minutes - probe.minutes) * self._walks[:, 0]
-        for i, weight in enumerate(h):
-            variance = variance + weight * column[:, i]
-        return innovation, variance, column
+    def _expected(self, bank: FilterBank, probe: _Probe) -> Expected:
+        h = self._row(probe.contributions_um, probe.feature)
+        return bank.expected(h, probe.deviation_um, probe.std_um, self._minutes - probe.minutes)
 
-    def _innovation(self, h: list[float], probe: _Refused) -> tuple[float, float]:
-        """Return the innovation of the whole bank and its variance."""
-        each, variances, _ = self._expected(h, probe)
-        return _mixed(self._weights, each.tolist(), variances.tolist())
+    def _weigh(self, bank: FilterBank, probe: _Probe) -> Weighing:
+        return bank.weigh(self._expected(bank, probe))
 
-    def _correct(self, h: list[float], probe: _Refused) -> None:
-        innovation, variance, column = self._expected(h, probe)
-        gain = column / variance[:, None]
-        self._x = self._x + gain * innovation[:, None]
-        self._P = self._P - gain[:, :, None] * column[:, None, :]
-        self._P = 0.5 * (self._P + self._P.transpose(0, 2, 1))
-        self._weights = _weighted(self._weights, innovation.tolist(), variance.tolist())
+    def _reconsider(self, probe: _Probe) -> bool:
+        """Let the bank without the probe on probation take over where this one makes that more probable."""
+        if self._without is None:
+            return False
+        doubt = self._doubt * self._weigh(self._without, probe).density
+        belief = (1.0 - self._doubt) * self._weigh(self._bank, probe).density
+        self._doubt = doubt / (doubt + belief)
+        if self._doubt <= 0.5:
+            return False
+        self._bank, self._without, self._doubt = self._without, self._bank, 1.0 - self._doubt
+        return True
+
+    def _accept(self, probe: _Probe, doubt: float) -> None:
+        """Correct by a probe; it goes on probation where it is more doubtful than the one that is."""
+        if self._without is None or self._doubt < doubt:
+            self._without, self._doubt = self._bank.copy(), doubt
+        else:
+            self._without.correct(self._expected(self._without, probe))
+        self._bank.correct(self._expected(self._bank, probe))
+        self._refused = []
+        self._probes += 1
+        self.active = True
+        self._mix()
+
+    def _mix(self) -> None:
+        """Keep mean, covariance and growth of the whole bank, so that a sample costs little."""
+        self._mean, self._covariance, self._growth = self._bank.mixture(1 + len(self.names))
 
     # ------------------------------------------------------------------ probes that do not fit
 
-    def _agreeing(self, probe: _Refused) -> list[_Refused]:
-        """Return the refused probes that agree with this one, and it."""
-        gains = [row[i] for i, row in enumerate(self._covariance)][1:]
+    def _agreeing(self, probe: _Probe) -> list[_Probe]:
+        """Return the refused probes that agree with this one."""
         found = []
         for other in self._refused:
             apart = self._minutes - other.minutes
             variance = probe.std_um**2 + other.std_um**2 + apart * self._growth[0]
-            for gain, now, then in zip(gains, probe.contributions_um, other.contributions_um, strict=False):
-                variance += gain * (now - then) ** 2
-            differ = probe.deviation_um - other.deviation_um
-            same = other.feature == probe.feature
-            if same and apart <= AGREEING_WITHIN_MIN and differ**2 <= AGREEMENT**2 * variance:
+            shares = zip(probe.contributions_um, other.contributions_um, strict=True)
+            for i, (now, then) in enumerate(shares, start=1):
+                variance += self._covariance[i][i] * (now - then) ** 2
+            differ = probe.innovation_um - other.innovation_um
+            if apart <= AGREEING_WITHIN_MIN and differ**2 <= AGREEMENT**2 * variance:
                 found.append(other)
-        return [*found, probe]
+        return found
 
-    def _widen(self, jump_um: float) -> None:
-        """Admit that the offset may have moved by this much, and that its walk is not known any more."""
-        self._P[:, 0, 0] += jump_um**2
-        self._weights = [1.0 / len(WALKS_UM)] * len(WALKS_UM)
+    def _believe(self, agreeing: Sequence[_Probe], probe: _Probe) -> None:
+        """Widen what may have moved, and correct by the refused probes.
 
-    # ------------------------------------------------------------------ the mixture
-
-    def _mix(self) -> None:
-        """Keep mean, covariance and growth of the whole bank, so that a sample costs little."""
-        n = 1 + len(self.names)
-        x, p, walks = self._x.tolist(), self._P.tolist(), self._walks.tolist()
-        bank = range(len(WALKS_UM))
-
-        def mean(values: Sequence[float]) -> float:
-            total = 0.0
-            for weight, value in zip(self._weights, values, strict=True):
-                total += weight * value
-            return total
-
-        self._mean = [mean([x[k][i] for k in bank]) for i in range(n)]
-        self._growth = [mean([walks[k][i] for k in bank]) for i in range(n)]
-        self._covariance = [
-            [
-                mean([p[k][i][j] + (x[k][i] - self._mean[i]) * (x[k][j] - self._mean[j]) for k in bank])
-                for j in range(i + 1)
-            ]
-            for i in range(n)
-        ]
+        Where one further feature alone shows it, that feature may have moved as well as the machine: its zero is
+        unknown again, the offset stays, and its deviation says so.
+        """
+        features = {one.feature for one in (*agreeing, probe)}
+        alone = len(features) == 1 and probe.feature != self._features[0]
+        zero = len(self.names) + self._features.index(probe.feature) if alone else None
+        self._without = None
+        self._bank.widen(probe.innovation_um, zero)
+        for earlier in agreeing:
+            self._bank.correct(self._expected(self._bank, earlier))
 
     # ------------------------------------------------------------------ state, another model
 
@@ -319,9 +303,9 @@ class ProbeCorrection:
             "probes": self._probes,
             "minutes": self._minutes,
             "waiting_min": self._waiting,
-            "weights": list(self._weights),
-            "states": self._x.tolist(),
-            "covariances": self._P.tolist(),
+            "bank": self._bank.to_dict(),
+            "without": self._without.to_dict() if self._without is not None else None,
+            "doubt": self._doubt,
         }
 
     @classmethod
@@ -334,25 +318,34 @@ class ProbeCorrection:
             If it is not what `to_dict` returns.
         """
         try:
-            found = cls(state["names"])
+            found = cls([str(name) for name in state["names"]])
             found.active = bool(state["active"])
             found._features = [str(name) for name in state["features"]]
             found._refused = [
-                _Refused(**{**probe, "contributions_um": tuple(probe["contributions_um"])})
+                _Probe(**{**probe, "contributions_um": tuple(map(float, probe["contributions_um"]))})
                 for probe in state["refused"]
             ]
-            found._probes = int(state["probes"])
+            found._probes, found._doubt = int(state["probes"]), float(state["doubt"])
             found._minutes, found._waiting = float(state["minutes"]), float(state["waiting_min"])
-            found._weights = [float(weight) for weight in state["weights"]]
-            found._x = np.array(state["states"], dtype=float)
-            found._P = np.array(state["covariances"], dtype=float)
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"state of the probes: {error}") from error
-        size = 1 + len(found.names) + max(len(found._features) - 1, 0)
-        bank = len(WALKS_UM)
-        if found._x.shape != (bank, size) or found._P.shape != (bank, size, size) or len(found._weights) != bank:
-            raise ValueError(f"state of the probes of shape {found._x.shape}, expected {(bank, size)}")
-        found._walks = np.pad(found._walks, ((0, 0), (0, size - found._walks.shape[1])))
+            for _ in found._features[1:]:
+                found._bank.add_zero()
+            if state["without"] is not None:
+                found._without = found._bank.copy()
+                found._without.restore(state["without"])
+            found._bank.restore(state["bank"])
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValueError(f"state of the probes: {error!r}") from error
+        found._mix()
+        return found
+
+    def at_zero(self) -> ProbeCorrection:
+        """Return the correction after a zero: the gains and walks stay, the offset and the zeros start anew."""
+        found, gains = ProbeCorrection(self.names), slice(1, 1 + len(self.names))
+        before = self._bank.copy()
+        before.advance(self._waiting)
+        found._bank.x[:, gains] = before.x[:, gains]
+        found._bank.P[:, gains, gains] = before.P[:, gains, gains]
+        found._bank.weights = before.weights_of_walks()
         found._mix()
         return found
 
@@ -367,7 +360,7 @@ class ProbeCorrection:
 
         The corrected deformation and its deviation are the same before and after. The zeros of the features and the
         weights of the walks go over. The gains start anew, for what they corrected may be what the new model explains:
-        their part is in the offset of this moment.
+        what they added up to now is in the new offset, which is known as well as the corrected deformation was.
 
         Parameters
         ----------
@@ -383,63 +376,27 @@ class ProbeCorrection:
         found._expect(new_contributions_um)
         if not self.active:
             return found
-        self._absorb_time()
-        old, new = 1 + len(self.names), 1 + len(found.names)
         found.active, found._probes, found._minutes = True, self._probes, self._minutes
-        found._features, found._weights = list(self._features), list(self._weights)
-        zeros = self._x.shape[1] - old
-        # States of the old model, reduced to the corrected deformation and the zeros: T x with covariance T P T'.
-        reduced = np.zeros((1 + zeros, self._x.shape[1]))
+        found._features = list(self._features)
+        before = self._bank.copy()
+        before.advance(self._waiting)
+        bank, old, new = found._bank, 1 + len(self.names), 1 + len(found.names)
+        zeros = len(self._features) - 1
+        # The old model's states, reduced to the correction as it is now and the zeros.
+        reduced = np.zeros((1 + zeros, old + zeros))
         reduced[0, :old] = [1.0, *contributions_um]
         reduced[np.arange(1, 1 + zeros), np.arange(old, old + zeros)] = 1.0
-        x, p = _transformed(reduced, self._x, self._P)
-        # Offset of the new model = total − change − Σ gain_i · c_i, with gains that are not known yet.
-        size = new + zeros
-        found._x = np.zeros((len(WALKS_UM), size))
-        wide = np.zeros((len(WALKS_UM), size, size))
-        wide[:, :new, :new] = found._P
-        kept = [0, *range(new, size)]
-        found._x[:, kept] = x
-        found._x[:, 0] -= change_um
-        wide[np.ix_(range(len(WALKS_UM)), kept, kept)] = p
-        back = np.eye(size)
-        back[0, 1:new] = [-share for share in new_contributions_um]
-        _, found._P = _transformed(back, found._x, wide)
-        found._walks = np.pad(found._walks, ((0, 0), (0, zeros)))
+        x, p = transformed(reduced, before.x, before.P)
+        # The new offset is that correction, less the change of the free run, less what the new gains add now.
+        for _ in range(zeros):
+            bank.add_zero()
+        kept = [0, *range(new, new + zeros)]
+        bank.x[:, kept] = x
+        bank.x[:, 0] -= change_um
+        bank.P[np.ix_(range(SIZE), kept, kept)] = p
+        offset = np.eye(new + zeros)
+        offset[0, 1:new] = [-share for share in new_contributions_um]
+        bank.x, bank.P = transformed(offset, bank.x, bank.P)
+        bank.weights = list(before.weights)
         found._mix()
         return found
-
-
-def _transformed(matrix: Matrix, x: Matrix, p: Matrix) -> tuple[Matrix, Matrix]:
-    """Return T x and T P T' for each filter, summed in a fixed order."""
-
-    def times(right: Matrix) -> Matrix:
-        total = np.zeros((right.shape[0], matrix.shape[0], *right.shape[2:]))
-        for j in range(matrix.shape[1]):
-            total = total + np.multiply.outer(matrix[:, j], right[:, j]).swapaxes(0, 1)
-        return total
-
-    return times(x), times(times(p).transpose(0, 2, 1))
-
-
-def _mixed(weights: Sequence[float], means: Sequence[float], variances: Sequence[float]) -> tuple[float, float]:
-    """Return mean and variance of a mixture."""
-    mean = 0.0
-    for weight, value in zip(weights, means, strict=True):
-        mean += weight * value
-    variance = 0.0
-    for weight, value, own in zip(weights, means, variances, strict=True):
-        variance += weight * (own + (value - mean) ** 2)
-    return mean, variance
-
-
-def _weighted(weights: Sequence[float], innovations: Sequence[float], variances: Sequence[float]) -> list[float]:
-    """Return the weights after a probe, by the density of a t distribution, of which a share is spread evenly."""
-    found = []
-    for weight, innovation, variance in zip(weights, innovations, variances, strict=True):
-        tail = 1.0 + innovation * innovation / (_FREEDOM * variance)
-        found.append(weight / (math.sqrt(variance) * tail * tail * tail * tail))
-    total = 0.0
-    for value in found:
-        total += value
-    return [(1.0 - FORGETTING) * value / total + FORGETTING / len(found) for value in found]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.data.record import SampledRecord
 from compensator.errors import DataError
-from compensator.model.engine import Engine
+from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
 
 #: Columns of a free run in the order of its CSV.
@@ -66,6 +66,24 @@ def simulate(model: ThermalModel, record: SampledRecord, *, source: str = "") ->
     DataError
         If no sample has both temperatures.
     """
+    engine, first = engine_at_start(model, record, source)
+    t_q, at = record.columns["t_q_degc"], record.columns["at_degc"]
+    names = [name for name in engine.channels if name in record.columns]
+    estimates = engine.run(t_q[first:], at[first:], {name: record.columns[name][first:] for name in names})
+    result = {"t_s": record.t_s} | columns_of(estimates, first)
+    if "y_um" in record.columns:
+        result |= _residual(record.columns["y_um"], result["y_pred_um"])
+    return result
+
+
+def engine_at_start(model: ThermalModel, record: SampledRecord, source: str = "") -> tuple[Engine, int]:
+    """Return the engine at rest, and the first sample with both temperatures, which is its reference.
+
+    Raises
+    ------
+    DataError
+        If no sample has both temperatures.
+    """
     t_q, at = record.columns["t_q_degc"], record.columns["at_degc"]
     complete = np.flatnonzero(~(np.isnan(t_q) | np.isnan(at)))
     if complete.size == 0:
@@ -73,26 +91,17 @@ def simulate(model: ThermalModel, record: SampledRecord, *, source: str = "") ->
     first = int(complete[0])
     engine = Engine(model)
     engine.set_reference(float(t_q[first]), float(at[first]))
-    names = [name for name in engine.channels if name in record.columns]
-    estimates = engine.run(t_q[first:], at[first:], {name: record.columns[name][first:] for name in names})
+    return engine, first
+
+
+def columns_of(estimates: Sequence[Estimate], first: int) -> dict[str, Vector]:
+    """Return heat, prediction, shares and standard deviation as columns, NaN in the rows before `first`."""
     lead = np.full(first, math.nan)
-
-    def column(name: str) -> Vector:
-        return np.concatenate((lead, [getattr(estimate, name) for estimate in estimates]))
-
-    result = {"t_s": record.t_s} | {
-        new: column(old)
-        for new, old in (
-            ("heat_w", "heat_w"),
-            ("y_pred_um", "y_um"),
-            ("y_dtf_um", "y_dtf_um"),
-            ("y_tdtf_um", "y_tdtf_um"),
-            ("y_std_um", "y_std_um"),
-        )
+    fields = {"y_pred_um": "y_um"} | {name: name for name in ("heat_w", "y_dtf_um", "y_tdtf_um", "y_std_um")}
+    return {
+        column: np.concatenate((lead, [getattr(estimate, field) for estimate in estimates]))
+        for column, field in fields.items()
     }
-    if "y_um" in record.columns:
-        result |= _residual(record.columns["y_um"], result["y_pred_um"])
-    return result
 
 
 def _residual(y: Vector, y_pred: Vector) -> dict[str, Vector]:

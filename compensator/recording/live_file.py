@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +20,8 @@ from compensator.recording.signature import Signer
 
 #: Topics of a recording; `chain` and `seal` come from the recorder itself.
 TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
+#: Topics of a machine whose Y is probed.
+TOPICS_WITH_PROBES = (*TOPICS, "probe")
 
 
 @dataclass(slots=True)
@@ -154,10 +156,15 @@ class RecordingFile(LiveFile):
         Last value of the chain in the previous recording.
     time_ns : int
         Now, ns since 1970 UTC.
+    topics : sequence of str
+        Its topics.
     """
 
-    def __init__(self, paths: Iterable[Path], machine: str, before: bytes, time_ns: int) -> None:
+    def __init__(
+        self, paths: Iterable[Path], machine: str, before: bytes, time_ns: int, topics: Sequence[str] = TOPICS
+    ) -> None:
         super().__init__(paths)
+        self._topics = topics
         self.time_ns = self.sealed_ns = time_ns
         self._machine = machine
         self._channels: dict[str, int] = {}
@@ -172,7 +179,7 @@ class RecordingFile(LiveFile):
     def begin(self, metadata: dict[str, str], attachments: list[Attachment]) -> None:
         """Write the start of the file."""
         contents = Contents(metadata={"run": metadata}, attachments={part.name: part for part in attachments})
-        for number, topic in enumerate(TOPICS, 1):
+        for number, topic in enumerate(self._topics, 1):
             about, kind, schema = {"machine": self._machine}, MESSAGES[topic].__name__, shipped_schema(topic)
             contents.channels[number] = McapChannel(f"/{topic}", "json", about, kind, "jsonschema", schema)
         opening = Opening(self.writer)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from compensator.clock import NS
 from compensator.recording import chain
 from compensator.recording.container import Attachment
 from compensator.recording.finishing import Finisher, Retention
-from compensator.recording.live_file import RecordingFile
+from compensator.recording.live_file import TOPICS, RecordingFile
 from compensator.recording.naming import day_of, names
 from compensator.recording.reading import last_value, recordings
 from compensator.recording.signature import Signer
@@ -46,6 +46,8 @@ class McapRecorder:
         Retention limits; by default everything is kept.
     signer : Signer, optional
         Signs the chain.
+    topics : sequence of str
+        Topics of its files.
     """
 
     def __init__(
@@ -56,11 +58,13 @@ class McapRecorder:
         *,
         retention: Retention | None = None,
         signer: Signer | None = None,
+        topics: Sequence[str] = TOPICS,
     ) -> None:
         self._folder = folder
         self._machine = machine
         self.attachments = attachments
         self._signer = signer
+        self._topics = topics
         self._finisher = Finisher(folder, machine, retention or Retention(), signer)
         self._live: RecordingFile | None = None
         self._day = ""
@@ -172,7 +176,7 @@ class McapRecorder:
         if previous and not before:
             before = last_value(previous[-1])
         paths = names(self._folder, self._machine, time_utc_ns, previous[-1] if previous else None)
-        live = self._live = RecordingFile(paths, self._machine, before or chain.NOTHING, time_utc_ns)
+        live = self._live = RecordingFile(paths, self._machine, before or chain.NOTHING, time_utc_ns, self._topics)
         self.path = live.path
         metadata = {
             "machine": self._machine,

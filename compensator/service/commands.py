@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
 import msgspec
 
+from compensator.clock import Clock
+from compensator.codes import ProbeCode
 from compensator.errors import ServiceError
 from compensator.events import CommandName, EventKind
+from compensator.messages import Probe
 from compensator.service.compensation import Compensation
 from compensator.service.event_log import EventLog
+from compensator.service.probing import ReceivedProbe, read_probe
+from compensator.service.probing.received import ProbeRefused, unread_probe
 from compensator.service.publisher import COMMANDS, Reply, Sender, refusal
 from compensator.service.replay import execute
 from compensator.service.transfer.adoption import LONGEST_MODEL, Adoption, ModelRequest
@@ -20,17 +26,50 @@ from compensator.service.transfer.adoption import LONGEST_MODEL, Adoption, Model
 LONGEST_COMMAND = 10_000
 #: Largest number of commands that wait for the next sample.
 WAITING_COMMANDS = 100
+#: Largest number of probes that wait for the next sample.
+WAITING_PROBES = 20
 #: Largest number of refused commands noted between two samples; a flood must not displace other events.
 NOTED_REFUSALS = 10
 
 
 class Commands:
-    """Receives commands from other threads; `unproven`: whether unauthenticated senders are accepted."""
+    """Receives commands from other threads.
 
-    def __init__(self, events: EventLog, adoption: Adoption, *, unproven: bool) -> None:
+    Parameters
+    ----------
+    events : EventLog
+        For the events of commands and refusals.
+    adoption : Adoption
+        Executes `adopt` and `back`.
+    clock : Clock
+        For the arrival of a probe.
+    running : callable
+        Returns the running compensation.
+    machine : str
+        Name of the machine.
+    unproven : bool
+        Whether unauthenticated senders are accepted.
+    """
+
+    def __init__(
+        self,
+        events: EventLog,
+        adoption: Adoption,
+        *,
+        clock: Clock,
+        running: Callable[[], Compensation],
+        machine: str,
+        unproven: bool,
+    ) -> None:
         self._events = events
         self._adoption = adoption
+        self._clock = clock
+        self._running = running
+        self._machine = machine
         self._unproven = unproven
+        #: Probes that wait for the next sample, and records of payloads that are none.
+        self._probes: list[ReceivedProbe] = []
+        self._unread: list[Probe] = []
         self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
         self._refused = 0
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -47,7 +86,12 @@ class Commands:
         """Accept or refuse a command from another thread; see `Daemon.command`."""
         loop = self._loop
         try:
-            arguments = self._checked(name, payload, sender)
+            self._check_sender(name, payload, sender)
+            if loop is not None and name == CommandName.PROBE:
+                decided: Future[dict[str, Any]] = Future()
+                loop.call_soon_threadsafe(self._receive_probe, payload, sender, self._clock.utc_ns(), decided)
+                return decided
+            arguments = self._checked(name, payload)
             if loop is None or self._waiting.full():
                 raise ServiceError("the service cannot accept a command now")
             if name in (CommandName.ADOPT, CommandName.BACK):
@@ -70,10 +114,52 @@ class Commands:
             self._events.note(EventKind.COMMAND, name, arguments | {"command": name} | sender.data())
             execute(compensation, name, arguments)
 
-    def _checked(self, name: str, payload: bytes, sender: Sender) -> dict[str, Any]:
-        """Return the arguments of an acceptable command."""
+    def drain_probes(self) -> tuple[list[ReceivedProbe], list[Probe]]:
+        """Return the probes that arrived since the last call, and records of payloads that are none."""
+        probes, unread = self._probes, self._unread
+        self._probes, self._unread = [], []
+        return probes, unread
+
+    def _receive_probe(self, payload: bytes, sender: Sender, now_ns: int, reply: Future[dict[str, Any]]) -> None:
+        """Check a probe at once; it is compared with the prediction at the next sample. In the loop only."""
+        try:
+            text = self._admit_probe(payload, sender, now_ns)
+            reply.set_result({"ok": True, "code": "", "text": text})
+        except ProbeRefused as refused:
+            reply.set_result(refusal(str(refused)) | {"code": refused.code})
+
+    def _admit_probe(self, payload: bytes, sender: Sender, now_ns: int) -> str:
+        """Return the reply to a probe that can be used; one that is refused is recorded, too."""
+        probing, by = self._running().probing, (sender.name, sender.proof)
+        try:
+            if probing is None or self._loop is None:
+                raise ProbeRefused(ProbeCode.NOT_CONFIGURED, "probe: the configuration has no table [probe]")
+            if len(self._probes) >= WAITING_PROBES:
+                raise ProbeRefused(ProbeCode.TOO_MANY, f"probe: {WAITING_PROBES} wait for the next sample already")
+            request = read_probe(payload)
+        except ProbeRefused as refused:
+            if refused.code == ProbeCode.MALFORMED and len(self._unread) < NOTED_REFUSALS:
+                self._unread.append(unread_probe(self._machine, now_ns, str(refused), *by))
+            self._note_refusal(CommandName.PROBE, str(refused), sender)
+            raise
+        waiting = list(self._probes)
+        received = ReceivedProbe(request=request, received_utc_ns=now_ns, by=by[0], by_proof=by[1])
+        self._probes.append(received)
+        probing.check(received, waiting)
+        return "probe: compared with the prediction at the next sample"
+
+    def _check_sender(self, name: str, payload: bytes, sender: Sender) -> None:
+        """Refuse a command that is too long, or whose sender may be anyone."""
         if len(payload) > (LONGEST_MODEL if name in (CommandName.ADOPT, CommandName.BACK) else LONGEST_COMMAND):
             raise ServiceError(f"{name}: the payload of {len(payload)} bytes is longer than permitted")
+        if sender.proof == "none" and not self._unproven:
+            raise ServiceError(
+                f"{name}: the sender {sender.name} is not authenticated; expected a router with TLS and the key "
+                f"thermal/command/{name}/<common name of the certificate>, or zenoh.unproven_commands = true"
+            )
+
+    def _checked(self, name: str, payload: bytes) -> dict[str, Any]:
+        """Return the arguments of an acceptable command."""
         try:
             arguments = msgspec.json.decode(payload, type=dict[str, Any]) if payload else {}
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -82,11 +168,6 @@ class Commands:
         if name not in COMMANDS or (name == CommandName.ZERO and mode not in ("auto", "rest", "warm")):
             raise ServiceError(
                 f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back"
-            )
-        if sender.proof == "none" and not self._unproven:
-            raise ServiceError(
-                f"{name}: the sender {sender.name} is not authenticated; expected a router with TLS and the key "
-                f"thermal/command/{name}/<common name of the certificate>, or zenoh.unproven_commands = true"
             )
         return arguments
 

@@ -7,6 +7,7 @@ same estimate and the same offset again, bit for bit. The published offset never
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import msgspec
 
@@ -15,12 +16,12 @@ from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
 from compensator.events import EventKind, Note, ZeroData
-from compensator.messages import Offset, Sample, number
+from compensator.messages import Offset, Probe, Sample, number
 from compensator.model.engine import Engine, Estimate
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.decision import Decision, OffsetDecision, mean
-from compensator.service.outcome import Outcome, Values, estimate_message
+from compensator.service.outcome import Outcome, Prediction, Values, estimate_message
 from compensator.service.plausibility import (
     HEATED_W,
     PlausibilityCheck,
@@ -28,6 +29,8 @@ from compensator.service.plausibility import (
     SensorEvidence,
     SensorGuards,
 )
+from compensator.service.probing import Probing, ReceivedProbe, Wanted
+from compensator.service.probing.state import PastSample
 from compensator.service.state import (
     STATE_SCHEMA,
     CompensationState,
@@ -66,6 +69,8 @@ class Compensation:
         self.plausibility = PlausibilityCheck(config, model)
         self._decision = OffsetDecision(config, model, self._engine.channels)
         self._limiter = self._decision.limiter
+        self._probes: tuple[ReceivedProbe, ...] = ()
+        self.probing = Probing.of(config, self._engine.contribution_names, model.period_s)
         self._zero = ZeroState(wanted=config.zero.at_start)
         self._memory = Memory()
         self._slowest_min = slowest_min(model)
@@ -100,6 +105,10 @@ class Compensation:
             if self._engine.has_reference:
                 self._pass_cold(self._cold_samples)
 
+    def receive_probes(self, probes: Sequence[ReceivedProbe]) -> None:
+        """Receive the probes that the next sample decides; without `[probe]` they are ignored."""
+        self._probes = tuple(probes)
+
     def fail(self) -> None:
         """Hold the offset because of an internal error, until `resume`."""
         self._memory.internal_error = True
@@ -116,22 +125,28 @@ class Compensation:
     @property
     def status(self) -> CompensationStatus:
         """Zero, target and handover after the last sample."""
-        memory, zero, estimate = self._memory, self._zero, self._memory.estimate
+        memory, zero, prediction, probing = self._memory, self._zero, self._prediction(), self.probing
         return CompensationStatus(
             seq=memory.seq,
             time_utc_ns=memory.time_utc_ns,
             zero=Zero.of_references(self._engine.reference, zero) if self._engine.has_reference else None,
             is_known=memory.cold_min <= 0.0,
-            target_um=zero.y_base - estimate.y_um if estimate is not None else NAN,
-            std_um=estimate.y_std_um if estimate is not None else NAN,
+            target_um=0.0 - prediction.y_um,
+            std_um=prediction.std_um,
             handover=Handover(
                 offset_um=self._limiter.offset_um,
                 operator_hold=memory.operator_hold,
                 internal_error=memory.internal_error,
                 waiting_zero=zero.mode if zero.wanted else None,
                 model_changed=memory.model_changed,
+                probing=probing.handover if probing is not None else None,
             ),
         )
+
+    @property
+    def wanted(self) -> Wanted | None:
+        """Whether a probe is wanted after the last sample; None without `[probe]`."""
+        return self.probing.wanted(self._prediction().std_um) if self.probing is not None else None
 
     @property
     def bridge_max_min(self) -> float:
@@ -152,6 +167,7 @@ class Compensation:
                 zero=self._zero,
                 memory=self._memory,
                 plausibility=self.plausibility.state if self.plausibility.is_on else None,
+                probing=self.probing.state if self.probing is not None else None,
             )
         )
 
@@ -180,6 +196,8 @@ class Compensation:
         estimate = restored.memory.estimate
         if estimate is not None and len(estimate.y_effects_um) != len(self.model.effects):
             raise DataError(f"state: estimate of {len(estimate.y_effects_um)} effects")
+        if self.probing is not None and restored.probing is not None:
+            self.probing.restore(restored.probing)
         self._engine, self._zero, self._memory = engine, restored.zero, restored.memory
         self._guards.restore(restored.guards)
         self._limiter.offset_um = restored.offset_um
@@ -214,6 +232,8 @@ class Compensation:
             self._pass_cold(min(samples, MOST_BRIDGED))
         else:
             self._memory.estimate = self._engine.skip(samples)
+        if self.probing is not None and self._memory.estimate is not None:
+            self.probing.pass_time(self._memory.estimate.contributions_um, minutes)
 
     @property
     def _cold_samples(self) -> int:
@@ -246,6 +266,8 @@ class Compensation:
         memory.operator_hold, memory.internal_error = handover.operator_hold, handover.internal_error
         memory.model_changed = handover.model_changed
         zero.wanted, zero.mode = handover.waiting_zero is not None, handover.waiting_zero or zero.mode
+        if self.probing is not None and handover.probing is not None:
+            self.probing.continue_from(handover.probing)
 
     # ------------------------------------------------------------------ one sample
 
@@ -266,7 +288,7 @@ class Compensation:
         sample = msgspec.structs.replace(raw, channels=self._guards.check(raw.channels, heat))
         values = Values.of(sample.channels)
         notes: list[Note] = []
-        self._set_zero(values, notes)
+        self._set_zero(raw.time_utc_ns, values, notes)
         self._memory.seq, self._memory.time_utc_ns = raw.seq, raw.time_utc_ns
         estimate = None
         if self._engine.has_reference:
@@ -274,23 +296,68 @@ class Compensation:
             self._memory.estimate = estimate
             self._memory.rates = [*self._memory.rates[-MEAN_SAMPLES + 1 :], estimate.y_rate_um_per_min]
             self._memory.heats = [*self._memory.heats[-MEAN_SAMPLES + 1 :], estimate.heat_w]
-        y_pred = estimate.y_um - self._zero.y_base if estimate else NAN
+            self._remember_sample(raw.time_utc_ns, estimate)
+        decided = self._decide_probes(raw, notes)
+        prediction = self._prediction() if estimate else Prediction()
+        y_pred = prediction.y_um
         if math.isnan(self._zero.y_ref) and estimate is not None:
             # The probe was missing at the zero: with this reference the residual starts at zero.
             self._zero.y_ref = values.y - y_pred
         if self.plausibility.is_on:
-            notes += self.plausibility.update(self._evidence(raw, values, estimate, y_pred))
-        decision = self._decision.decide(values, estimate, y_pred, self._memory, self.plausibility)
+            notes += self.plausibility.update(self._evidence(raw, values, prediction))
+        decision = self._decision.decide(values, prediction if estimate else None, self._memory, self.plausibility)
+        if self.probing is not None and decision.limited is not None:
+            held = decision.state in (State.HOLD, State.FAULT)
+            self.probing.publish(decision.limited.offset_um, decision.limited.rate_um_per_min, is_held=held)
         # During an alarm the offset may be wrong by the difference between measured and predicted Y.
-        std = math.hypot(estimate.y_std_um, self.plausibility.error_um) if estimate else NAN
+        std = math.hypot(prediction.std_um, self.plausibility.error_um)
         return Outcome(
             sample=sample,
-            estimate=estimate_message(sample, values, estimate, self._engine.reference, self._zero, y_pred),
+            estimate=estimate_message(sample, values, estimate, self._engine.reference, self._zero, prediction),
             offset=decision.message(self.model, sample.machine, sample.seq, sample.time_utc_ns, std),
             notes=tuple(notes),
+            probes=decided,
         )
 
-    def _evidence(self, raw: Sample, values: Values, estimate: Estimate | None, y_pred: float) -> SensorEvidence:
+    def _prediction(self) -> Prediction:
+        """Return the deformation since the zero after the last sample, corrected by the probes; NaN before a zero."""
+        estimate = self._memory.estimate
+        if estimate is None:
+            return Prediction()
+        y_um, std_um, rate = estimate.y_um - self._zero.y_base, estimate.y_std_um, estimate.y_rate_um_per_min
+        if self.probing is None:
+            return Prediction(y_um, std_um, rate)
+        found = self.probing.corrected(estimate.contributions_um, self._engine.y_noise_std_um)
+        if math.isnan(found.std_um):
+            return Prediction(y_um, std_um, rate)
+        return Prediction(y_um + found.y_um, found.std_um, rate + found.rate_um_per_min, found.is_limited)
+
+    def _remember_sample(self, time_ns: int, estimate: Estimate) -> None:
+        """Keep what a probe of this time is compared with."""
+        if self.probing is not None:
+            self.probing.add(
+                PastSample(
+                    time_ns=time_ns,
+                    y_um=estimate.y_um - self._zero.y_base,
+                    rate_um_per_min=estimate.y_rate_um_per_min,
+                    contributions_um=estimate.contributions_um,
+                    noise_um=self._engine.y_noise_std_um,
+                    offset_um=NAN,
+                    offset_rate_um_per_min=NAN,
+                    is_held=False,
+                )
+            )
+
+    def _decide_probes(self, raw: Sample, notes: list[Note]) -> tuple[Probe, ...]:
+        """Decide the probes that arrived since the last sample, and add their events."""
+        probes, self._probes = self._probes, ()
+        if self.probing is None or not probes:
+            return ()
+        decided, found = self.probing.decide(raw.machine, raw.seq, probes)
+        notes += found
+        return tuple(decided)
+
+    def _evidence(self, raw: Sample, values: Values, prediction: Prediction) -> SensorEvidence:
         """Return the input of the checks between the sensors."""
         t_q, at = (
             number(channel.mean) if channel is not None and channel.device_quality == SampleQuality.GOOD else NAN
@@ -304,12 +371,12 @@ class Compensation:
             below_k=at - t_q,
             apart_k=(values.t_q - reference.t_q_degc) - (values.at - reference.at_degc),
             rest=values.others.get(rest.channel, NAN) if rest is not None else NAN,
-            residual_um=values.y - self._zero.y_ref - y_pred if usable else NAN,
-            std_um=estimate.y_std_um if estimate else NAN,
-            predicted_um=y_pred,
+            residual_um=values.y - self._zero.y_ref - prediction.y_um if usable else NAN,
+            std_um=prediction.std_um,
+            predicted_um=prediction.y_um,
         )
 
-    def _set_zero(self, values: Values, notes: list[Note]) -> None:
+    def _set_zero(self, time_ns: int, values: Values, notes: list[Note]) -> None:
         zero = self._zero
         if not zero.wanted or math.isnan(values.t_q) or math.isnan(values.at):
             return
@@ -323,6 +390,8 @@ class Compensation:
             zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
         self.plausibility.reset(at_rest=not warm)
+        if self.probing is not None:
+            self.probing.set_zero(time_ns)
         # Version 0.1.0 recorded this text without data: an audit of its recordings compares it.
         text = (
             f"zero on a {'warm machine' if warm else 'machine at rest'}: T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C"

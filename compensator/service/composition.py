@@ -11,6 +11,7 @@ from compensator.clock import Clock, SystemClock
 from compensator.errors import ConfigError
 from compensator.events import EventKind, Note
 from compensator.recording.finishing import Retention
+from compensator.recording.live_file import TOPICS, TOPICS_WITH_PROBES
 from compensator.recording.reading import first_sequence
 from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Outcome
@@ -80,6 +81,7 @@ async def run_service(
             {"config.toml": loaded.data, "model.toml": setup.model_bytes},
             retention=Retention(keep_days=config.recording.keep_days, keep_mb=config.recording.keep_mb),
             signer=setup.signer,
+            topics=TOPICS if config.probe is None else TOPICS_WITH_PROBES,
         )
 
         def command(name: str, payload: bytes, sender: Sender) -> Reply:

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from msgspec.structs import replace as replace_fields
+
 from compensator import __version__
 from compensator.clock import NS, Clock
 from compensator.config import Config
@@ -23,6 +25,8 @@ from compensator.service.disk_writer import DiskWriter, Entry, Recorder
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.offset_checkpoint import OffsetCheckpoint
+from compensator.service.probing import ReceivedProbe
+from compensator.service.probing.received import undecided_probe
 from compensator.service.publisher import UNNAMED, Reply, Sender
 from compensator.service.sampling import Grid, Sampler
 from compensator.service.transfer.adoption import Adoption
@@ -122,7 +126,16 @@ class Daemon:
         self._adoption = Adoption(
             config, recordings, store, self._events, self._journal, clock=clock, running=lambda: self._compensation
         )
-        self._commands = Commands(self._events, self._adoption, unproven=config.zenoh.accepts_unproven())
+        self._commands = Commands(
+            self._events,
+            self._adoption,
+            clock=clock,
+            running=lambda: self._compensation,
+            machine=config.machine.name,
+            unproven=config.zenoh.accepts_unproven(),
+        )
+        #: Probes of the sample that is being processed.
+        self._deciding: list[ReceivedProbe] = []
         self._stop = False
         self._started_utc_ns = clock.utc_ns()
         self._last_state = ""
@@ -205,8 +218,10 @@ class Daemon:
     async def _hold(self, label_ns: int) -> None:
         """Publish that the last offset is held, without the sample that could not be processed."""
         await self._await_pending()
-        held = self._compensation.held(self._config.machine.name, self._events.sequence, label_ns)
-        offset = await self._journal.record(label_ns, self._compensation.state(), offset=held)
+        machine, sequence = self._config.machine.name, self._events.sequence
+        held = self._compensation.held(machine, sequence, label_ns)
+        probes, self._deciding = [undecided_probe(machine, sequence, probe) for probe in self._deciding], []
+        offset = await self._journal.record(label_ns, self._compensation.state(), probes=probes, offset=held)
         self._publish("offset", encode(offset or held))
         self._events.sequence += 1
 
@@ -241,15 +256,20 @@ class Daemon:
             period_s=self._compensation.model.period_s,
             channels=self._sampler.close_sample(),
         )
+        self._deciding, unread = self._commands.drain_probes()
+        self._compensation.receive_probes(self._deciding)
         outcome = self._compensation.process(raw)
-        self._failed_midway = False
+        self._failed_midway, self._deciding = False, []
         if failed_midway:  # once for all consecutive samples that failed
             self._journal.start_new_file()
         for note in outcome.notes:
             self._events.note(*note)
         self._note_state(self._journal.expected(outcome.offset))
         sample, estimate = encode(outcome.sample), encode(outcome.estimate)
-        entry = self._journal.enqueue(label_ns, state, sample=sample, estimate=estimate, offset=outcome.offset)
+        probes = [*(replace_fields(probe, seq=raw.seq) for probe in unread), *outcome.probes]
+        entry = self._journal.enqueue(
+            label_ns, state, sample=sample, estimate=estimate, probes=probes, offset=outcome.offset
+        )
         decided = _Decided(outcome=outcome, entry=entry, began=began)
         if await self._journal.wait_briefly(entry):
             self._publish_sample(decided)
@@ -314,7 +334,7 @@ class Daemon:
 
     def _status(self, outcome: Outcome) -> Status:
         model = self._compensation.model
-        return Status(
+        status = Status(
             schema=SCHEMA,
             machine=self._config.machine.name,
             seq=outcome.offset.seq,
@@ -329,6 +349,17 @@ class Daemon:
             recording=self._writer.file,
             devices=self._sampler.device_states(),
             effects=[effect.label for effect in model.effects],
+        )
+        wanted = self._compensation.wanted
+        if wanted is None:
+            return status
+        return replace_fields(
+            status,
+            probe_wanted=wanted.is_wanted,
+            wanted_by_ns=wanted.by_ns,
+            wanted_why=wanted.why,
+            wanted_std_um=wanted.std_um,
+            wanted_tolerance_um=wanted.tolerance_um,
         )
 
     # ------------------------------------------------------------------ events and commands
@@ -349,16 +380,18 @@ class Daemon:
         Parameters
         ----------
         name : str
-            `zero`, `hold`, `resume`, `adopt` or `back`.
+            `zero`, `hold`, `resume`, `adopt`, `back` or `probe`.
         payload : bytes
             Empty or a JSON object. `zero` has `mode`: `auto`, `rest` or `warm`; `adopt` has `model`, the text of a
-            model file, or `sha256`, that of one adopted before, or both; `adopt` and `back` have `force`.
+            model file, or `sha256`, that of one adopted before, or both; `adopt` and `back` have `force`. That of
+            `probe` is a `ProbeRequest`.
         sender : Sender
             Sender; recorded in the event.
 
         Returns
         -------
         dict or Future of dict
-            `ok` and `text`; a future of them for `adopt` and `back`, whose warm-up takes time.
+            `ok` and `text`; a future of them for `adopt` and `back`, whose warm-up takes time, and for `probe`, which
+            the loop checks at once (with `code`).
         """
         return self._commands.receive(name, payload, sender)

@@ -10,9 +10,8 @@ from compensator.arrays import NAN
 from compensator.codes import Reason, State
 from compensator.config import Config, Limits
 from compensator.messages import SCHEMA, Offset
-from compensator.model.engine import Estimate
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.outcome import Values
+from compensator.service.outcome import Prediction, Values
 from compensator.service.plausibility import PlausibilityCheck
 from compensator.service.state import Memory
 
@@ -114,7 +113,7 @@ class OffsetDecision:
         self.limiter = OffsetLimiter(config.limits, self._period_min)
 
     def decide(
-        self, values: Values, estimate: Estimate | None, y_pred: float, memory: Memory, plausibility: PlausibilityCheck
+        self, values: Values, prediction: Prediction | None, memory: Memory, plausibility: PlausibilityCheck
     ) -> Decision:
         """Decide one sample.
 
@@ -122,10 +121,8 @@ class OffsetDecision:
         ----------
         values : Values
             Its usable values.
-        estimate : Estimate, optional
-            The model's estimate, None before the first zero.
-        y_pred : float
-            Predicted deformation since the zero, µm.
+        prediction : Prediction, optional
+            Predicted deformation since the zero, None before the first zero.
         memory : Memory
             Values kept from sample to sample; times in it advance.
         plausibility : PlausibilityCheck
@@ -136,7 +133,7 @@ class OffsetDecision:
         lost = bool(reasons)
         memory.missing_min = memory.missing_min + self._period_min if lost else 0.0
         expired = lost and memory.missing_min > self._predict_for_min
-        if estimate is None:
+        if prediction is None:
             return Decision(State.FAULT if expired else State.STARTING, [*reasons, Reason.NO_ZERO], None)
         missing = (name for name in self._channels if math.isnan(values.others.get(name, NAN)))
         reasons += [f"{Reason.CHANNEL_MISSING}:{name}" for name in missing]
@@ -151,7 +148,9 @@ class OffsetDecision:
             return Decision(State.HOLD, reasons + blocking, self.limiter.hold())
         if lost:
             reasons.append(Reason.PREDICTING)
-        limited = self.limiter.follow(0.0 - y_pred, -estimate.y_rate_um_per_min)
+        if prediction.is_limited:
+            reasons.append(Reason.CORRECTION_LIMITED)
+        limited = self.limiter.follow(0.0 - prediction.y_um, -prediction.rate_um_per_min)
         memory.model_changed &= Reason.RATE_LIMITED in limited.reasons
         if memory.model_changed:
             reasons.append(Reason.MODEL_CHANGED)

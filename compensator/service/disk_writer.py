@@ -61,6 +61,8 @@ class Entry:
         Events since the previous sample.
     sample, estimate : bytes
         JSON; empty if there is none.
+    probes : list of bytes
+        JSON of the probes that were decided with the sample.
     offset : Offset, optional
         The offset as decided.
     new_file : bool
@@ -74,6 +76,7 @@ class Entry:
     events: list[Event] = field(default_factory=list)
     sample: bytes = b""
     estimate: bytes = b""
+    probes: list[bytes] = field(default_factory=list)
     offset: Offset | None = None
     new_file: bool = False
     model: bytes | None = None
@@ -86,6 +89,7 @@ class Entry:
     def records(self) -> list[tuple[str, bytes]]:
         """Return topic and JSON of all records; the offset as published, if it was published already."""
         records = [("event", encode(event)) for event in self.events]
+        records += [("probe", data) for data in self.probes]
         records += [(topic, data) for topic, data in (("sample", self.sample), ("estimate", self.estimate)) if data]
         if self.offset is not None:
             records.append(("offset", encode(degraded(self.offset, self.reason) if self.reason else self.offset)))
@@ -99,6 +103,7 @@ class Entry:
     def inherit(self, dropped: Entry) -> None:
         """Take over from a dropped sample what must not be lost."""
         self.events = [*dropped.events, *self.events][-WAITING_EVENTS:]
+        self.probes = [*dropped.probes, *self.probes][-WAITING_EVENTS:]
         self.model = self.model if self.model is not None else dropped.model
         self.new_file = True
 

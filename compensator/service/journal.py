@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Sequence
 
 from compensator.clock import Clock
 from compensator.codes import Reason, Remark, ServiceWarning
 from compensator.events import EventKind, RecordingCode, RecordingData
-from compensator.messages import Offset, degraded
+from compensator.messages import Offset, Probe, degraded, encode
 from compensator.service.disk_writer import DiskWriter, Entry
 from compensator.service.event_log import EventLog
 from compensator.service.offset_checkpoint import OffsetCheckpoint
@@ -79,6 +80,7 @@ class Journal:
         *,
         sample: bytes = b"",
         estimate: bytes = b"",
+        probes: Sequence[Probe] = (),
         offset: Offset | None = None,
     ) -> Entry:
         """Queue a sample with the events since the previous one.
@@ -91,6 +93,7 @@ class Journal:
             events=self._events.drain(),
             sample=sample,
             estimate=estimate,
+            probes=[encode(probe) for probe in probes],
             offset=offset,
             new_file=self._new_file,
             model=self._model,
@@ -124,9 +127,11 @@ class Journal:
             self._checkpoint.write(entry.offset)
         return degraded(entry.offset, entry.reason) if entry.offset is not None and entry.reason else entry.offset
 
-    async def record(self, time_utc_ns: int, state: bytes, *, offset: Offset | None = None) -> Offset | None:
-        """Write the queued events, and an offset without a sample, to disk; return the offset to be published."""
-        entry = self.enqueue(time_utc_ns, state, offset=offset)
+    async def record(
+        self, time_utc_ns: int, state: bytes, *, probes: Sequence[Probe] = (), offset: Offset | None = None
+    ) -> Offset | None:
+        """Write the queued events, probes and an offset without a sample to disk; return the offset to be published."""
+        entry = self.enqueue(time_utc_ns, state, probes=probes, offset=offset)
         await self.wait_briefly(entry)
         return self.resolve(entry)
 

@@ -7,19 +7,20 @@ from dataclasses import dataclass
 from compensator.arrays import NAN
 from compensator.codes import SampleQuality
 from compensator.events import Note
-from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Sample, number
+from compensator.messages import SCHEMA, ChannelSample, EstimateMessage, Offset, Probe, Sample, number
 from compensator.model.engine import Estimate, Reference
 from compensator.service.state import ZeroState
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Outcome of one sample: the sample with final qualities, estimate, offset, and events."""
+    """Outcome of one sample: the sample with final qualities, estimate, offset, events, and the decided probes."""
 
     sample: Sample
     estimate: EstimateMessage
     offset: Offset
     notes: tuple[Note, ...]
+    probes: tuple[Probe, ...] = ()
 
 
 @dataclass(slots=True)
@@ -54,10 +55,28 @@ class Values:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Deformation since the zero, its standard deviation, µm, and its growth over the next sample, µm/min.
+
+    All are NaN before the first zero. A correction by probes is included; `is_limited` if it has reached its limit.
+    """
+
+    y_um: float = NAN
+    std_um: float = NAN
+    rate_um_per_min: float = NAN
+    is_limited: bool = False
+
+
 def estimate_message(
-    sample: Sample, values: Values, estimate: Estimate | None, reference: Reference, zero: ZeroState, y_pred_um: float
+    sample: Sample,
+    values: Values,
+    estimate: Estimate | None,
+    reference: Reference,
+    zero: ZeroState,
+    prediction: Prediction,
 ) -> EstimateMessage:
-    """Return the model's estimate as a message."""
+    """Return the estimate as a message: shares of the model, and the prediction with the correction by probes."""
     y = values.y - zero.y_ref
     return EstimateMessage(
         schema=SCHEMA,
@@ -73,9 +92,9 @@ def estimate_message(
         y_tdtf_um=estimate.y_tdtf_um if estimate else NAN,
         y_effects_um=list(estimate.y_effects_um) if estimate else [],
         y_base_um=zero.y_base,
-        y_pred_um=y_pred_um,
-        y_std_um=estimate.y_std_um if estimate else NAN,
-        y_rate_um_per_min=estimate.y_rate_um_per_min if estimate else NAN,
+        y_pred_um=prediction.y_um,
+        y_std_um=prediction.std_um,
+        y_rate_um_per_min=prediction.rate_um_per_min,
         y_um=y,
-        residual_um=y - y_pred_um,
+        residual_um=y - prediction.y_um,
     )

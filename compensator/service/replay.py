@@ -17,24 +17,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from compensator.clock import NS
+from compensator.codes import ProbeCode
 from compensator.config import Config, parse_config
 from compensator.errors import DataError
 from compensator.events import CommandName, EventKind, PauseData, command_of, data_of
-from compensator.messages import EstimateMessage, Event, Offset, Sample
+from compensator.messages import EstimateMessage, Event, Offset, Probe, Sample
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.container import Container, Contents, Damaged
 from compensator.recording.reading import RawRecord, decode_with, groups_of
 from compensator.service.compensation import Compensation, Outcome, model_of
+from compensator.service.probing import ReceivedProbe
 from compensator.service.state import ZeroMode
 
 _SAMPLE, _EVENT = msgspec.json.Decoder(Sample), msgspec.json.Decoder(Event)
+_PROBE = msgspec.json.Decoder(Probe)
 _ESTIMATE, _OFFSET = msgspec.json.Decoder(EstimateMessage), msgspec.json.Decoder(Offset)
 
 
@@ -54,6 +57,8 @@ class RecordedStep:
         Events. Those with smaller numbers were delayed by a full disk and are already in the state of the file.
     sample : Sample or None
         The sample; None for a held offset or for events alone.
+    probes : list of (RawRecord, Probe)
+        Probes that were decided with it; those with smaller numbers are already in the state of the file.
     """
 
     file: str
@@ -61,6 +66,22 @@ class RecordedStep:
     records: dict[str, RawRecord]
     events: list[Event]
     sample: Sample | None
+    probes: list[tuple[RawRecord, Probe]] = field(default_factory=list)
+
+    def received_probes(self, *, checked: bool = False) -> list[ReceivedProbe]:
+        """Return the probes of the sample as they arrived.
+
+        With `checked` only those that passed the checks of the recording service, and without repeating these checks:
+        another model has not published the offset that acted.
+        """
+        seq = self.sample.seq if self.sample is not None else -1
+        found = []
+        for _, probe in self.probes:
+            received = ReceivedProbe.of(probe, is_checked=checked)
+            passed = probe.taken or probe.code == ProbeCode.OUTLIER
+            if received is not None and probe.seq == seq and (passed or not checked):
+                found.append(received)
+        return found
 
     @property
     def estimate(self) -> EstimateMessage | None:
@@ -90,16 +111,18 @@ def step_of(records: Sequence[RawRecord], contents: Contents, file: str) -> Reco
     Raises
     ------
     DataError
-        If its sample or an event does not follow its schema.
+        If its sample, an event or a probe does not follow its schema.
     """
-    found, events = {}, []
+    found, events, probes = {}, [], []
     for record in records:
         if record.topic == "event":
             events.append(decode_with(_EVENT, record, file))
+        elif record.topic == "probe":
+            probes.append((record, decode_with(_PROBE, record, file)))
         else:
             found[record.topic] = record
     sample = decode_with(_SAMPLE, found["sample"], file) if "sample" in found else None
-    return RecordedStep(file, contents.metadata.get("run", {}), found, events, sample)
+    return RecordedStep(file, contents.metadata.get("run", {}), found, events, sample, probes)
 
 
 def steps_in(container: Container) -> Iterator[RecordedStep]:
@@ -158,7 +181,7 @@ def _attachment(contents: Contents, name: str, file: str) -> bytes:
 
 
 def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
-    """Execute a command, live or recorded; `adopt` and `back` are handled elsewhere and change nothing here."""
+    """Execute a command, live or recorded; `adopt`, `back` and `probe` are handled elsewhere, not here."""
     if name == CommandName.ZERO:
         mode = arguments.get("mode", "auto")
         compensation.zero(mode if mode in ("auto", "rest", "warm") else "auto")
@@ -169,7 +192,12 @@ def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) ->
 
 
 def apply(
-    compensation: Compensation, step: RecordedStep, *, commands: bool = True, since: int | None = None
+    compensation: Compensation,
+    step: RecordedStep,
+    *,
+    commands: bool = True,
+    since: int | None = None,
+    checked: bool = False,
 ) -> Outcome | Offset | None:
     """Repeat what the service did with one recorded group: commands and errors of its number, then the sample.
 
@@ -180,9 +208,11 @@ def apply(
     step : RecordedStep
         The group.
     commands : bool
-        Whether commands and errors are applied.
+        Whether commands, probes and errors are applied.
     since : int, optional
         Lowest number of the events that are applied; by default that of the group.
+    checked : bool
+        Whether the checks of the probes are taken from the recording, as for another model.
 
     Returns
     -------
@@ -210,6 +240,7 @@ def apply(
     if sample is None:
         assert held is not None
         return compensation.held(held.machine, held.seq, held.time_utc_ns)
+    compensation.receive_probes(step.received_probes(checked=checked) if commands else ())
     try:
         # The guards set `quality` again, from `device_quality` alone.
         return compensation.process(sample)
@@ -256,14 +287,15 @@ class FreeRun:
                 )
             if self._before_torn_um is not None:
                 own = compensation.status.handover
-                compensation.continue_from(replace(own, offset_um=self._before_torn_um))
+                compensation.continue_from(replace(own, offset_um=self._before_torn_um, probing=None))
             if self.seq >= 0:
                 self._pass_pause(step, sample)
             self._before_torn_um = compensation.status.handover.offset_um if "offset" not in step.records else None
         elif self.seq >= 0 and step.offset is not None:
             # The first sample of a start failed: its group contains the pause and a held offset.
             self._pass_noted_pause(step, step.offset.seq)
-        result = apply(compensation, step, commands=commands, since=self.seq + 1 if self.seq >= 0 else None)
+        since = self.seq + 1 if self.seq >= 0 else None
+        result = apply(compensation, step, commands=commands, since=since, checked=True)
         self._file = step.run.get("file", step.file)
         if isinstance(result, Outcome):
             self.seq, self.time_ns = result.sample.seq, result.sample.time_utc_ns

@@ -17,6 +17,7 @@ from compensator.arrays import NAN
 from compensator.errors import DataError
 from compensator.model.engine import EngineState, Estimate
 from compensator.service.plausibility import PlausibilityState
+from compensator.service.probing import ProbingState
 
 #: Version of the state; a state of another version is refused.
 STATE_SCHEMA = 1
@@ -106,6 +107,8 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
         Values kept from sample to sample.
     plausibility : PlausibilityState, optional
         State of the checks between the sensors; omitted if none is on, as in versions without these checks.
+    probing : ProbingState, optional
+        State of the probes; omitted without `[probe]`, as in versions without probes.
     """
 
     schema: int
@@ -117,13 +120,15 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     zero: ZeroState
     memory: Memory
     plausibility: PlausibilityState | None = None
+    probing: ProbingState | None = None
 
 
 def encode_state(state: CompensationState) -> bytes:
     """Return a state as JSON."""
     table = msgspec.to_builtins(state)
-    if state.plausibility is None:
-        del table["plausibility"]
+    for name in ("plausibility", "probing"):
+        if table[name] is None:
+            del table[name]
     return json.dumps(_encodable(table), separators=(",", ":")).encode()
 
 

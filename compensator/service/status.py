@@ -7,6 +7,7 @@ from dataclasses import astuple, dataclass
 
 from compensator.messages import EstimateMessage, number
 from compensator.model.engine import Reference
+from compensator.service.probing import ProbingHandover
 from compensator.service.state import ZeroMode, ZeroState
 
 
@@ -74,6 +75,8 @@ class Handover:
         A requested zero that waits for both temperatures.
     model_changed : bool
         Whether the offset is still moving to that of another model.
+    probing : ProbingHandover or None
+        What the probes have shown; None if the successor keeps its own.
     """
 
     offset_um: float = 0.0
@@ -81,6 +84,7 @@ class Handover:
     internal_error: bool = False
     waiting_zero: ZeroMode | None = None
     model_changed: bool = False
+    probing: ProbingHandover | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
 import msgspec
+from msgspec import UnsetType
 
 from compensator.clock import NS
 from compensator.codes import Reason, Remark, State, WatchWarning
@@ -279,7 +281,24 @@ class WatchedMachine:
             "last_malformed": self.last_malformed,
             "events": [self._event(event) for event in reversed(self.events)],
         }
+        found["probe"] = self._probe(status) if self._fresh(status, now_ns) else None
         return found | {name: getattr(status, name, None) for name in _STATUS}
+
+    @staticmethod
+    def _probe(status: Status | None) -> dict[str, Any] | None:
+        """Return whether, by when and why a probe is wanted; None for a machine without probes."""
+        if status is None or isinstance(status.probe_wanted, UnsetType):
+            return None
+        why = explained(status.wanted_why) if status.wanted_why else None
+        return {
+            "wanted": status.probe_wanted,
+            "by_ns": status.wanted_by_ns,
+            "why": why.code if why else "",
+            "means": why.means if why else "",
+            "do": why.do if why else "",
+            "std_um": status.wanted_std_um,
+            "tolerance_um": status.wanted_tolerance_um,
+        }
 
     def _fresh(self, message: Any, now_ns: int) -> bool:
         """Return whether a message is still valid by its own time."""
@@ -294,6 +313,9 @@ class WatchedMachine:
         parts = [("DTF", estimate.y_dtf_um), ("TDTF", estimate.y_tdtf_um), *effects]
         # The prediction at the zero is subtracted from the sum.
         parts += [("at the zero", -estimate.y_base_um)] if estimate.y_base_um else []
+        if self._status is not None and not isinstance(self._status.probe_wanted, UnsetType):
+            shown = [value for _, value in parts if value is not None]
+            parts += [("probes", estimate.y_pred_um - math.fsum(shown))] if estimate.y_pred_um is not None else []
         shares = [{"name": name, "y_um": value} for name, value in parts]
         return {**{name: getattr(estimate, name) for name in _ESTIMATE}, "shares": shares}
 

@@ -17,7 +17,7 @@ from compensator.report.notation import plain, signed
 from compensator.watch.day import STYLES, drawn, evenly, sparkline
 from compensator.watch.history import StateInterval, state_intervals
 from compensator.watch.shop import Shop, headline
-from compensator.watch.words import SIGNS, age, here, zone
+from compensator.watch.words import SIGNS, age, here, probe_text, zone
 
 #: Columns of the table of a shop: heading, minimum width of the terminal.
 _COLUMNS = (
@@ -207,6 +207,7 @@ def detail(
     parts += [
         Text(""),
         numbers,
+        *([Text(probe_text(machine["probe"]))] if machine["probe"] is not None else []),
         *([] if short else [Text(_about(machine), style="dim")]),
         *drawn(history, width - 4, short=short),
     ]
@@ -313,6 +314,7 @@ def line(machine: dict[str, Any]) -> str:
         f"offset {signed(machine['y_offset_um'])} µm ({old})",
         f"residual {signed(machine['residual_um'])} µm",
         *(reason["code"] for reason in machine["reasons"]),
+        *(["probe wanted"] if machine["probe"] is not None and machine["probe"]["wanted"] else []),
         *machine["warnings"],
     ]
     return "  ".join(words)

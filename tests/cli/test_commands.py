@@ -249,6 +249,7 @@ def test_bad_tables_get_one_line_and_exit_2(
     assert expected in error and error.count("\n") == 1 and "Traceback" not in error
 
 
+PROBE_TABLE = "[probe]\nstd_um = 1.0\nmeasured_max_um = 60.0\nlargest_um = 40.0\n"
 BAD_CONFIGS = [
     (
         "offset_max_um = 200.0",
@@ -266,6 +267,11 @@ BAD_CONFIGS = [
     ('file = "quill"', 'file = "absent.toml"', "expected a model file"),
     ("range = [0.0, 80.0]", "range = [80.0, 0.0]", "expected the lower bound first"),
     ("rate_max_per_min = 30.0\n", "", "rate_max_per_min is missing"),
+    ("[machine]", "[probe]\nstd_um = 1.0\n[machine]", "probe.measured_max_um: missing"),
+    ("[machine]", PROBE_TABLE.replace("1.0", "0.0") + "[machine]", "probe.std_um = 0.0"),
+    ("[machine]", PROBE_TABLE.replace("40.0", "400.0") + "[machine]", "probe.largest_um = 400, expected at most"),
+    ("[machine]", PROBE_TABLE + "oldest_min = 1000.0\n[machine]", "probe.oldest_min = 1000.0"),
+    ("[machine]", PROBE_TABLE + "often = true\n[machine]", "probe.often: no such key, expected one of: std_um"),
 ]
 
 

@@ -18,6 +18,7 @@ from compensator.clock import VirtualClock
 from compensator.config import Config, LoadedConfig
 from compensator.messages import Event, encode, number
 from compensator.model.model_file import parse_model, read_model_bytes
+from compensator.recording.live_file import TOPICS, TOPICS_WITH_PROBES
 from compensator.recording.reading import first_sequence, recordings
 from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
@@ -87,7 +88,12 @@ class Machine:
         note = OffsetCheckpoint(self.recordings, MACHINE, self.folder)
         early = note.read(self.config.limits.offset_max_um)
         resumed = resume(loaded, check_model(self.config, data, source="test"), early)
-        recorder = McapRecorder(self.recordings, MACHINE, {"config.toml": self.config_bytes, "model.toml": data})
+        recorder = McapRecorder(
+            self.recordings,
+            MACHINE,
+            {"config.toml": self.config_bytes, "model.toml": data},
+            topics=TOPICS if self.config.probe is None else TOPICS_WITH_PROBES,
+        )
         daemon = self.daemon = Daemon(
             config=self.config,
             compensation=resumed.compensation,

@@ -159,9 +159,10 @@ class Adoption:
         for outcome in order.since:
             candidate.update(outcome)
         new = candidate.compensation
-        before, after = old.status, new.status
+        before = old.status
         has_offset = not math.isnan(before.target_um)
         new.continue_from(replace(before.handover, model_changed=has_offset))
+        after = new.status
         difference = after.target_um - before.target_um
         self._journal.start_new_file(data)
         named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]

@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from compensator.codes import Reason
-from compensator.config import LoadedConfig
+from compensator.config import LoadedConfig, parse_config
 from compensator.errors import CompensatorError, DataError
 from compensator.events import CommandName, EventKind, Note, command_of
 from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import recordings
-from compensator.service.compensation import Compensation, Outcome
+from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.offset_checkpoint import CheckpointedOffset
+from compensator.service.probing import ProbingHandover
 from compensator.service.replay import RecordedStep, apply, opening_of, steps_of
 from compensator.service.state import CompensationState, decode_state
 from compensator.service.status import Handover
@@ -40,7 +41,8 @@ class Resumed:
 
     def continue_from(self, offset_um: float) -> None:
         """Continue from another offset than the compensation's own, µm."""
-        self.compensation.continue_from(replace(self.compensation.status.handover, offset_um=offset_um))
+        own = self.compensation.status.handover
+        self.compensation.continue_from(replace(own, offset_um=offset_um, probing=None))
 
 
 @dataclass(slots=True)
@@ -206,6 +208,23 @@ def _continue(resumed: Resumed, last: _LastFile, compensation: Compensation, dif
     )
 
 
+def _probing_of(last: _LastFile) -> ProbingHandover:
+    """Return what the probes had shown at the end of a file, replayed with the configuration and model in it."""
+    nothing = ProbingHandover()
+    if last.state is None or last.state.probing is None:
+        return nothing
+    try:
+        config = parse_config(last.opening.get("config.toml", b""), source=f"{last.path.name}: config.toml")
+        model = model_of(config, last.opening.get("model.toml", b""), source=f"{last.path.name}: model.toml")
+        compensation = Compensation(config, model)
+        compensation.restore(last.opening["state.json"])
+        for step in steps_of(last.path):
+            apply(compensation, step)
+    except CompensatorError:
+        return nothing
+    return compensation.status.handover.probing or nothing
+
+
 def _warm(resumed: Resumed, last: _LastFile, loaded: LoadedConfig, model: ThermalModel, why: str) -> None:
     """Warm up a new compensation on the recordings; if that fails it starts as at the first start."""
     config = loaded.config
@@ -228,5 +247,6 @@ def _warm(resumed: Resumed, last: _LastFile, loaded: LoadedConfig, model: Therma
             last.handover,
             waiting_zero=resumed.compensation.status.handover.waiting_zero,
             model_changed=last.state is None or last.state.model_sha256 != model.sha256,
+            probing=_probing_of(last),
         )
     )

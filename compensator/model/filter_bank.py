@@ -1,0 +1,268 @@
+"""A bank of Kalman filters for what a model's deformation lacks: an offset, relative gains, zeros of features.
+
+The filters differ in how fast the offset walks and in whether its level was known before the first value. Their
+weights are how well they predicted the values. Only +, −, ·, / and square roots, in a fixed order: the same values
+give the same bits on every machine.
+
+Sources: Magill, Optimal adaptive estimation of sampled stochastic processes (1965): the bank; Herbster and Warmuth,
+Tracking the best expert (1998): the share of the weights that is spread.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from compensator.arrays import Matrix, Vector
+
+#: Walks of the offset, µm/√min, and how probable each is before the first value.
+WALKS_UM = (0.02, 0.042, 0.087, 0.18, 0.38, 0.8)
+WALK_WEIGHTS = tuple(1.0 / math.sqrt(w) / sum(1.0 / math.sqrt(v) for v in WALKS_UM) for w in WALKS_UM)
+#: Standard deviation of the offset before the first value, µm: the machine was zeroed, or the level is anything.
+LEVELS_UM = (3.0, 1000.0)
+#: Standard deviation of the zero of a further feature before its first value, µm.
+ZERO_STD_UM = 1000.0
+#: Share of the weights of the walks that returns to `WALK_WEIGHTS` at each value, so that a change is found.
+FORGETTING = 0.005
+#: How often a value is wrong (a chip, another feature), and by about how much, µm.
+WRONG_SHARE, WRONG_UM = 0.05, 20.0
+#: Degrees of freedom of the t distributions; odd, so that their densities need whole powers only.
+FREEDOM = 7
+
+_GROUPS = range(0, len(WALKS_UM) * len(LEVELS_UM), len(WALKS_UM))
+#: Number of filters: the walks for one level, then for the next.
+SIZE = len(WALKS_UM) * len(LEVELS_UM)
+
+
+@dataclass(frozen=True, slots=True)
+class Weighing:
+    """What a value says of the filters.
+
+    Parameters
+    ----------
+    right : float
+        Probability that the value is right.
+    density : float
+        How well the bank foretold it, but for a factor that is common to all banks.
+    weights : list of float
+        Weights of the filters after it.
+    """
+
+    right: float
+    density: float
+    weights: list[float]
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What each filter expected of a value.
+
+    Parameters
+    ----------
+    innovation : numpy.ndarray, shape (SIZE,)
+        The value less what was expected, µm.
+    variance : numpy.ndarray, shape (SIZE,)
+        Its variance, µm².
+    column : numpy.ndarray, shape (SIZE, n)
+        Covariance of the states with it.
+    """
+
+    innovation: Vector
+    variance: Vector
+    column: Matrix
+
+
+class FilterBank:
+    """Kalman filters with the states offset, gains, zeros.
+
+    Parameters
+    ----------
+    gain_stds, gain_walks : sequence of float
+        Standard deviation of each relative gain before the first value, and its walk, 1/√min.
+    """
+
+    def __init__(self, gain_stds: Sequence[float], gain_walks: Sequence[float]) -> None:
+        n = 1 + len(gain_stds)
+        self.x: Matrix = np.zeros((SIZE, n))
+        self.P: Matrix = np.zeros((SIZE, n, n))
+        self.P[:, np.arange(1, n), np.arange(1, n)] = np.array(gain_stds) ** 2
+        self.P[:, 0, 0] = np.repeat(LEVELS_UM, len(WALKS_UM)) ** 2
+        self.walks = np.tile(np.array([0.0, *gain_walks]) ** 2, (SIZE, 1))
+        self.walks[:, 0] = np.tile(WALKS_UM, len(LEVELS_UM)) ** 2
+        self.weights = [weight / len(LEVELS_UM) for _ in LEVELS_UM for weight in WALK_WEIGHTS]
+
+    def add_zero(self) -> None:
+        """Add the zero of a further feature."""
+        n = self.x.shape[1]
+        self.x = np.pad(self.x, ((0, 0), (0, 1)))
+        self.P = np.pad(self.P, ((0, 0), (0, 1), (0, 1)))
+        self.P[:, n, n] = ZERO_STD_UM**2
+        self.walks = np.pad(self.walks, ((0, 0), (0, 1)))
+
+    def advance(self, minutes: float) -> None:
+        """Let the states walk for a time, min."""
+        states = np.arange(self.x.shape[1])
+        self.P[:, states, states] += minutes * self.walks
+
+    def expected(self, h: Sequence[float], value_um: float, std_um: float, age_min: float = 0.0) -> Expected:
+        """Compare a value with what was expected of it.
+
+        Parameters
+        ----------
+        h : sequence of float, length n
+            What of each state it shows.
+        value_um, std_um : float
+            The value and its standard deviation, µm.
+        age_min : float
+            How long ago it was measured, when the offset had not walked as far yet, min.
+        """
+        innovation = np.full(SIZE, value_um)
+        column = np.zeros_like(self.x)
+        for i, weight in enumerate(h):
+            innovation = innovation - weight * self.x[:, i]
+            column = column + weight * self.P[:, :, i]
+        variance = std_um**2 + age_min * self.walks[:, 0]
+        for i, weight in enumerate(h):
+            variance = variance + weight * column[:, i]
+        return Expected(innovation, variance, column)
+
+    def innovation(self, expected: Expected) -> tuple[float, float]:
+        """Return the innovation of the whole bank, µm, and its variance, µm²."""
+        mean, variance = 0.0, 0.0
+        each = expected.innovation.tolist()
+        for weight, value in zip(self.weights, each, strict=True):
+            mean += weight * value
+        for weight, value, own in zip(self.weights, each, expected.variance.tolist(), strict=True):
+            variance += weight * (own + (value - mean) ** 2)
+        return mean, variance
+
+    def weigh(self, expected: Expected) -> Weighing:
+        """Judge the filters by a value, and the value by the filters.
+
+        A wrong value is further off by about `WRONG_UM`. Where it is more probably wrong, the walks that allow it
+        gain weight all the same: what moved may be the machine.
+        """
+        right, wrong, found = 0.0, 0.0, []
+        each = zip(self.weights, expected.innovation.tolist(), expected.variance.tolist(), strict=True)
+        for weight, innovation, variance in each:
+            as_right = (1.0 - WRONG_SHARE) * _density(innovation, variance)
+            as_wrong = WRONG_SHARE * _density(innovation, variance + WRONG_UM**2)
+            right += weight * as_right
+            wrong += weight * as_wrong
+            found.append(weight * (as_right + as_wrong))
+        total = right + wrong
+        return Weighing(right / total, total, _spread([value / total for value in found], FORGETTING))
+
+    def correct(self, expected: Expected) -> None:
+        """Correct every filter by a value, and the weights."""
+        gain = expected.column / expected.variance[:, None]
+        self.x = self.x + gain * expected.innovation[:, None]
+        self.P = self.P - gain[:, :, None] * expected.column[:, None, :]
+        self.P = 0.5 * (self.P + self.P.transpose(0, 2, 1))
+        self.weights = self.weigh(expected).weights
+
+    def weights_of_walks(self) -> list[float]:
+        """Return the weights with each walk's as it is, and every level as probable as before the first value."""
+        found = []
+        for walk in range(len(WALKS_UM)):
+            total = 0.0
+            for start in _GROUPS:
+                total += self.weights[start + walk]
+            found.append(total / len(LEVELS_UM))
+        return found * len(LEVELS_UM)
+
+    def copy(self) -> FilterBank:
+        """Return a bank in the same state."""
+        found = FilterBank((), ())
+        found.x, found.P, found.walks = self.x.copy(), self.P.copy(), self.walks.copy()
+        found.weights = list(self.weights)
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the state, for JSON."""
+        return {"weights": list(self.weights), "states": self.x.tolist(), "covariances": self.P.tolist()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from what `to_dict` of a bank with the same states returned.
+
+        Raises
+        ------
+        ValueError
+            If it has other states, or a number is missing.
+        """
+        weights = [float(weight) for weight in state["weights"]]
+        x, p = np.array(state["states"], dtype=float), np.array(state["covariances"], dtype=float)
+        if (x.shape, p.shape, len(weights)) != (self.x.shape, self.P.shape, SIZE):
+            raise ValueError(f"{len(weights)} filters with states of shape {x.shape}, expected {self.x.shape}")
+        if not (np.isfinite(x).all() and np.isfinite(p).all() and all(map(math.isfinite, weights))):
+            raise ValueError("a number is missing or not finite")
+        self.x, self.P, self.weights = x, p, weights
+
+    def widen(self, jump_um: float, zero: int | None = None) -> None:
+        """Admit that the offset may have moved by this much, µm, and that its walk is not known any more.
+
+        Parameters
+        ----------
+        jump_um : float
+            How much, µm.
+        zero : int, optional
+            The state of a zero that is unknown again.
+        """
+        self.P[:, 0, 0] += jump_um**2
+        if zero is not None:
+            self.P[:, zero, zero] += ZERO_STD_UM**2
+        self.weights = _spread(self.weights, 1.0)
+
+    def mixture(self, n: int) -> tuple[list[float], list[list[float]], list[float]]:
+        """Return mean, lower triangle of the covariance, and growth of the variances a minute, of `n` states."""
+        x, p, walks = self.x.tolist(), self.P.tolist(), self.walks.tolist()
+
+        def mean(values: Sequence[float]) -> float:
+            total = 0.0
+            for weight, value in zip(self.weights, values, strict=True):
+                total += weight * value
+            return total
+
+        means = [mean([row[i] for row in x]) for i in range(n)]
+        covariance = [
+            [
+                mean([p[k][i][j] + (x[k][i] - means[i]) * (x[k][j] - means[j]) for k in range(SIZE)])
+                for j in range(i + 1)
+            ]
+            for i in range(n)
+        ]
+        return means, covariance, [mean([row[i] for row in walks]) for i in range(n)]
+
+
+def _spread(weights: Sequence[float], share: float) -> list[float]:
+    """Return weights of which a share has returned to `WALK_WEIGHTS`; those of the levels are kept."""
+    found = []
+    for start in _GROUPS:
+        group = weights[start : start + len(WALKS_UM)]
+        total = 0.0
+        for weight in group:
+            total += weight
+        found += [(1.0 - share) * w + share * total * own for w, own in zip(group, WALK_WEIGHTS, strict=True)]
+    return found
+
+
+def _density(innovation: float, variance: float) -> float:
+    """Return a t distribution's density but for a factor that is common to all."""
+    tail = 1.0 + innovation * innovation / (FREEDOM * variance)
+    return 1.0 / (math.sqrt(variance) * tail * tail * tail * tail)
+
+
+def transformed(matrix: Matrix, x: Matrix, p: Matrix) -> tuple[Matrix, Matrix]:
+    """Return T x and T P T' for each filter, summed in a fixed order."""
+
+    def times(right: Matrix) -> Matrix:
+        total = np.zeros((right.shape[0], matrix.shape[0], *right.shape[2:]))
+        for j in range(matrix.shape[1]):
+            total = total + np.multiply.outer(matrix[:, j], right[:, j]).swapaxes(0, 1)
+        return total
+
+    return times(x), times(times(p).transpose(0, 2, 1))

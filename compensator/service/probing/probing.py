@@ -1,0 +1,348 @@
+"""Probes of one compensation: which of them can be used, the correction that they give, and when another is wanted.
+
+    predicted deformation = model + correction,   deformation of a probe = measured − applied offset
+
+The correction is limited to `probe.largest_um`. It goes on while the offset is held or a temperature is missing: what
+is known stays known, and its standard deviation grows. No clock, socket or file, as in `compensation`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+
+from compensator.arrays import NAN
+from compensator.clock import NS
+from compensator.codes import ProbeCode
+from compensator.config import Config
+from compensator.config import Probe as ProbeSettings
+from compensator.errors import DataError
+from compensator.events import EventKind, Note, ProbeData
+from compensator.messages import Probe
+from compensator.model.probe_correction import ProbeCorrection
+from compensator.service.probing.checks import check_probe
+from compensator.service.probing.past import predicted_at
+from compensator.service.probing.received import ProbeRefused, ReceivedProbe, Verdict, recorded_probe
+from compensator.service.probing.state import KnownProbe, PastSample, ProbingState
+
+#: Samples that are kept beyond `probe.oldest_min`: a probe is compared with the one after it, and waits for a sample.
+_MORE_SAMPLES = 4
+#: Largest number of compared probes that are kept to recognise duplicates.
+_KNOWN = 100
+#: Refusals after which no other probe is wanted: the same value is known already, or none can be used.
+_NOT_ASKED = (ProbeCode.DUPLICATE, ProbeCode.TOO_MANY_FEATURES, ProbeCode.AXIS)
+_WORDS = {"": "taken", ProbeCode.OUTLIER: "refused", ProbeCode.BELIEVED: "taken against earlier ones"}
+#: How far ahead the next probe is foreseen, min, and the step of the forecast.
+_AHEAD_MIN, _FORECAST_MIN = 1440.0, 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Corrected:
+    """What the probes add to the prediction of a sample; all zero before the first probe.
+
+    Parameters
+    ----------
+    y_um, rate_um_per_min : float
+        Correction of the deformation, and of its growth.
+    std_um : float
+        Standard deviation of the corrected deformation; NaN if no probe was taken.
+    is_limited : bool
+        Whether the correction has reached its limit.
+    """
+
+    y_um: float = 0.0
+    rate_um_per_min: float = 0.0
+    std_um: float = NAN
+    is_limited: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """Whether, by when and why a probe is wanted; see `messages.Status`."""
+
+    is_wanted: bool
+    by_ns: int | None
+    why: str
+    std_um: float
+    tolerance_um: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ProbingHandover:
+    """State that the probes pass on to another model; without one nothing is known of what was published."""
+
+    state: ProbingState | None = None
+
+
+class Probing:
+    """Probes of one compensation.
+
+    Parameters
+    ----------
+    settings : config.Probe
+        `[probe]`.
+    names : sequence of str
+        Paths and effects of the model (`Engine.contribution_names`).
+    offset_max_um : float
+        Largest offset, µm.
+    period_s : float
+        Length of a sample, s.
+    """
+
+    def __init__(self, settings: ProbeSettings, names: Sequence[str], *, offset_max_um: float, period_s: float) -> None:
+        self._settings = settings
+        self._names = tuple(names)
+        self._offset_max_um = offset_max_um
+        self._period_s = period_s
+        self._kept = math.ceil(60.0 * settings.oldest_min / period_s) + _MORE_SAMPLES
+        self._correction = ProbeCorrection(names)
+        self._state = ProbingState(correction={})
+
+    @classmethod
+    def of(cls, config: Config, names: Sequence[str], period_s: float) -> Probing | None:
+        """Return the probes of a configuration; None without `[probe]`."""
+        if config.probe is None:
+            return None
+        return cls(config.probe, names, offset_max_um=config.limits.offset_max_um, period_s=period_s)
+
+    # ------------------------------------------------------------------ state
+
+    @property
+    def state(self) -> ProbingState:
+        """Everything that determines what comes next."""
+        return replace(self._state, correction=self._correction.to_dict())
+
+    def restore(self, state: ProbingState) -> None:
+        """Continue from a state, with the same bits.
+
+        Raises
+        ------
+        DataError
+            If it belongs to another model or cannot be used; nothing is changed then.
+        """
+        try:
+            correction = ProbeCorrection.from_dict(state.correction)
+        except ValueError as error:
+            raise DataError(f"state: {error}") from error
+        sizes = {len(sample.contributions_um) for sample in state.samples} | {len(correction.names)}
+        if correction.names != self._names or sizes != {len(self._names)}:
+            raise DataError(f"state: probes of {list(correction.names)}, expected {list(self._names)}")
+        self._correction, self._state = correction, state
+
+    @property
+    def handover(self) -> ProbingHandover:
+        """State for a successor."""
+        return ProbingHandover(self.state)
+
+    def continue_from(self, handover: ProbingHandover) -> None:
+        """Continue from the probes of another compensation, at the same sample and without a jump.
+
+        The samples are those that this one has predicted, with the offsets that the other one has published.
+        """
+        before = handover.state or ProbingState(correction={})
+        own = {sample.time_ns: sample for sample in self._state.samples}
+        # The gains of another model start anew: what they correct at this moment goes into the offset.
+        common = [sample for sample in before.samples if sample.time_ns in own]
+        if common and common[-1] is before.samples[-1]:
+            then, now = common[-1], own[common[-1].time_ns]
+            self._correction = ProbeCorrection.from_dict(before.correction).transferred(
+                self._names, then.contributions_um, now.contributions_um, now.y_um - then.y_um
+            )
+        else:  # The successor has no prediction yet, so there is nothing that the correction could be added to.
+            self._correction = ProbeCorrection(self._names)
+        self._state = ProbingState(
+            correction={},
+            samples=[_as_published(own[sample.time_ns], sample) for sample in common],
+            known=before.known,
+            features=before.features if self._correction.active else [],
+            zero_ns=before.zero_ns,
+            refused=before.refused,
+        )
+
+    def set_zero(self, time_ns: int) -> None:
+        """Forget what belongs to the previous zero; what the probes have shown about the gains stays."""
+        self._correction = self._correction.at_zero()
+        self._state = ProbingState(correction={}, known=self._state.known, zero_ns=time_ns)
+
+    def pass_time(self, contributions_um: Sequence[float], minutes: float) -> None:
+        """Advance over samples that were not measured."""
+        self._correction.step(contributions_um, minutes)
+
+    # ------------------------------------------------------------------ one sample
+
+    def add(self, sample: PastSample) -> None:
+        """Advance to a sample, before its offset is known."""
+        if self._state.samples and sample.time_ns <= self._state.samples[-1].time_ns:
+            # The clock was set back: which sample a time belongs to is not known any more.
+            self._state.samples, self._state.zero_ns = [], 0
+            self._state.known = [known for known in self._state.known if known.time_ns < sample.time_ns]
+        self._correction.step(sample.contributions_um, self._period_s / 60.0)
+        self._state.samples = [*self._state.samples[1 - self._kept :], sample]
+
+    def publish(self, offset_um: float, rate_um_per_min: float, *, is_held: bool) -> None:
+        """Add the offset of the last sample."""
+        last = self._state.samples[-1]
+        self._state.samples[-1] = msgspec.structs.replace(
+            last, offset_um=offset_um, offset_rate_um_per_min=rate_um_per_min, is_held=is_held
+        )
+
+    def corrected(self, contributions_um: Sequence[float], noise_um: float) -> Corrected:
+        """Return what the probes add to the prediction after the last sample.
+
+        Parameters
+        ----------
+        contributions_um : sequence of float
+            Share of each path and effect.
+        noise_um : float
+            Standard deviation of the prediction that sensor noise and missing samples cause.
+        """
+        if not self._correction.active:
+            return Corrected()
+        correction, largest = self._correction, self._settings.largest_um
+        whole_um = correction.correction_um(contributions_um)
+        std_um = math.hypot(correction.std_um(contributions_um), noise_um)
+        if abs(whole_um) > largest:
+            y_um = math.copysign(largest, whole_um)
+            return Corrected(y_um=y_um, std_um=math.hypot(std_um, whole_um - y_um), is_limited=True)
+        rate = 0.0
+        if len(self._state.samples) > 1:
+            # As the paths have grown over the last sample: how they will grow over the next is not known here.
+            before, last = self._state.samples[-2:]
+            minutes = (last.time_ns - before.time_ns) / (60.0 * NS)
+            rate = (whole_um - correction.correction_um(before.contributions_um)) / minutes
+        return Corrected(y_um=whole_um, rate_um_per_min=rate, std_um=std_um)
+
+    # ------------------------------------------------------------------ probes
+
+    def check(self, probe: ReceivedProbe, waiting: Sequence[ReceivedProbe] = ()) -> None:
+        """Check a probe against what was published, without comparing it with the prediction.
+
+        Parameters
+        ----------
+        probe : ReceivedProbe
+            The probe.
+        waiting : sequence of ReceivedProbe
+            Probes that wait for the next sample before it.
+
+        Raises
+        ------
+        ProbeRefused
+            If it cannot be used.
+        """
+        known = [*self._state.known, *(_known(earlier) for earlier in waiting)]
+        check_probe(
+            probe,
+            replace(self._state, known=known) if waiting else self._state,
+            self._settings,
+            offset_max_um=self._offset_max_um,
+            period_s=self._period_s,
+        )
+
+    def decide(self, machine: str, seq: int, probes: Sequence[ReceivedProbe]) -> tuple[list[Probe], list[Note]]:
+        """Decide the probes that arrived since the last sample; return their records and events."""
+        records, notes = [], []
+        for probe in probes:
+            verdict = self._decide(probe)
+            record = recorded_probe(machine, seq, probe, verdict)
+            records.append(record)
+            compared = not math.isnan(verdict.innovation_um)
+            data = ProbeData(
+                taken=record.taken,
+                code=record.code,
+                probe_utc_ns=record.time_utc_ns,
+                feature=record.feature,
+                innovation_um=record.innovation_um if compared else None,
+                innovation_std_um=record.innovation_std_um if compared else None,
+                by=record.by,
+            )
+            notes.append(Note(EventKind.PROBE, verdict.text, data.table()))
+        return records, notes
+
+    def _decide(self, probe: ReceivedProbe) -> Verdict:
+        try:
+            self.check(probe)
+        except ProbeRefused as refused:
+            if refused.code not in _NOT_ASKED:
+                self._state.refused = refused.code
+            return Verdict(taken=False, code=refused.code, text=str(refused))
+        request, samples = probe.request, self._state.samples
+        predicted = predicted_at(samples, request.time_utc_ns, self._period_s)
+        assert predicted is not None
+        std_um = request.std_um if request.std_um is not None else self._settings.std_um
+        deformation_um = request.measured_um - request.offset_applied_um
+        found = self._correction.update(
+            deformation_um,
+            math.hypot(std_um, predicted.noise_um),
+            predicted.y_um,
+            predicted.contributions_um,
+            request.feature,
+        )
+        self._state.known = [*self._state.known[1 - _KNOWN :], _known(probe)]
+        if request.feature not in self._state.features:
+            self._state.features = [*self._state.features, request.feature]
+        self._state.refused = "" if found.taken else ProbeCode.OUTLIER
+        text = (
+            f"probe {_WORDS[found.reason or '']}: deformation {deformation_um:.2f} µm, "
+            f"{found.innovation_um:+.2f} µm from the prediction (expected ±{found.innovation_std_um:.2f} µm)"
+        )
+        return Verdict(
+            taken=found.taken,
+            code=found.reason or "",
+            text=text,
+            predicted_um=predicted.y_um,
+            innovation_um=found.innovation_um,
+            innovation_std_um=found.innovation_std_um,
+        )
+
+    def wanted(self, y_std_um: float) -> Wanted:
+        """Return whether, by when and why a probe is wanted after the last sample.
+
+        Parameters
+        ----------
+        y_std_um : float
+            Standard deviation that was published with it, µm.
+        """
+        tolerance, samples = self._settings.tolerance_um, self._state.samples
+        if not samples or math.isnan(samples[-1].offset_um) or samples[-1].is_held:
+            # A probe could not be used now.
+            return Wanted(is_wanted=False, by_ns=None, why="", std_um=y_std_um, tolerance_um=tolerance)
+        now_ns, why = samples[-1].time_ns, ""
+        by_ns: int | None = now_ns
+        if self._state.refused:
+            why = self._state.refused
+        elif not self._correction.active:
+            why = ProbeCode.FIRST
+        elif tolerance is not None and y_std_um > tolerance:
+            why = ProbeCode.DEVIATION
+        else:
+            by_ns = self._exceeded_ns(tolerance, y_std_um) if tolerance is not None else None
+        return Wanted(is_wanted=bool(why), by_ns=by_ns, why=why, std_um=y_std_um, tolerance_um=tolerance)
+
+    def _exceeded_ns(self, tolerance_um: float, y_std_um: float) -> int | None:
+        """Return when the standard deviation will exceed the tolerance; None if not within a day."""
+        last = self._state.samples[-1]
+        ahead = ProbeCorrection.from_dict(self._correction.to_dict())
+        now_um2 = ahead.std_um(last.contributions_um) ** 2
+        ahead.step(last.contributions_um, _FORECAST_MIN)
+        # The variance grows in proportion to the time, as the states walk.
+        growth = (ahead.std_um(last.contributions_um) ** 2 - now_um2) / _FORECAST_MIN
+        if growth <= 0.0:
+            return None
+        minutes = max(tolerance_um**2 - y_std_um**2, 0.0) / growth
+        return last.time_ns + round(minutes * 60.0 * NS) if minutes <= _AHEAD_MIN else None
+
+
+def _known(probe: ReceivedProbe) -> KnownProbe:
+    return KnownProbe(probe.request.time_utc_ns, probe.request.measured_um, probe.request.feature)
+
+
+def _as_published(own: PastSample, published: PastSample) -> PastSample:
+    return msgspec.structs.replace(
+        own,
+        offset_um=published.offset_um,
+        offset_rate_um_per_min=published.offset_rate_um_per_min,
+        is_held=published.is_held,
+    )
