@@ -18,6 +18,8 @@ from compensator.probes.settings import Dprnt, convention
 _SHOWN = 120
 #: Largest number of lines of others that are reported; the port may have another use.
 _FOREIGN = 5
+#: After so many unusable lines in a row only each so many is reported: a wrong baud rate makes several a second.
+_REFUSED, _EACH = 20, 1000
 
 
 class PrintedProbes:
@@ -48,6 +50,7 @@ class PrintedProbes:
         self._report = report
         self._zone = zoneinfo.ZoneInfo(settings.zone)
         self._foreign = 0
+        self._refused = 0
         self.connected()
 
     def connected(self) -> None:
@@ -110,6 +113,7 @@ class PrintedProbes:
         if offset_um is None:
             self._refuse(ProbeSourceRemark.LINE_OFFSET_UNKNOWN, text, "no O")
             return
+        self._refused = 0
         measured_um = convention(settings).measured_um(printed.reading_um, offset_um)
         self._submit(
             Probe(
@@ -132,5 +136,9 @@ class PrintedProbes:
             self._report(f"{self._settings.name}: not a probe: {text[:_SHOWN]!r}{end}")
 
     def _refuse(self, code: ProbeSourceRemark, text: str, why: str) -> None:
-        figures = f"{self._settings.name}: not sent: {text[:_SHOWN]!r}: {why}."
+        self._refused += 1
+        if self._refused > _REFUSED and self._refused % _EACH:
+            return
+        count = f" ({self._refused} in a row)" if self._refused >= _REFUSED else ""
+        figures = f"{self._settings.name}: not sent{count}: {text[:_SHOWN]!r}: {why}."
         self._report(Remark(code, figures).marked)

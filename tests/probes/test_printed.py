@@ -128,6 +128,14 @@ def test_other_lines_are_reported_a_few_times() -> None:
     assert len(bench.probes) == 1 and len(bench.reports) == 5
 
 
+def test_a_wrong_baud_rate_does_not_fill_the_log() -> None:
+    bench = Bench()
+    bench.receive(b"\xff\r" * 5000)
+    assert len(bench.reports) == 25 and "(5000 in a row)" in bench.reports[-1]
+    bench.receive(LINE + b"\xff\r")
+    assert len(bench.probes) == 1 and len(bench.reports) == 26
+
+
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.one_of(st.binary(max_size=300), st.just(LINE), st.sampled_from([LINE[:30], LINE[30:]]))), st.data())
 def test_no_bytes_end_the_reading(pieces: list[bytes], data: st.DataObject) -> None:

@@ -12,6 +12,7 @@ from compensator.cli import main
 from compensator.commands.probes import CommandSink
 from compensator.probes.probe import NotSent, Probe, Reply
 from compensator.probes.settings import Service
+from compensator.service.probing.received import read_probe
 from compensator.service.publisher import Sender
 from tests.security.shop import BOTH, OFFSET, PREFIX, Plant, Shop, wait
 from tests.security.test_access import COMMAND, tamper
@@ -30,6 +31,7 @@ def test_it_sends_probes_in_its_own_name(plant: Plant, shop: Shop) -> None:
     assert sink(shop).send(PROBE) == Reply(True, "heard")
     ((name, payload, sender),) = plant.commands
     assert (name, sender) == ("probe", Sender("probe-07", "certificate"))
+    assert read_probe(payload).feature == "sphere-1"  # what the service makes of it
     assert json.loads(payload) == {
         "schema": 1,
         "time_utc_ns": 1,
