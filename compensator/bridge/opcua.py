@@ -116,6 +116,7 @@ class Bridge:
             "heartbeat_node": _INTEGERS,
             "state_node": _INTEGERS,
             "enable_node": (ua.VariantType.Boolean,),
+            "probe_wanted_node": (ua.VariantType.Boolean,),
         }
         for key, kinds in wanted.items():
             name = getattr(self._settings, key)
@@ -148,7 +149,10 @@ class Bridge:
                 self.register.wrote(value)
         self._beat = (self._beat + 1) % HEARTBEAT_MODULUS
         state = STATES.index("trouble" if self.register.trouble else applied.state)
-        for key, number in (("state_node", state), ("heartbeat_node", self._beat)):
+        wanted = self._receiver.probe_wanted
+        shown = {"state_node": state, "heartbeat_node": self._beat}
+        shown["probe_wanted_node"] = wanted is not None and wanted.wanted
+        for key, number in shown.items():
             if key in nodes:
                 await _write(nodes[key][0], number, nodes[key][1])
         self._report_change(applied)

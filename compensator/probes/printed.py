@@ -51,11 +51,7 @@ class PrintedProbes:
         self._zone = zoneinfo.ZoneInfo(settings.zone)
         self._foreign = 0
         self._refused = 0
-        self.connected()
-
-    def connected(self) -> None:
-        """Begin a new connection."""
-        self._lines = Lines(cast(Bits, self._settings.bits))
+        self._lines = Lines(cast(Bits, settings.bits))
 
     def disconnected(self) -> None:
         """Report the rest of a connection that has ended."""

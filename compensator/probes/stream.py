@@ -112,7 +112,6 @@ class Stream:
     async def _read(self, reader: asyncio.StreamReader, stop: asyncio.Event) -> None:
         freshness = Freshness(self._settings.settle_s, self._settings.pause_s)
         freshness.connected(self._clock())
-        self._probes.connected()
         waits = asyncio.ensure_future(stop.wait())
         read: asyncio.Future[bytes] | None = None
         try:

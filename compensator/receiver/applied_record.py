@@ -10,7 +10,7 @@ from pathlib import Path
 STEP_UM, EVERY_S = 0.02, 2.0
 #: Shortest time between two lines, s.
 SHORTEST_S = 0.1
-#: A time further than this from the values around it has no offset, s.
+#: Between two values further apart than this the offset is not known, s.
 GAP_S = 10.0
 #: Length at which the file is moved aside, bytes.
 LONGEST = 2_000_000
@@ -81,7 +81,7 @@ def applied_at(path: Path, time_utc_ns: int) -> float | None:
     if after == 0:
         return None
     from_ns, from_um = values[after - 1]
-    if from_um is None or time_utc_ns - from_ns > GAP_S * 1e9:
+    if from_um is None:
         return None
     if after == len(values) or values[after][1] is None or values[after][0] - from_ns > GAP_S * 1e9:
         # Nothing later yet; a gap that begins here is bridged no further than the line before it.

@@ -47,6 +47,7 @@ timeout_s = 5.0
 heartbeat_node = "ns=2;s=/Plc/DB100.DBW4"
 state_node = "ns=2;s=/Plc/DB100.DBW6"
 enable_node = "ns=2;s=/Plc/DB100.DBX8.0"
+probe_wanted_node = "ns=2;s=/Plc/DB100.DBX8.1"
 """
 
 
@@ -101,6 +102,9 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                 assert await at(2.0)  # what it held stands until there is an offset
                 service.put(1, -12.0)
                 await until(lambda: at(12.0), "minus the offset, in mm")
+                assert await plc.probe_wanted.read_value() is False
+                service.put_status(probe_wanted=True)
+                await until(lambda: _is(plc.probe_wanted, True), "a probe is wanted")
                 # For probes: what the PLC holds, with the sign of the offset.
                 await until(lambda: asyncio.sleep(0, _applied_um(tmp_path) == -12.0), "the record")
                 check(plc.values)

@@ -107,6 +107,17 @@ def test_what_is_there_at_the_start_or_after_a_pause_is_refused(tmp_path: Path) 
     assert len(bench.probes) == 2 and "[line_age_unknown]" in bench.reports[1]
 
 
+@pytest.mark.parametrize("written_s", [-60.0, 60.0])
+def test_a_file_of_another_time_is_refused(tmp_path: Path, written_s: float) -> None:
+    bench = Bench(tmp_path)
+    bench.path.write_text(line(50.001))  # copied here with its time, for instance
+    at_ns = T0_NS + round(written_s * 1e9)
+    os.utime(bench.path, ns=(at_ns, at_ns))
+    bench.now_s += 0.1
+    bench.file.poll()
+    assert not bench.probes and "[line_age_unknown]" in bench.reports[0]
+
+
 @pytest.mark.parametrize("text", ["", "1 2 3", "x " * 9, "nan " * 9, line(50.0).replace("50.0", "50,0"), line(60.0)])
 def test_what_is_no_probe_of_this_feature_is_refused(tmp_path: Path, text: str) -> None:
     bench = Bench(tmp_path)
