@@ -17,8 +17,6 @@ from compensator.service.probing.state import PastSample
 _GAP = 1.5
 #: A receiver follows the rate for this many periods, and holds the offset after twice as many.
 _FOLLOWED = 1.25
-#: The offset of a sample may be published this much after its end, s: see `daemon.PATIENCE_S`.
-_LATE_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +63,11 @@ def published_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -
 def offsets_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -> tuple[float, float]:
     """Return the smallest and the largest offset that a control may have applied at a time, µm.
 
-    A control follows the rate or only the offset, and receives the offset of a sample a little after its end.
+    A control follows the rate or only the offset, receives it some time after the end of the sample, and moves at its
+    own permitted rate: it is between the last two.
     """
-    *earlier, newest = _published_until(samples, time_ns)
-    followed = [newest, *(earlier[-1:] if time_ns - newest.time_ns <= _LATE_S * NS else [])]
     values = []
-    for sample in followed:
+    for sample in _published_until(samples, time_ns)[-2:]:
         minutes = min((time_ns - sample.time_ns) / NS, _FOLLOWED * period_s) / 60.0
         values += [sample.offset_um, sample.offset_um + sample.offset_rate_um_per_min * minutes]
     return min(values), max(values)
