@@ -16,9 +16,11 @@ import pytest
 
 from compensator.audit.comparison import compare
 from compensator.audit.series import Audit, audit
+from compensator.cli import main
 from compensator.clock import NS
 from compensator.codes import ProbeCode
 from compensator.config import Zenoh
+from compensator.demo.machine import configuration
 from compensator.errors import ServiceError
 from compensator.messages import ProbeRequest, number
 from compensator.model.model_file import parse_model
@@ -33,7 +35,7 @@ from tests.audit.made import CONFIG, other_model
 from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
 from tests.security.shop import free_port
 from tests.service.living import MACHINE, check_files, largest_step
-from tests.service.probed import PROBED, RATE_UM, ProbedMachine
+from tests.service.probed import PROBE, PROBED, RATE_UM, ProbedMachine
 from tests.service.test_compensation_day import MISSING
 
 MINUTE_NS = 60 * NS
@@ -490,6 +492,19 @@ async def test_the_time_by_which_a_probe_is_wanted_comes_true(tmp_path: Path) ->
     assert foretold["wanted_by_ns"] > foretold["time_utc_ns"]
     (last,) = [s for s in statuses if s["seq"] == first["seq"] - 1]
     assert abs(last["wanted_by_ns"] - first["time_utc_ns"]) < 15 * MINUTE_NS
+
+
+def test_a_tolerance_below_the_noise_of_a_probe_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = configuration(
+        "vmc-07", {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 1, "command": 2}, 7447
+    )
+    path = tmp_path / "machine.toml"
+    path.write_bytes(text.encode() + PROBE.replace(b"tolerance_um = 3.0", b"tolerance_um = 0.5"))
+    assert main(["check", "--config", str(path)]) == 0
+    said = capsys.readouterr()
+    assert "probe_tolerance" in said.err and "probes: on, one value ±1 µm, correction at most 40 µm" in said.out
 
 
 async def test_the_first_probe_is_asked_for(tmp_path: Path) -> None:
