@@ -543,6 +543,11 @@ class ServiceWarning(Code):
         "Certificates are not checked, so an expired one is noticed only when the router refuses it.",
         "Install the extra that reads them: pip install quill-compensator[tls].",
     )
+    PROBE_TOLERANCE = (
+        "probe_tolerance",
+        "The tolerance for probes is smaller than the standard deviation of one of them: one is wanted nearly always.",
+        "Raise probe.tolerance_um, or lower probe.std_um if ten probes of one feature scatter less.",
+    )
     SERVICE_RUNS = (
         "service_runs",
         "The service is running and uses the devices; a second program may be refused or disturb its readings.",

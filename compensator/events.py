@@ -129,8 +129,8 @@ class ProbeData(_Data, frozen=True, kw_only=True):
         The feature.
     innovation_um, innovation_std_um : float, optional
         Measured less predicted deformation, and the standard deviation expected of it, µm.
-    by : str
-        The sender.
+    by, by_proof : str
+        The sender, as in the event of a command.
     """
 
     taken: bool
@@ -139,7 +139,8 @@ class ProbeData(_Data, frozen=True, kw_only=True):
     feature: str = ""
     innovation_um: float | None = None
     innovation_std_um: float | None = None
-    by: str = ""
+    by: str
+    by_proof: str
 
 
 class RecordingCode(StrEnum):

@@ -84,7 +84,8 @@ def level(event: Event) -> int:
         return _LEVELS.get(event.data["state"], logging.WARNING)
     if event.kind == EventKind.ERROR:
         return logging.ERROR
-    return logging.WARNING if event.data.get("ok") is False else logging.INFO
+    refused = event.data.get("ok") is False or event.data.get("taken") is False
+    return logging.WARNING if refused else logging.INFO
 
 
 def status(offset: Offset) -> str:

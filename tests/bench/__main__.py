@@ -8,7 +8,7 @@ python -m tests.bench drawn --help       drawn machines, with options of their o
 import sys
 
 from compensator.blas import in_one_thread
-from tests.bench import audit, diagnosis, drawn, faults, hidden, identification, machines, shop, speed, spindle
+from tests.bench import audit, diagnosis, drawn, faults, hidden, identification, machines, probes, shop, speed, spindle
 from tests.bench.figures import surroundings, table
 
 AREAS = {
@@ -19,6 +19,7 @@ AREAS = {
     "drawn": drawn.report,
     "spindle": spindle.report,
     "hidden": hidden.report,
+    "probes": probes.report,
     "faults": faults.report,
     "audit": audit.report,
     "shop": shop.report,

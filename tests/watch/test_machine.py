@@ -289,3 +289,28 @@ def test_samples_of_a_slow_model_are_one_interval() -> None:
     intervals = [(interval.begin_s, interval.end_s) for interval in state_intervals(day, 750.0)]
     assert intervals == [(2000.0, 2060.0), (0.0, 660.0)]
     assert len(state_intervals(day, 150.0)) == 4
+
+
+WANTED = {
+    "probe_wanted": False,
+    "wanted_by_ns": START_NS + 5400 * NS,
+    "wanted_why": "",
+    "wanted_std_um": 1.2,
+    "wanted_tolerance_um": 3.0,
+}
+
+
+def test_whether_a_probe_is_wanted_and_what_probes_add(heard: Heard) -> None:
+    heard.hear(offset=offset(5), estimate=estimate(5, y_pred_um=14.34))
+    heard.hear(status=status(5))
+    assert heard.machine["probe"] is None  # a machine without probes
+    assert [share["name"] for share in heard.machine["shares"]] == ["DTF", "TDTF", "gain DTF"]
+    heard.hear(status=status(6, START_NS + 60 * NS, **WANTED))
+    probe = heard.machine["probe"]
+    assert (probe["wanted"], probe["by_ns"], probe["std_um"], probe["why"]) == (False, WANTED["wanted_by_ns"], 1.2, "")
+    assert heard.machine["shares"][-1] == {"name": "probes", "y_um": pytest.approx(2.0)}
+    changed = {"probe_wanted": True, "wanted_why": "probe_deviation", "wanted_std_um": 3.1}
+    heard.hear(status=status(7, START_NS + 120 * NS, **(WANTED | changed)))
+    assert heard.machine["probe"]["means"].startswith("The standard deviation exceeds the tolerance")
+    heard.clock.advance(600)  # an old status says nothing about now
+    assert heard.machine["probe"] is None

@@ -44,6 +44,15 @@ PROBE = """if (top === window) {
 LONG = "a_name_without_any_blank_that_is_much_longer_than_a_narrow_window_is_wide_0123456789"
 
 
+WANTED = {
+    "probe_wanted": True,
+    "wanted_by_ns": START_NS,
+    "wanted_why": "probe_outlier",
+    "wanted_std_um": 1.2,
+    "wanted_tolerance_um": 3.0,
+}
+
+
 def shop_in_trouble() -> Shop:
     clock = Clock()
     shop = Shop(clock)
@@ -63,7 +72,7 @@ def shop_in_trouble() -> Shop:
             shop.receive(key + "y/offset", offset(i, t, **({"machine": name, "state": state} | changes)))
             shop.receive(key + "sample", sample(i, t, quality="open_circuit" if name == "hold" else "good"))
             shop.receive(key + "estimate", estimate(i, t))
-            shop.receive(key + "status", status(i, t, devices={"couples": LONG}, recording=LONG))
+            shop.receive(key + "status", status(i, t, devices={"couples": LONG}, recording=LONG, **WANTED))
         clock.advance(60)
     shop.receive("shop/hold/thermal/event", event(3, text=LONG, ok=False))
     shop.receive("shop/hold/thermal/y/offset", b"nonsense")

@@ -64,6 +64,23 @@ def test_one_machine_says_why_and_what_to_do() -> None:
     assert "gain DTF, µm +1.50" in text and "residual, µm −0.34" in text
 
 
+def test_one_line_says_whether_a_probe_is_wanted_and_what_for() -> None:
+    shop, clock = filled("vmc-01")
+    assert "robe wanted" not in shown(shop, 200)
+    wanted = {"probe_wanted": False, "wanted_by_ns": clock.now_ns + 3600 * NS, "wanted_why": ""}
+    wanted |= {"wanted_std_um": 1.25, "wanted_tolerance_um": 3.0}
+    shop.receive("shop/vmc-01/thermal/status", status(3, clock.now_ns, **wanted))
+    text = " ".join(shown(shop, 200).split())
+    assert "(standard deviation 1.25 µm, tolerance 3.00 µm)" in text and "No probe wanted before" in text
+    assert "saves about half of the probes; timing alone saves nothing" in text
+    changed = {"probe_wanted": True, "wanted_why": "probe_outlier", "wanted_tolerance_um": None}
+    shop.receive("shop/vmc-01/thermal/status", status(4, clock.now_ns, **(wanted | changed)))
+    text = " ".join(shown(shop, 200).split())
+    assert "Probe wanted (standard deviation 1.25 µm): The probe does not fit the prediction" in text
+    one = shop.one("shop/vmc-01")
+    assert one is not None and "probe wanted" in line(one)
+
+
 def test_silence_and_a_lost_connection_are_said() -> None:
     shop, clock = filled("vmc-01")
     clock.advance(600)

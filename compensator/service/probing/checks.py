@@ -13,7 +13,7 @@ from compensator.service.probing.state import KnownProbe, ProbingState
 
 #: A probe this far ahead of the clock here is from the future, s: two clocks never agree exactly.
 AHEAD_S = 5.0
-#: The same value of the same feature within this time is the same probe, s: two ways may round its time differently.
+#: The same values of the same feature within this time is the same probe, s: two ways may round its time differently.
 SAME_S = 1.0
 #: Largest number of features between two zeros: each has a zero of its own, which needs a first probe.
 MOST_FEATURES = 16
@@ -113,7 +113,8 @@ def _check_offset(probe: ReceivedProbe, state: ProbingState, settings: ProbeSett
 def _is_same(probe: ReceivedProbe, known: KnownProbe) -> bool:
     request = probe.request
     apart_ns = abs(request.time_utc_ns - known.time_ns)
-    equal = (request.measured_um, request.feature) == (known.measured_um, known.feature)
+    values = (request.measured_um, request.offset_applied_um, request.feature)
+    equal = values == (known.measured_um, known.offset_applied_um, known.feature)
     return apart_ns == 0 or (equal and apart_ns < SAME_S * NS)
 
 

@@ -30,11 +30,15 @@ from compensator.service.probing.state import KnownProbe, PastSample, ProbingSta
 
 #: Samples that are kept beyond `probe.oldest_min`: a probe is compared with the one after it, and waits for a sample.
 _MORE_SAMPLES = 4
+#: Largest number of samples that are kept: they are a part of the state, which is encoded at each sample.
+_MOST_SAMPLES = 300
 #: Largest number of compared probes that are kept to recognise duplicates.
 _KNOWN = 100
 #: Refusals after which no other probe is wanted: the same value is known already, or none can be used.
 _NOT_ASKED = (ProbeCode.DUPLICATE, ProbeCode.TOO_MANY_FEATURES, ProbeCode.AXIS)
 _WORDS = {"": "taken", ProbeCode.OUTLIER: "refused", ProbeCode.BELIEVED: "taken against earlier ones"}
+#: From this standard deviation on nothing was known about the value, µm.
+_UNKNOWN_UM = 200.0
 #: How far ahead the next probe is foreseen, min, and the step of the forecast.
 _AHEAD_MIN, _FORECAST_MIN = 1440.0, 60.0
 
@@ -97,7 +101,7 @@ class Probing:
         self._names = tuple(names)
         self._offset_max_um = offset_max_um
         self._period_s = period_s
-        self._kept = math.ceil(60.0 * settings.oldest_min / period_s) + _MORE_SAMPLES
+        self._kept = min(math.ceil(60.0 * settings.oldest_min / period_s), _MOST_SAMPLES) + _MORE_SAMPLES
         self._correction = ProbeCorrection(names)
         self._state = ProbingState(correction={})
 
@@ -128,6 +132,9 @@ class Probing:
         except ValueError as error:
             raise DataError(f"state: {error}") from error
         sizes = {len(sample.contributions_um) for sample in state.samples} | {len(correction.names)}
+        numbers = [n for s in state.samples for n in (s.y_um, s.rate_um_per_min, s.noise_um, *s.contributions_um)]
+        if not all(map(math.isfinite, numbers)):
+            raise DataError("state: a number of the samples for probes is not finite")
         if correction.names != self._names or sizes != {len(self._names)}:
             raise DataError(f"state: probes of {list(correction.names)}, expected {list(self._names)}")
         self._correction, self._state = correction, state
@@ -257,6 +264,7 @@ class Probing:
                 innovation_um=record.innovation_um if compared else None,
                 innovation_std_um=record.innovation_std_um if compared else None,
                 by=record.by,
+                by_proof=record.by_proof,
             )
             notes.append(Note(EventKind.PROBE, verdict.text, data.table()))
         return records, notes
@@ -284,9 +292,11 @@ class Probing:
         if request.feature not in self._state.features:
             self._state.features = [*self._state.features, request.feature]
         self._state.refused = "" if found.taken else ProbeCode.OUTLIER
+        std_um = found.innovation_std_um
+        known = f"±{std_um:.2f} µm" if std_um < _UNKNOWN_UM else "anything: the first of this feature"
         text = (
             f"probe {_WORDS[found.reason or '']}: deformation {deformation_um:.2f} µm, "
-            f"{found.innovation_um:+.2f} µm from the prediction (expected ±{found.innovation_std_um:.2f} µm)"
+            f"{found.innovation_um:+.2f} µm from the prediction (expected {known})"
         )
         return Verdict(
             taken=found.taken,
@@ -336,7 +346,8 @@ class Probing:
 
 
 def _known(probe: ReceivedProbe) -> KnownProbe:
-    return KnownProbe(probe.request.time_utc_ns, probe.request.measured_um, probe.request.feature)
+    request = probe.request
+    return KnownProbe(request.time_utc_ns, request.measured_um, request.offset_applied_um, request.feature)
 
 
 def _as_published(own: PastSample, published: PastSample) -> PastSample:

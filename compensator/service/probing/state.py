@@ -42,6 +42,7 @@ class KnownProbe(msgspec.Struct, frozen=True, array_like=True):
 
     time_ns: int
     measured_um: float
+    offset_applied_um: float
     feature: str
 
 
