@@ -81,7 +81,11 @@ USERS = {
         Command("report", "make a page from recordings or a folder of results", "report recordings/"),
     ),
     "CNC integrator": (
-        Command("bridge", "write the offset to a control that speaks OPC UA", "bridge opcua --config bridge.toml"),
+        Command(
+            "bridge",
+            "the offset to a control over OPC UA; touch probes to the service",
+            "bridge opcua --config bridge.toml",
+        ),
         Command("router", "run a Zenoh router where no zenohd is installed", "router --config router.json5"),
     ),
     "auditor": (

@@ -548,6 +548,11 @@ class ServiceWarning(Code):
         "Certificates are not checked, so an expired one is noticed only when the router refuses it.",
         "Install the extra that reads them: pip install quill-compensator[tls].",
     )
+    PROBE_TOLERANCE = (
+        "probe_tolerance",
+        "The tolerance for probes is smaller than the standard deviation of one of them: one is wanted nearly always.",
+        "Raise probe.tolerance_um, or lower probe.std_um if ten probes of one feature scatter less.",
+    )
     SERVICE_RUNS = (
         "service_runs",
         "The service is running and uses the devices; a second program may be refused or disturb its readings.",
@@ -617,6 +622,51 @@ class BridgeTrouble(Code):
         "plc_beyond_limit",
         "The PLC's value is not a possible offset; the bridge does not overwrite it.",
         "Correct it in the PLC, to the offset that the axis has now.",
+    )
+
+
+class ProbeSourceRemark(Code):
+    """Why a measured value of a touch probe is not sent to the service, and troubles of its sources."""
+
+    SOURCE_LOST = (
+        "source_lost",
+        "A source of probes cannot be reached or read; the bridge retries.",
+        "Check the cable, the network, the port and the rights of the file or folder.",
+    )
+    LINE_BROKEN = (
+        "line_broken",
+        "A line does not have the agreed form, so nothing of it is used.",
+        "Probe again. If it happens often: check baud rate, parity, cable and macro.",
+    )
+    LINE_INCOMPLETE = (
+        "line_incomplete",
+        "The last line of a file has no line end, so it may be half a line; it is not sent.",
+        "Let the program that writes the file end each line.",
+    )
+    LINE_CHANGED = (
+        "line_changed",
+        "A probe that was handled before is now in the file with another value; the first one stands.",
+        "Append new lines instead of changing old ones.",
+    )
+    LINE_AGE_UNKNOWN = (
+        "line_age_unknown",
+        "A line waited somewhere for an unknown time before it was read; when it was measured is not known.",
+        "Probe again while the bridge is connected.",
+    )
+    LINE_CLOCK_DISAGREES = (
+        "line_clock_disagrees",
+        "The time in the line is not the time at which it arrived: it is late, or the control's clock is wrong.",
+        "Set the control's clock and the key `zone`; probe again.",
+    )
+    LINE_OFFSET_UNKNOWN = (
+        "line_offset_unknown",
+        "The offset that acted at the touch is neither in the line nor in the receiver's record.",
+        "Let the macro print it, or set applied_file for the receiver and for the bridge.",
+    )
+    PROBE_NOT_SENT = (
+        "probe_not_sent",
+        "A probe did not reach the service in time and was given up; it was not sent with another time.",
+        "Check the service, the router and the certificate; probe again.",
     )
 
 
@@ -808,7 +858,7 @@ class AuditFinding(Code):
 
 #: All domains; each code occurs in only one of them.
 DOMAINS: tuple[type[Code], ...] = (
-    *(State, Reason, ProbeCode, SampleQuality, ModelWarning, ServiceWarning, BridgeTrouble),
+    *(State, Reason, ProbeCode, SampleQuality, ModelWarning, ServiceWarning, BridgeTrouble, ProbeSourceRemark),
     *(DataRemark, WatchWarning, AuditRemark, RecordingEnd, AuditFinding),
 )
 

@@ -382,7 +382,7 @@ class Seal(msgspec.Struct, frozen=True, kw_only=True):
     signature: str
 
 
-#: Message of each recorded channel and Zenoh key.
+#: Message of each recorded channel and Zenoh key, and the payload of the command `probe`.
 MESSAGES: Mapping[str, type[msgspec.Struct]] = {
     "sample": Sample,
     "estimate": EstimateMessage,
@@ -390,6 +390,7 @@ MESSAGES: Mapping[str, type[msgspec.Struct]] = {
     "event": Event,
     "status": Status,
     "probe": Probe,
+    "probe_request": ProbeRequest,
     "chain": Chain,
     "seal": Seal,
 }

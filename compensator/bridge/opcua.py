@@ -116,6 +116,7 @@ class Bridge:
             "heartbeat_node": _INTEGERS,
             "state_node": _INTEGERS,
             "enable_node": (ua.VariantType.Boolean,),
+            "probe_wanted_node": (ua.VariantType.Boolean,),
         }
         for key, kinds in wanted.items():
             name = getattr(self._settings, key)
@@ -132,7 +133,9 @@ class Bridge:
 
     async def _cycle(self, nodes: dict[str, tuple[Any, ua.VariantType]]) -> None:
         node, kind = nodes["offset_node"]
-        may_move = self.register.check(monotonic_s(), float(await node.read_value()))
+        found = float(await node.read_value())
+        self._receiver.record(found * self._settings.sign * self._settings.unit_um)
+        may_move = self.register.check(monotonic_s(), found)
         enabled = "enable_node" not in nodes or bool(await nodes["enable_node"][0].read_value())
         if may_move and enabled:
             self._receiver.follower.follow()
@@ -146,7 +149,10 @@ class Bridge:
                 self.register.wrote(value)
         self._beat = (self._beat + 1) % HEARTBEAT_MODULUS
         state = STATES.index("trouble" if self.register.trouble else applied.state)
-        for key, number in (("state_node", state), ("heartbeat_node", self._beat)):
+        wanted = self._receiver.probe_wanted
+        shown = {"state_node": state, "heartbeat_node": self._beat}
+        shown["probe_wanted_node"] = wanted is not None and wanted.wanted
+        for key, number in shown.items():
             if key in nodes:
                 await _write(nodes[key][0], number, nodes[key][1])
         self._report_change(applied)

@@ -41,8 +41,9 @@ class OpcUa:
         Time for which the PLC's value must not change after a difference before the offset continues from it, s.
     retry_s, timeout_s : float
         Pause before the next attempt to connect, and time limit of a reply, s.
-    heartbeat_node, state_node, enable_node : str
-        Optional: an integer that counts up each cycle; one for the state; a BOOL of the PLC, false holds the offset.
+    heartbeat_node, state_node, enable_node, probe_wanted_node : str
+        Optional: an integer that counts up each cycle; one for the state; a BOOL of the PLC, false holds the offset; a
+        BOOL for whether a touch probe is wanted.
     user, password_file : str
         Login; the file contains only the password.
     security_policy, certificate, private_key, server_certificate : str
@@ -63,6 +64,7 @@ class OpcUa:
     heartbeat_node: str = ""
     state_node: str = ""
     enable_node: str = ""
+    probe_wanted_node: str = ""
     user: str = ""
     password_file: str = ""
     security_policy: str = ""

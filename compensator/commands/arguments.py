@@ -74,8 +74,10 @@ def export(parser: argparse.ArgumentParser) -> None:
 
 def bridge(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `bridge`."""
-    parser.add_argument("protocol", choices=("opcua",), help="protocol of the control")
-    parser.add_argument("--config", required=True, metavar="FILE", help="TOML with [receiver] and [opcua]")
+    words = "opcua: the offset to a control; probes: what touch probes measure to the service"
+    parser.add_argument("protocol", choices=("opcua", "probes"), help=words)
+    words = "TOML with [receiver] and [opcua], or with [probes] and its sources"
+    parser.add_argument("--config", required=True, metavar="FILE", help=words)
     parser.add_argument("--check", action="store_true", help="check the file without opening a connection")
 
 

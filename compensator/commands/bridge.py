@@ -1,4 +1,4 @@
-"""`compensator bridge`: write the offset to a control over OPC UA, until SIGTERM or SIGINT."""
+"""`compensator bridge`: write the offset to a control over OPC UA, or send probes, until SIGTERM or SIGINT."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ log = logging.getLogger("compensator")
 
 def run(arguments: argparse.Namespace) -> Answer | None:
     """Run the command."""
+    if arguments.protocol == "probes":
+        from compensator.commands import probes
+
+        return probes.run(arguments)
     settings, opcua = load_bridge(arguments.config)
     if arguments.check:
         text = (

@@ -22,6 +22,10 @@ def run(arguments: argparse.Namespace) -> Answer:
         f"{len(devices)} device(s), {len(config.channel)} channel(s). Nothing was opened.\n"
         f"plausibility: {checks}"
     )
+    if config.probe is not None:
+        text += (
+            f"\nprobes: on, one value ±{config.probe.std_um:g} µm, correction at most {config.probe.largest_um:g} µm"
+        )
     result = {
         "ok": True,
         "machine": machine,

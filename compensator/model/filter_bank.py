@@ -20,7 +20,7 @@ import numpy as np
 from compensator.arrays import Matrix, Vector
 
 #: Walks of the offset, µm/√min, and how probable each is before the first value.
-WALKS_UM = (0.02, 0.042, 0.087, 0.18, 0.38, 0.8)
+WALKS_UM = (0.02, 0.05, 0.12, 0.28, 0.67, 1.6)
 WALK_WEIGHTS = tuple(1.0 / math.sqrt(w) / sum(1.0 / math.sqrt(v) for v in WALKS_UM) for w in WALKS_UM)
 #: Standard deviation of the offset before the first value, µm: the machine was zeroed, or the level is anything.
 LEVELS_UM = (3.0, 1000.0)
@@ -30,8 +30,8 @@ ZERO_STD_UM = 1000.0
 FORGETTING = 0.005
 #: How often a value is wrong (a chip, another feature), and by about how much, µm.
 WRONG_SHARE, WRONG_UM = 0.05, 20.0
-#: Degrees of freedom of the t distributions; odd, so that their densities need whole powers only.
-FREEDOM = 7
+#: Degrees of freedom of the t distributions; with 15 their densities need an eighth power only.
+FREEDOM = 15
 
 _GROUPS = range(0, len(WALKS_UM) * len(LEVELS_UM), len(WALKS_UM))
 #: Number of filters: the walks for one level, then for the next.
@@ -94,6 +94,8 @@ class FilterBank:
         self.walks = np.tile(np.array([0.0, *gain_walks]) ** 2, (SIZE, 1))
         self.walks[:, 0] = np.tile(WALKS_UM, len(LEVELS_UM)) ** 2
         self.weights = [weight / len(LEVELS_UM) for _ in LEVELS_UM for weight in WALK_WEIGHTS]
+        # Those of the mean, which a refused value must not move.
+        self.mean_weights = list(self.weights)
 
     def add_zero(self) -> None:
         """Add the zero of a further feature."""
@@ -132,13 +134,10 @@ class FilterBank:
 
     def innovation(self, expected: Expected) -> tuple[float, float]:
         """Return the innovation of the whole bank, µm, and its variance, µm²."""
-        mean, variance = 0.0, 0.0
         each = expected.innovation.tolist()
-        for weight, value in zip(self.weights, each, strict=True):
-            mean += weight * value
-        for weight, value, own in zip(self.weights, each, expected.variance.tolist(), strict=True):
-            variance += weight * (own + (value - mean) ** 2)
-        return mean, variance
+        mean = _mean(self.mean_weights, each)
+        own = zip(each, expected.variance.tolist(), strict=True)
+        return mean, _mean(self.weights, [variance + (value - mean) ** 2 for value, variance in own])
 
     def weigh(self, expected: Expected) -> Weighing:
         """Judge the filters by a value, and the value by the filters.
@@ -164,6 +163,7 @@ class FilterBank:
         self.P = self.P - gain[:, :, None] * expected.column[:, None, :]
         self.P = 0.5 * (self.P + self.P.transpose(0, 2, 1))
         self.weights = self.weigh(expected).weights
+        self.mean_weights = list(self.weights)
 
     def weights_of_walks(self) -> list[float]:
         """Return the weights with each walk's as it is, and every level as probable as before the first value."""
@@ -179,12 +179,17 @@ class FilterBank:
         """Return a bank in the same state."""
         found = FilterBank((), ())
         found.x, found.P, found.walks = self.x.copy(), self.P.copy(), self.walks.copy()
-        found.weights = list(self.weights)
+        found.weights, found.mean_weights = list(self.weights), list(self.mean_weights)
         return found
 
     def to_dict(self) -> dict[str, Any]:
         """Return the state, for JSON."""
-        return {"weights": list(self.weights), "states": self.x.tolist(), "covariances": self.P.tolist()}
+        return {
+            "weights": list(self.weights),
+            "mean_weights": list(self.mean_weights),
+            "states": self.x.tolist(),
+            "covariances": self.P.tolist(),
+        }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from what `to_dict` of a bank with the same states returned.
@@ -194,13 +199,13 @@ class FilterBank:
         ValueError
             If it has other states, or a number is missing.
         """
-        weights = [float(weight) for weight in state["weights"]]
+        weights, mean_weights = ([float(weight) for weight in state[key]] for key in ("weights", "mean_weights"))
         x, p = np.array(state["states"], dtype=float), np.array(state["covariances"], dtype=float)
-        if (x.shape, p.shape, len(weights)) != (self.x.shape, self.P.shape, SIZE):
+        if (x.shape, p.shape, len(weights), len(mean_weights)) != (self.x.shape, self.P.shape, SIZE, SIZE):
             raise ValueError(f"{len(weights)} filters with states of shape {x.shape}, expected {self.x.shape}")
-        if not (np.isfinite(x).all() and np.isfinite(p).all() and all(map(math.isfinite, weights))):
+        if not (np.isfinite(x).all() and np.isfinite(p).all() and all(map(math.isfinite, weights + mean_weights))):
             raise ValueError("a number is missing or not finite")
-        self.x, self.P, self.weights = x, p, weights
+        self.x, self.P, self.weights, self.mean_weights = x, p, weights, mean_weights
 
     def widen(self, jump_um: float, zero: int | None = None) -> None:
         """Admit that the offset may have moved by this much, µm, and that its walk is not known any more.
@@ -220,22 +225,22 @@ class FilterBank:
     def mixture(self, n: int) -> tuple[list[float], list[list[float]], list[float]]:
         """Return mean, lower triangle of the covariance, and growth of the variances a minute, of `n` states."""
         x, p, walks = self.x.tolist(), self.P.tolist(), self.walks.tolist()
-
-        def mean(values: Sequence[float]) -> float:
-            total = 0.0
-            for weight, value in zip(self.weights, values, strict=True):
-                total += weight * value
-            return total
-
-        means = [mean([row[i] for row in x]) for i in range(n)]
+        means = [_mean(self.mean_weights, [row[i] for row in x]) for i in range(n)]
         covariance = [
             [
-                mean([p[k][i][j] + (x[k][i] - means[i]) * (x[k][j] - means[j]) for k in range(SIZE)])
+                _mean(self.weights, [p[k][i][j] + (x[k][i] - means[i]) * (x[k][j] - means[j]) for k in range(SIZE)])
                 for j in range(i + 1)
             ]
             for i in range(n)
         ]
-        return means, covariance, [mean([row[i] for row in walks]) for i in range(n)]
+        return means, covariance, [_mean(self.weights, [row[i] for row in walks]) for i in range(n)]
+
+
+def _mean(weights: Sequence[float], values: Sequence[float]) -> float:
+    total = 0.0
+    for weight, value in zip(weights, values, strict=True):
+        total += weight * value
+    return total
 
 
 def _spread(weights: Sequence[float], share: float) -> list[float]:
@@ -253,7 +258,9 @@ def _spread(weights: Sequence[float], share: float) -> list[float]:
 def _density(innovation: float, variance: float) -> float:
     """Return a t distribution's density but for a factor that is common to all."""
     tail = 1.0 + innovation * innovation / (FREEDOM * variance)
-    return 1.0 / (math.sqrt(variance) * tail * tail * tail * tail)
+    squared = tail * tail
+    fourth = squared * squared
+    return 1.0 / (math.sqrt(variance) * fourth * fourth)
 
 
 def transformed(matrix: Matrix, x: Matrix, p: Matrix) -> tuple[Matrix, Matrix]:

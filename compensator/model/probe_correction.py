@@ -35,7 +35,6 @@ AGREEING_WITHIN_MIN = 720.0
 REFUSED_KEPT = 20
 #: Refused probes agree within this many standard deviations of their difference.
 AGREEMENT = 3.0
-
 #: Reasons of a verdict.
 OUTLIER, BELIEVED = "probe_outlier", "probe_believed"
 
@@ -49,8 +48,8 @@ class ProbeVerdict:
     taken : bool
         False where it was refused by its innovation.
     reason : str or None
-        `probe_outlier` where it was refused; `probe_believed` where it was taken against earlier ones: together with
-        refused ones that agree with it, or because the last one that was taken is more probably wrong.
+        `probe_outlier` where it was refused; `probe_believed` where it was taken together with refused ones that agree
+        with it.
     innovation_um : float
         Measured less predicted deformation, µm.
     innovation_std_um : float
@@ -189,18 +188,19 @@ class ProbeCorrection:
         deviation = y_um - predicted_um
         innovation, variance = self._bank.innovation(self._bank.expected(h, deviation, std_um))
         probe = _Probe(self._minutes, deviation, innovation, std_um, tuple(contributions_um), feature)
-        reason = BELIEVED if self._reconsider(probe) else None
+        self._reconsider(probe)
+        reason = None
         weighing = self._weigh(self._bank, probe)
-        if weighing.right < 0.5:
-            agreeing = self._agreeing(probe)
-            if len(agreeing) + 1 < min(AGREEING, self._probes + 2):
-                for bank in self._banks():
-                    bank.weights = self._weigh(bank, probe).weights
-                self._refused = [*self._refused[1 - REFUSED_KEPT :], probe]
-                self._mix()
-                return ProbeVerdict(False, OUTLIER, innovation, math.sqrt(variance))
+        agreeing = self._agreeing(probe)
+        if len(agreeing) + 1 >= min(AGREEING, self._probes + 2):
             reason = BELIEVED
             self._believe(agreeing, probe)
+        elif weighing.right < 0.5:
+            for bank in self._banks():
+                bank.weights = self._weigh(bank, probe).weights
+            self._refused = [*self._refused[1 - REFUSED_KEPT :], probe]
+            self._mix()
+            return ProbeVerdict(False, OUTLIER, innovation, math.sqrt(variance))
         self._accept(probe, 1.0 - weighing.right)
         return ProbeVerdict(True, reason, innovation, math.sqrt(variance))
 
@@ -233,17 +233,15 @@ class ProbeCorrection:
     def _weigh(self, bank: FilterBank, probe: _Probe) -> Weighing:
         return bank.weigh(self._expected(bank, probe))
 
-    def _reconsider(self, probe: _Probe) -> bool:
+    def _reconsider(self, probe: _Probe) -> None:
         """Let the bank without the probe on probation take over where this one makes that more probable."""
         if self._without is None:
-            return False
+            return
         doubt = self._doubt * self._weigh(self._without, probe).density
         belief = (1.0 - self._doubt) * self._weigh(self._bank, probe).density
         self._doubt = doubt / (doubt + belief)
-        if self._doubt <= 0.5:
-            return False
-        self._bank, self._without, self._doubt = self._without, self._bank, 1.0 - self._doubt
-        return True
+        if self._doubt > 0.5:
+            self._bank, self._without, self._doubt = self._without, self._bank, 1.0 - self._doubt
 
     def _accept(self, probe: _Probe, doubt: float) -> None:
         """Correct by a probe; it goes on probation where it is more doubtful than the one that is."""
@@ -397,6 +395,6 @@ class ProbeCorrection:
         offset = np.eye(new + zeros)
         offset[0, 1:new] = [-share for share in new_contributions_um]
         bank.x, bank.P = transformed(offset, bank.x, bank.P)
-        bank.weights = list(before.weights)
+        bank.weights, bank.mean_weights = list(before.weights), list(before.mean_weights)
         found._mix()
         return found

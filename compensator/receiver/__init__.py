@@ -12,7 +12,7 @@ ReceiverError            the receiver cannot be started: one line with file, key
 # Imports within this folder are relative, so that a copy of it works under any name.
 from .errors import ReceiverError
 from .follower import Applied, Follower, Limits
-from .message import OffsetMessage, Rejected, parse_offset
+from .message import OffsetMessage, ProbeWanted, Rejected, parse_offset
 from .reasons import WORDS, Reason
 from .settings import Settings, load_settings, settings_from
 from .subscriber import Receiver
@@ -23,6 +23,7 @@ __all__ = [
     "Follower",
     "Limits",
     "OffsetMessage",
+    "ProbeWanted",
     "Reason",
     "Receiver",
     "ReceiverError",

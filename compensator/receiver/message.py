@@ -111,6 +111,53 @@ def parse_offset(payload: bytes) -> OffsetMessage:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProbeWanted:
+    """What the status of a service with touch probes says about the next one.
+
+    Parameters
+    ----------
+    wanted : bool
+        Whether a probe is wanted now.
+    by_utc_ns : int or None
+        When one will be wanted, ns since 1970 UTC; None if this is not foreseen.
+    std_um, tolerance_um : float or None
+        The standard deviation that asks for it, and what it is compared with, µm; None if not known.
+    """
+
+    wanted: bool
+    by_utc_ns: int | None
+    std_um: float | None
+    tolerance_um: float | None
+
+
+def parse_wanted(payload: bytes, machine: str) -> ProbeWanted | None:
+    """Read what a status says about probes; None for a service without probes.
+
+    Raises
+    ------
+    Rejected
+        `malformed`, `other_schema` or `other_machine`.
+    """
+    table = _decode(payload)
+    if _integer(table, "schema") != SCHEMA:
+        raise Rejected(Reason("other_schema", f"schema {table['schema']}, expected {SCHEMA}"))
+    if table.get("machine") != machine:
+        raise Rejected(Reason("other_machine", f"{str(table.get('machine'))[:64]}, expected {machine}"))
+    wanted = table.get("probe_wanted")
+    if wanted is None:
+        return None
+    if not isinstance(wanted, bool):
+        raise _malformed("probe_wanted", wanted, "true or false")
+    optional = {"wanted_std_um": None, "wanted_tolerance_um": None} | table
+    return ProbeWanted(
+        wanted=wanted,
+        by_utc_ns=None if table.get("wanted_by_ns") is None else _integer(table, "wanted_by_ns"),
+        std_um=_number(optional, "wanted_std_um"),
+        tolerance_um=_number(optional, "wanted_tolerance_um"),
+    )
+
+
 def _decode(payload: bytes) -> dict[str, Any]:
     if len(payload) > PAYLOAD_MAX_BYTES:
         raise Rejected(Reason("malformed", f"{len(payload)} bytes, expected at most {PAYLOAD_MAX_BYTES}"))

@@ -71,6 +71,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
         "The state file could not be read; replayed messages from before the start are not recognised.",
         "Check the disk; the file is rewritten with the next offset.",
     ),
+    "applied_not_recorded": (
+        "The applied offset cannot be recorded, so probes without an offset of their own are refused.",
+        "Check the folder of applied_file: space, permissions, disk.",
+    ),
     "not_connected": ("No router or service has been reached yet.", "Check address, certificates and network."),
 }
 

@@ -42,6 +42,8 @@ class Settings:
         Longest time that one message may be used, s.
     state_file : str
         Keeps the last number over a restart, so that older messages are still dropped; relative to the file.
+    applied_file : str
+        Where `Receiver.record` writes the offset that the control had, for probes; relative to the file.
     """
 
     machine: str
@@ -54,6 +56,7 @@ class Settings:
     clock_tolerance_s: float = 5.0
     valid_max_s: float = 600.0
     state_file: str = ""
+    applied_file: str = ""
 
     def limits(self, *, step_max_s: float = 1.0) -> Limits:
         """Return the follower's limits.
@@ -86,16 +89,27 @@ def load_settings(path: str | Path) -> tuple[Settings, dict[str, Any]]:
         One line that names file, key, value and what was expected.
     """
     path = Path(path)
-    try:
-        tables = tomllib.loads(path.read_bytes().decode("utf-8"))
-    except OSError as error:
-        raise ReceiverError(f"{path}: {error.strerror or error}; expected a settings file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ReceiverError(f"{path}: not a TOML file: {error}") from error
+    tables = load_tables(path)
     table = tables.pop("receiver", None)
     if not isinstance(table, dict):
         raise ReceiverError(f"{path}: receiver: missing, expected a table [receiver]")
     return settings_from(table, source=str(path), folder=path.parent), tables
+
+
+def load_tables(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    ReceiverError
+        If it cannot be read.
+    """
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8"))
+    except OSError as error:
+        raise ReceiverError(f"{path}: {error.strerror or error}; expected a settings file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ReceiverError(f"{path}: not a TOML file: {error}") from error
 
 
 def settings_from(table: Mapping[str, Any], *, source: str, folder: Path | None = None) -> Settings:
@@ -120,7 +134,7 @@ def settings_from(table: Mapping[str, Any], *, source: str, folder: Path | None 
     folder = Path() if folder is None else folder
     absolute: dict[str, Any] = {
         key: str((folder / getattr(settings, key)).resolve()) if getattr(settings, key) else ""
-        for key in ("zenoh_config", "state_file")
+        for key in ("zenoh_config", "state_file", "applied_file")
     }
     return replace(settings, **absolute)
 

@@ -19,8 +19,10 @@ from typing import Any
 
 import zenoh
 
+from .applied_record import AppliedRecord
 from .errors import ReceiverError
 from .follower import Applied, Follower
+from .message import ProbeWanted, Rejected, parse_wanted
 from .reasons import Reason
 from .settings import Settings
 
@@ -107,6 +109,9 @@ class Receiver:
         self._clock, self._utc_ns = clock, utc_ns
         self._state_file = Path(settings.state_file) if settings.state_file else None
         self._remark: Reason | None = None
+        self._record = AppliedRecord(Path(settings.applied_file)) if settings.applied_file else None
+        self._record_remark: Reason | None = None
+        self._wanted: tuple[ProbeWanted | None, int, float] | None = None
         self.follower = Follower(
             settings.machine, settings.limits(step_max_s=step_max_s), applied_um, self._last_sequence()
         )
@@ -117,7 +122,9 @@ class Receiver:
         self._opener = threading.Thread(target=self._open, name="thermal-receiver-connect", daemon=True)
         self._offsets: Any = None
         self._tokens: Any = None
+        self._statuses: Any = None
         self._answers: list[Any] = []
+        self._status_answers: list[Any] = []
 
     def __enter__(self) -> Receiver:
         self._opener.start()
@@ -157,10 +164,12 @@ class Receiver:
         if self._session is not None:
             self._receive_tokens()
             self._receive_answers(now_s)
+            self._receive_statuses(now_s)
             while (sample := self._offsets.try_recv()) is not None:
                 self._receive(now_s, sample, check_age=paused or self._settings.check_clock, asked=False)
         applied = self.follower.advance(now_s)
-        remarks = tuple(r for r in (self._remark, None if self.connected else _CONNECTING) if r is not None)
+        own = (self._remark, self._record_remark, None if self.connected else _CONNECTING)
+        remarks = tuple(r for r in own if r is not None)
         return replace(applied, reasons=applied.reasons + remarks)
 
     def _receive(self, now_s: float, sample: Any, *, check_age: bool, asked: bool) -> None:
@@ -184,6 +193,55 @@ class Receiver:
             if self.follower.alive:  # a new service, or a new route to it: it may have published meanwhile
                 self._query_latest()
 
+    # ------------------------------------------------------------------ probes
+
+    def record(self, applied_um: float | None) -> None:
+        """Record what the control has applied now, for probes; only with `applied_file`.
+
+        Parameters
+        ----------
+        applied_um : float or None
+            What was read back from the control or written to it, µm; None if it is not known.
+        """
+        if self._record is None:
+            return
+        try:
+            self._record.append(self._utc_ns(), applied_um)
+        except OSError as error:
+            self._record_remark = Reason("applied_not_recorded", f"{error.strerror or error}")
+        else:
+            self._record_remark = None
+
+    @property
+    def probe_wanted(self) -> ProbeWanted | None:
+        """What the service says about the next probe; None without probes, or where its status is not recent."""
+        if self._wanted is None or self.follower.alive is False:
+            return None
+        wanted, _, received_s = self._wanted
+        return wanted if self._clock() - received_s <= self._settings.valid_max_s else None
+
+    def _receive_statuses(self, now_s: float) -> None:
+        for answers in list(self._status_answers):
+            try:
+                while (reply := answers.try_recv()) is not None:
+                    if reply.ok is not None:
+                        payload = reply.ok.payload.to_bytes()
+                        # A service whose sampling hangs still answers.
+                        self._receive_status(payload, now_s - (self._utc_ns() - _time_of(payload)) / 1e9)
+            except zenoh.ZError:  # all answers were received
+                self._status_answers.remove(answers)
+        while (sample := self._statuses.try_recv()) is not None:
+            self._receive_status(sample.payload.to_bytes(), now_s)
+
+    def _receive_status(self, payload: bytes, measured_s: float) -> None:
+        try:
+            wanted = parse_wanted(payload, self._settings.machine)
+        except Rejected:  # the messages of the offset show what is wrong
+            return
+        time_utc_ns = _time_of(payload)
+        if self._wanted is None or time_utc_ns >= self._wanted[1]:
+            self._wanted = (wanted, time_utc_ns, min(measured_s, self._clock()))
+
     # ------------------------------------------------------------------ connecting
 
     def _key(self, name: str) -> str:
@@ -203,6 +261,7 @@ class Receiver:
         ring = zenoh.handlers.RingChannel
         self._session = session
         self._offsets = session.declare_subscriber(self._key("y/offset"), ring(_BUFFER))
+        self._statuses = session.declare_subscriber(self._key("status"), ring(_BUFFER))
         self._tokens = session.liveliness().declare_subscriber(self._key("alive"), ring(_BUFFER), history=True)
         self._query_latest()
 
@@ -211,6 +270,9 @@ class Receiver:
             # A ring channel would lose the answers when the query ends.
             handler: Any = zenoh.handlers.FifoChannel(_BUFFER)
             self._answers.append(self._session.get(self._key("y/offset"), handler, timeout=ANSWER_TIMEOUT_S))
+        if len(self._status_answers) < _BUFFER:
+            handler = zenoh.handlers.FifoChannel(_BUFFER)
+            self._status_answers.append(self._session.get(self._key("status"), handler, timeout=ANSWER_TIMEOUT_S))
 
     # ------------------------------------------------------------------ over a restart
 

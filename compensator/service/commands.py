@@ -132,7 +132,7 @@ class Commands:
         """Return the reply to a probe that can be used; one that is refused is recorded, too."""
         probing, by = self._running().probing, (sender.name, sender.proof)
         try:
-            if probing is None or self._loop is None:
+            if probing is None:
                 raise ProbeRefused(ProbeCode.NOT_CONFIGURED, "probe: the configuration has no table [probe]")
             if len(self._probes) >= WAITING_PROBES:
                 raise ProbeRefused(ProbeCode.TOO_MANY, f"probe: {WAITING_PROBES} wait for the next sample already")
@@ -145,6 +145,8 @@ class Commands:
         waiting = list(self._probes)
         received = ReceivedProbe(request=request, received_utc_ns=now_ns, by=by[0], by_proof=by[1])
         self._probes.append(received)
+        if self._loop is None:
+            raise ProbeRefused(ProbeCode.TIME_UNKNOWN, "probe: the service is ending")
         probing.check(received, waiting)
         return "probe: compared with the prediction at the next sample"
 

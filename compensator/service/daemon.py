@@ -234,7 +234,11 @@ class Daemon:
         self._commands.close()
         await self._await_pending()
         await self._adoption.end()
-        await self._journal.close(self._compensation.state())
+        probes, unread = self._commands.drain_probes()
+        machine, sequence = self._config.machine.name, self._events.sequence
+        undecided = [undecided_probe(machine, sequence, probe, ends=True) for probe in probes]
+        unread = [replace_fields(probe, seq=sequence) for probe in unread]
+        await self._journal.close(self._compensation.state(), [*unread, *undecided])
         await self._sampler.close()
 
     # ------------------------------------------------------------------ one sample

@@ -86,6 +86,13 @@ class Setup:
         zenoh = self.config.zenoh
         found = [remark for line in self.config.line if (remark := _numbered_port(line)) is not None]
         found += _exposures(zenoh)
+        probe = self.config.probe
+        if probe is not None and probe.tolerance_um is not None and probe.tolerance_um < probe.std_um:
+            figures = (
+                f"probe.tolerance_um = {probe.tolerance_um:g} is below probe.std_um = {probe.std_um:g}: a probe is "
+                "wanted nearly always."
+            )
+            found.append(Remark(ServiceWarning.PROBE_TOLERANCE, figures))
         if zenoh.secured():
             now = now or datetime.datetime.now(datetime.UTC)
             wrong = self.certificate.wrong_at(now) if self.certificate is not None else None

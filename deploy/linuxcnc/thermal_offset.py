@@ -84,11 +84,11 @@ def make_pins(component: Any) -> None:
     for name in ("enable", "fade"):
         component.newpin(name, hal.HAL_BIT, hal.HAL_IN)
     component.newpin("counts", hal.HAL_S32, hal.HAL_OUT)
-    for name in ("offset-um", "applied-um", "age-s"):
+    for name in ("offset-um", "applied-um", "age-s", "probe-by-s", "probe-std-um"):
         component.newpin(name, hal.HAL_FLOAT, hal.HAL_OUT)
     for name in ("state", "seq"):
         component.newpin(name, hal.HAL_U32, hal.HAL_OUT)
-    for name in ("fresh", "arrived", "alive", "ready", "limited", "trouble", "heartbeat"):
+    for name in ("fresh", "arrived", "alive", "ready", "limited", "trouble", "heartbeat", "probe-wanted"):
         component.newpin(name, hal.HAL_BIT, hal.HAL_OUT)
 
 
@@ -101,6 +101,9 @@ def run(component: Any, receiver: Receiver, reconciler: Reconciler, axis: Axis, 
         view = axis.view()
         component["counts"] = reconciler.step(monotonic_s(), applied.offset_um, view)
         _show(component, receiver, applied, view, reconciler)
+        _show_probe(component, receiver)
+        # While the axis cannot move its pins show an old offset.
+        receiver.record(view.eoffset_um if view.ready else None)
         words = " ".join(filter(None, (reconciler.trouble.replace("axis.L", axis.name), applied.steady_reasons)))
         line = f"{applied.state}{': ' if words else ''}{words}"
         if line != reported:
@@ -132,6 +135,14 @@ def _show(component: Any, receiver: Receiver, applied: Applied, view: AxisView, 
     component["limited"] = view.limited
     component["trouble"] = bool(reconciler.trouble)
     component["heartbeat"] = not component["heartbeat"]
+
+
+def _show_probe(component: Any, receiver: Receiver) -> None:
+    probe = receiver.probe_wanted
+    component["probe-wanted"] = probe is not None and probe.wanted
+    by_ns = None if probe is None else probe.by_utc_ns
+    component["probe-by-s"] = -1.0 if by_ns is None else max(0.0, (by_ns - time.time_ns()) / 1e9)
+    component["probe-std-um"] = -1.0 if probe is None or probe.std_um is None else probe.std_um
 
 
 class Axis:

@@ -24,6 +24,7 @@ KEYS = {
     "machine": {"name", "prefix"},
     "receiver": {"name", "machines"},
     "operator": {"name", "machines"},
+    "probe": {"name", "machines"},
 }
 #: What a receiver may query; anything else below a prefix is published or is a command.
 ANSWERED = ("thermal/y/offset", "thermal/status", "thermal/sample", "thermal/estimate")
@@ -73,11 +74,17 @@ def operator_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
     return [*reading_rules(name, prefixes), rule(f"{name} commands", "ingress", ["query"], own)]
 
 
+def probe_rules(name: str, prefixes: list[str]) -> list[dict[str, Any]]:
+    """Let a source of touch probes send probes in its own name and receive the answers; it may read nothing."""
+    own = [f"{prefix}/thermal/command/probe/{name}" for prefix in prefixes]
+    return [rule(f"{name} probes", "ingress", ["query"], own), rule(f"{name} is answered", "egress", ["reply"], own)]
+
+
 def access_control(shop: dict[str, Any]) -> dict[str, Any]:
     """Return Zenoh's access list."""
     machines = {machine["name"]: machine for machine in shop["machine"]}
     rules: dict[str, list[dict[str, Any]]] = {name: machine_rules(machine) for name, machine in machines.items()}
-    for role, make in (("receiver", reading_rules), ("operator", operator_rules)):
+    for role, make in (("receiver", reading_rules), ("operator", operator_rules), ("probe", probe_rules)):
         for client in shop.get(role, []):
             # Zenoh passes a subscription or query only where one rule includes all of it.
             prefixes = [machines[name]["prefix"] for name in client["machines"]] if "machines" in client else ["**"]

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Make a small certificate authority and the certificates of router, machines, receivers and operators.
+"""Make a small certificate authority and the certificates of router, machines, receivers, operators and probes.
 
 The router's access list goes by the common name of each certificate. Keys are written with mode 0600. Running it again
 keeps what is there and valid, and makes only what is missing; `--renew` replaces certificates with less than
@@ -27,7 +27,7 @@ try:
 except ImportError:
     sys.exit("certificates.py: needs the package cryptography: pip install quill-compensator[tls]")
 
-ROLES = ("machine", "receiver", "operator")
+ROLES = ("machine", "receiver", "operator", "probe")
 CLOCK_SKEW = datetime.timedelta(hours=1)
 
 

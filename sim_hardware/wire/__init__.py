@@ -9,6 +9,7 @@ from sim_hardware.wire.icpdas import IcpDas
 from sim_hardware.wire.modbus_servers import ModbusRtuLine, ModbusRtuTcpServer, ModbusTcpServer
 from sim_hardware.wire.module import Module, Source
 from sim_hardware.wire.moxa import MoxaE1262
+from sim_hardware.wire.printing import PrintingControl
 from sim_hardware.wire.rack import Rack, Server
 from sim_hardware.wire.register_map import Register, RegisterMap
 
@@ -26,6 +27,7 @@ __all__ = [
     "ModbusTcpServer",
     "Module",
     "MoxaE1262",
+    "PrintingControl",
     "Rack",
     "Register",
     "RegisterMap",

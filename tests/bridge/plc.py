@@ -35,6 +35,7 @@ class Plc:
         self.heartbeat = await add("/Plc/DB100.DBW4", 0, ua.VariantType.Int16)
         self.state = await add("/Plc/DB100.DBW6", 0, ua.VariantType.UInt16)
         self.enable = await add("/Plc/DB100.DBX8.0", True, ua.VariantType.Boolean)
+        self.probe_wanted = await add("/Plc/DB100.DBX8.1", False, ua.VariantType.Boolean)
         await self.server.start()
         subscription = await self.server.create_subscription(10, self)
         await subscription.subscribe_data_change(self.offset, queuesize=1000)

@@ -18,6 +18,7 @@ from compensator.bridge.settings import load_bridge
 from compensator.cli import main
 from compensator.errors import ConfigError
 from compensator.receiver import Receiver
+from compensator.receiver.applied_record import applied_at
 from tests.bridge.plc import Plc
 from tests.receiver.wire import ScriptedService, free_port, router
 
@@ -31,6 +32,7 @@ prefix = "shop/vmc-07"
 connect = ["tcp/127.0.0.1:{zenoh}"]
 offset_max_um = 100.0
 offset_rate_max_um_per_min = 6000.0
+applied_file = "applied.txt"
 
 [opcua]
 endpoint = "{endpoint}"
@@ -45,6 +47,7 @@ timeout_s = 5.0
 heartbeat_node = "ns=2;s=/Plc/DB100.DBW4"
 state_node = "ns=2;s=/Plc/DB100.DBW6"
 enable_node = "ns=2;s=/Plc/DB100.DBX8.0"
+probe_wanted_node = "ns=2;s=/Plc/DB100.DBX8.1"
 """
 
 
@@ -99,6 +102,11 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                 assert await at(2.0)  # what it held stands until there is an offset
                 service.put(1, -12.0)
                 await until(lambda: at(12.0), "minus the offset, in mm")
+                assert await plc.probe_wanted.read_value() is False
+                service.put_status(probe_wanted=True)
+                await until(lambda: _is(plc.probe_wanted, True), "a probe is wanted")
+                # For probes: what the PLC holds, with the sign of the offset.
+                await until(lambda: asyncio.sleep(0, _applied_um(tmp_path) == -12.0), "the record")
                 check(plc.values)
                 await until(lambda: asyncio.sleep(0, said[-1] == "following"), "following is said")
                 assert await plc.state.read_value() == 1
@@ -152,6 +160,10 @@ async def test_from_the_offset_to_the_data_block_and_back(tmp_path: Path) -> Non
                     pytest.raises(ConfigError, match="a UInt16, expected one of Float"),
                 ):
                     await Bridge(opcua, receiver, said.append).run(asyncio.Event())
+
+
+def _applied_um(folder: Path) -> float | None:
+    return applied_at(folder / "applied.txt", time.time_ns())
 
 
 async def _changed(plc: Plc, beat: int) -> bool:

@@ -153,7 +153,7 @@ NAMESPACES = ("unshare", "--ipc", "--pid", "--mount", "--mount-proc", "--net", "
 
 
 @contextmanager
-def linuxcnc(folder: Path, settings: str, **ini: str) -> Iterator[tuple[Control, Path]]:
+def linuxcnc(folder: Path, settings: str, *, hal: str = "", **ini: str) -> Iterator[tuple[Control, Path]]:
     """Start the shipped configuration with other settings.
 
     Yields
@@ -163,7 +163,14 @@ def linuxcnc(folder: Path, settings: str, **ini: str) -> Iterator[tuple[Control,
     """
     folder.mkdir(mode=0o777, exist_ok=True)
     folder.chmod(0o777)
-    for name in ("machine.hal", "thermal.hal", "thermal_offset.py", "reconcile.py"):
+    for name in (
+        "machine.hal",
+        "thermal.hal",
+        "thermal_offset.py",
+        "reconcile.py",
+        "thermal_probe.ngc",
+        "thermal_probe.hal",
+    ):
         shutil.copy(SHIPPED / name, folder / name)
     text = (SHIPPED / "machine.ini").read_text(encoding="utf-8")
     panel = folder / "panel.py"
@@ -179,7 +186,7 @@ def linuxcnc(folder: Path, settings: str, **ini: str) -> Iterator[tuple[Control,
     )
     (folder / "machine.ini").write_text(text, encoding="utf-8")
     (folder / "thermal.toml").write_text(settings, encoding="utf-8")
-    (folder / "sampler.hal").write_text(SAMPLER, encoding="utf-8")
+    (folder / "sampler.hal").write_text(SAMPLER + hal, encoding="utf-8")
     # The system's Python with this environment's zenoh, whose wheel is for every version of Python 3.
     python = folder / "python"
     packages = Path(zenoh.__file__).parents[1]

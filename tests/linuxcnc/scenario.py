@@ -379,6 +379,94 @@ def service(folder: Path) -> None:
         assert all(b > a for a, b in itertools.pairwise(seqs))
 
 
+# ---------------------------------------------------------------------- a touch probe
+
+#: Where the feature is, mm, and a switch that closes where the tip (the slide and the deformation) touches it.
+FEATURE_MM = 50.0
+TOUCH = """
+source thermal_probe.hal
+loadrt sum2
+addf sum2.0 servo-thread
+loadrt comp
+addf comp.0 servo-thread
+net y-position => sum2.0.in0
+net deformation sum2.0.in1
+net tip sum2.0.out => comp.0.in1
+setp comp.0.in0 50.0
+net touch comp.0.out => motion.probe-input
+"""
+PROBES = """
+[probes]
+prefix = "shop/vmc-07"
+connect = ["tcp/127.0.0.1:7447"]
+send_within_s = 900.0
+applied_file = "applied.txt"
+
+[[linuxcnc]]
+file = "thermal-probe.txt"
+feature = "bore"
+nominal = 50.0
+unit = "mm"
+sign = -1
+includes_offset = true
+sign_checked = "the simulated machine, two offsets"
+"""
+
+
+def probing_settings() -> str:
+    return changed(settings(), {"# applied_file": "applied_file"})
+
+
+def probing(folder: Path) -> None:
+    """The cycle probes where it is wanted; the value shows the deformation, whatever the offset."""
+    with (
+        router(PORT),
+        ScriptedService(PORT) as service,
+        linuxcnc(folder, probing_settings(), hal=TOUCH) as (control, _),
+    ):
+        bench = Bench(control)
+        bench.on()
+        control.do("home")
+        config = folder / "probes.toml"
+        config.write_text(PROBES, encoding="utf-8")
+        command = [sys.executable, "-m", "compensator", "bridge", "probes", "--config", str(config)]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+            try:
+                _probed(bench, service, process)
+            finally:
+                process.terminate()
+
+
+def _probed(bench: Bench, service: ScriptedService, process: subprocess.Popen[str]) -> None:
+    control, probes = bench.control, service.probes
+    part = control.folder / "probe.ngc"
+    cycle = (control.folder / "thermal_probe.ngc").read_text(encoding="utf-8").rpartition("M2")[0]
+    part.write_text(cycle + "G20 G91 G55\no<thermal_probe> call\nG4 P0.5\nM2\n", encoding="utf-8")
+
+    def run() -> None:
+        control.do("start", str(part))
+        until(lambda: not control.do("running"), "the program's end", 120.0)
+
+    for seq, (deformation_um, offset_um) in enumerate(((12.0, -8.0), (12.0, 0.0), (-5.0, 3.0)), 1):
+        service.put(seq, offset_um)
+        service.put_status(probe_wanted=False)
+        bench.arrive(offset_um, control.um("axis.y.pos-cmd"))
+        control.do("halcmd", "sets", "deformation", str(deformation_um / 1000.0))
+        until(lambda: not bench.pin("probe-wanted"), "no probe is wanted")
+        run()
+        assert len(probes) == seq - 1 and abs(control.um("axis.y.pos-cmd") - 47_000.0 * (seq > 1)) < 1.0
+        service.put_status(probe_wanted=True, wanted_by_ns=time.time_ns(), wanted_std_um=2.5)
+        until(lambda: bench.pin("probe-wanted") and bench.pin("probe-by-s") == 0.0, "a probe is wanted")
+        begin_ns = time.time_ns()
+        run()
+        until(lambda seq=seq: len(probes) == seq, "the probe at the service")
+        probe = probes[-1]
+        assert probe["feature"] == "bore" and begin_ns < probe["time_utc_ns"] < time.time_ns()
+        # The touch is found in a servo period; at 60 mm/min that is 1 µm, and the probe is read two periods later.
+        assert abs(probe["offset_applied_um"] - offset_um) < 0.05
+        assert abs(probe["measured_um"] - probe["offset_applied_um"] - deformation_um) < 3.0, probe
+
+
 # ---------------------------------------------------------------------- what must not start
 
 
@@ -403,5 +491,5 @@ def refused(folder: Path) -> None:
 if __name__ == "__main__":  # NAME FOLDER
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     place = Path(sys.argv[2])
-    {"scripted": scripted, "service": service, "refused": refused}[sys.argv[1]](place / "control")
+    {"scripted": scripted, "service": service, "probing": probing, "refused": refused}[sys.argv[1]](place / "control")
     print("done", flush=True)

@@ -26,7 +26,7 @@ def place() -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-@pytest.mark.parametrize("name", ["scripted", "service", "refused"])
+@pytest.mark.parametrize("name", ["scripted", "service", "probing", "refused"])
 def test_at_the_control(name: str, place: Path) -> None:
     done = subprocess.run(
         [*NAMESPACES, sys.executable, "-m", "tests.linuxcnc.scenario", name, str(place)],

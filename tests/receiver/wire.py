@@ -56,6 +56,14 @@ class ScriptedService:
         self.session: Any = zenoh.open(config)
         self._publisher = self.session.declare_publisher(self.key)
         self._queryable = self.session.declare_queryable(self.key, self._answer)
+        self.status: bytes | None = None
+        self._status_key = f"{prefix}/thermal/status"
+        self._statuses = self.session.declare_publisher(self._status_key)
+        self._status_queryable = self.session.declare_queryable(self._status_key, self._answer_status)
+        #: Payloads of the command `probe`.
+        self.probes: list[dict[str, Any]] = []
+        self.probe_answer: dict[str, Any] = {"ok": True, "text": "heard", "code": ""}
+        self._commands = self.session.declare_queryable(f"{prefix}/thermal/command/probe/*", self._answer_probe)
         self._token = self.session.liveliness().declare_token(f"{prefix}/thermal/alive")
 
     def _answer(self, query: Any) -> None:
@@ -70,7 +78,28 @@ class ScriptedService:
         self.latest = offset(seq, y_um, **{"time_utc_ns": time.time_ns(), **changes})
         self._publisher.put(self.latest)
 
+    def _answer_status(self, query: Any) -> None:
+        with query:
+            if self.status is not None:
+                query.reply(self._status_key, self.status)
+
+    def _answer_probe(self, query: Any) -> None:
+        with query:
+            self.probes.append(json.loads(query.payload.to_bytes()))
+            query.reply(query.key_expr, json.dumps(self.probe_answer))
+
+    def put_status(self, *, heard: bool = True, **changes: Any) -> None:
+        """Publish a status with these keys."""
+        if heard:
+            until(lambda: self._statuses.matching_status.matching, "a subscriber")
+        own = {"schema": 1, "machine": "vmc-07", "seq": 1, "time_utc_ns": time.time_ns(), "state": "ok"}
+        self.status = json.dumps(own | changes).encode()
+        self._statuses.put(self.status)
+
     def close(self) -> None:
+        self._commands.undeclare()
+        self._statuses.undeclare()
+        self._status_queryable.undeclare()
         self._publisher.undeclare()
         self._queryable.undeclare()
         self._token.undeclare()

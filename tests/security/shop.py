@@ -53,6 +53,9 @@ name = "bert"
 machines = ["vmc-08"]
 [[operator]]
 name = "old"
+[[probe]]
+name = "probe-07"
+machines = ["vmc-07"]
 """
 
 
@@ -98,6 +101,8 @@ def make_keys(folder: Path) -> Path:
         "anna",
         "--operator",
         "bert",
+        "--probe",
+        "probe-07",
     )
     script("certificates.py", str(keys), "--operator", "old", "--days", "-2")
     script("certificates.py", str(folder / "other"), "--operator", "anna", "--receiver", "cnc-07")
@@ -134,14 +139,16 @@ class Shop:
     def client_file(self, stem: str) -> Path:
         """The shipped client configuration, with this shop's addresses and keys in the place of the example's."""
         role, *_ = stem.partition("-")
-        text = (DEPLOY / ("receiver.json5" if role == "receiver" else "operator.json5")).read_text(encoding="utf-8")
+        shipped = f"{role}.json5" if role in ("receiver", "probe") else "operator.json5"
+        text = (DEPLOY / shipped).read_text(encoding="utf-8")
         for old, new in (
             ("router.shop:7447", f"127.0.0.1:{self.port}"),
             ("/etc/compensator/zenoh", str(self.keys)),
             ("receiver-cnc-07", stem),
             ("operator-anna", stem),
+            ("probe-probe-07", stem),
         ):
-            assert old in text or old in ("receiver-cnc-07", "operator-anna")
+            assert old in text or old in ("receiver-cnc-07", "operator-anna", "probe-probe-07")
             text = text.replace(old, new)
         path = self.folder / f"{stem}.json5"
         path.write_text(text, encoding="utf-8")

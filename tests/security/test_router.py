@@ -147,7 +147,7 @@ def test_the_trial_on_one_computer_works_as_written(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "Listens on tls/127.0.0.1:7448, access list on." in done.stdout
-    for name in ("receiver", "operator"):
+    for name in ("receiver", "operator", "probe"):
         operator_of_file(tmp_path / f"{name}.json5")  # files are where the configuration says
     files = tls_files(Zenoh(**_zenoh(tmp_path / "service.toml")))
     assert files is not None and check_files("service.toml", files) is not None

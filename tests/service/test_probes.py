@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +14,16 @@ import msgspec
 import numpy as np
 import pytest
 
+from compensator.audit.comparison import compare
 from compensator.audit.series import Audit, audit
+from compensator.cli import main
 from compensator.clock import NS
 from compensator.codes import ProbeCode
 from compensator.config import Zenoh
+from compensator.demo.machine import configuration
 from compensator.errors import ServiceError
 from compensator.messages import ProbeRequest, number
+from compensator.model.model_file import parse_model
 from compensator.recording.container import Container
 from compensator.recording.reading import recordings
 from compensator.service.command_client import send_probe
@@ -29,7 +35,7 @@ from tests.audit.made import CONFIG, other_model
 from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
 from tests.security.shop import free_port
 from tests.service.living import MACHINE, check_files, largest_step
-from tests.service.probed import PROBED, RATE_UM, ProbedMachine
+from tests.service.probed import PROBE, PROBED, RATE_UM, ProbedMachine
 from tests.service.test_compensation_day import MISSING
 
 MINUTE_NS = 60 * NS
@@ -323,6 +329,41 @@ async def test_a_probe_of_a_sample_that_failed_is_recorded_as_undecided(tmp_path
     assert look(machine).clean
 
 
+async def test_a_probe_that_no_sample_follows_is_recorded_as_undecided(tmp_path: Path) -> None:
+    machine = ProbedMachine(tmp_path)
+
+    def probe_and_stop() -> None:
+        machine.probe()
+        assert machine.daemon is not None
+        asyncio.get_running_loop().call_soon(machine.daemon.stop)
+
+    machine.at_sample[30] = probe_and_stop
+    machine.at_sample[35] = machine.probe  # as the service ends
+    await machine.run(50)
+    await machine.run(5)
+    assert machine.codes() == [ProbeCode.TIME_UNKNOWN] * 2
+    assert all("ended" in probe.text for probe in machine.recorded())
+    assert [reply.result()["ok"] for reply in machine.replies] == [True, False]
+    await machine.run(5)
+    assert nothing_jumped(machine)
+
+
+async def test_a_control_that_still_moves_to_a_new_offset_is_believed(tmp_path: Path) -> None:
+    """After a correction of some µm the control takes most of a minute; what it applies meanwhile is no mismatch."""
+    machine = ProbedMachine(tmp_path)
+    machine.each_hour(200)
+
+    def probe_underway() -> None:
+        before, now = (number(outcome.offset.y_offset_um) for outcome in machine.outcomes[-2:])
+        assert abs(now - before) > 2.0
+        applied = 0.5 * (before + now)
+        machine.probe(offset_applied_um=applied, measured_um=machine.truth_um() + applied)
+
+    machine.at_sample[61] = probe_underway
+    await machine.run(70)
+    assert machine.codes() == ["taken", "taken"]
+
+
 # ---------------------------------------------------------------------- restarts and other models
 
 
@@ -382,7 +423,7 @@ async def test_another_model_goes_on_with_the_correction(tmp_path: Path) -> None
     model = msgspec.json.encode({"model": other_model().decode(), "force": True})
     machine.at_sample[600] = lambda: (machine.probe(), machine.command("adopt", model))
     machine.at_sample[601] = machine.probe
-    await machine.run(900)
+    await machine.run(890)
     (adopted,) = [event for event in machine.events("adopt") if event.data["ok"]]
     assert abs(adopted.data["difference_um"]) < 0.05
     at = next(i for i, o in enumerate(machine.outcomes) if o.offset.model_sha256 == adopted.data["new_sha256"])
@@ -390,23 +431,45 @@ async def test_another_model_goes_on_with_the_correction(tmp_path: Path) -> None
     assert abs(number(after.y_offset_um) - number(before.y_offset_um)) < 2.0
     assert number(after.y_offset_std_um) < 1.5 * number(before.y_offset_std_um)
     assert set(machine.codes()) == {"taken"} and nothing_jumped(machine)
-    assert check_files(machine) == 900
+    assert check_files(machine) == 890
     left = machine.left_um()
-    assert np.sqrt(np.mean(left[at:] ** 2)) < 2.0
+    assert np.sqrt(np.mean(left[at:] ** 2)) < 2.5
 
 
-async def test_a_restart_with_another_configuration_goes_on_with_the_correction(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changed", ["configuration", "model"])
+async def test_a_restart_with_another_configuration_or_model_goes_on_with_the_correction(
+    tmp_path: Path, changed: str
+) -> None:
     machine = ProbedMachine(tmp_path)
     machine.each_hour(1000)
     await machine.run(590)
     last = number(machine.outcomes[-1].offset.y_offset_um)
-    machine.config_bytes = PROBED + b"# changed\n"
+    if changed == "model":
+        machine.configured = other_model()
+    else:
+        machine.config_bytes = PROBED + b"# changed\n"
     await machine.run(200)
-    assert any("the configuration has changed" in event.text for event in machine.events("restart"))
+    assert any(f"the {changed} has changed" in event.text for event in machine.events("restart"))
     first = machine.outcomes[590].offset
     assert abs(number(first.y_offset_um) - last) < 2.0 and wanted_because(machine) != ProbeCode.FIRST
-    assert np.sqrt(np.mean(machine.left_um()[590:] ** 2)) < 2.0
+    assert np.sqrt(np.mean(machine.left_um()[590:] ** 2)) < 2.5
     assert set(machine.codes()) == {"taken"} and nothing_jumped(machine)
+
+
+async def test_a_run_of_another_model_uses_the_probes_that_were_taken(tmp_path: Path) -> None:
+    """With the same model it gives the recorded offsets; with another the probes make up for the difference."""
+    machine = ProbedMachine(tmp_path)
+    machine.each_hour(500)
+    machine.at_sample[130] = lambda: machine.probe(offset_applied_um=machine.applied_um() + 5.0)
+    machine.at_sample[250] = lambda: machine.probe(20.0)
+    await machine.run(300)
+    await machine.sleep(3.0)
+    await machine.run(250)
+    files = recordings(machine.recordings, MACHINE)
+    same = compare(files, machine.daemon._compensation.model)  # type: ignore[union-attr]
+    assert same.samples == 550 and same.offsets.peak == 0.0
+    other = compare(files, parse_model(other_model(), source="test"))
+    assert 0.0 < other.offsets.rms < 2.5
 
 
 # ---------------------------------------------------------------------- when a probe is wanted
@@ -425,11 +488,23 @@ async def test_the_time_by_which_a_probe_is_wanted_comes_true(tmp_path: Path) ->
     first = next(s for s in statuses[245:] if s["probe_wanted"])
     assert first["wanted_why"] == ProbeCode.DEVIATION and first["wanted_std_um"] > 3.0
     assert first["wanted_by_ns"] == first["time_utc_ns"]
-    # The shares of the paths change meanwhile, so the forecast is not exact.
-    wanted_min, came_min = (
-        (ns - foretold["time_utc_ns"]) / MINUTE_NS for ns in (foretold["wanted_by_ns"], first["time_utc_ns"])
+    # The shares of the paths change meanwhile, so an early forecast is not exact; the last one is.
+    assert foretold["wanted_by_ns"] > foretold["time_utc_ns"]
+    (last,) = [s for s in statuses if s["seq"] == first["seq"] - 1]
+    assert abs(last["wanted_by_ns"] - first["time_utc_ns"]) < 15 * MINUTE_NS
+
+
+def test_a_tolerance_below_the_noise_of_a_probe_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = configuration(
+        "vmc-07", {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 1, "command": 2}, 7447
     )
-    assert 0.5 * came_min < wanted_min < 2.0 * came_min
+    path = tmp_path / "machine.toml"
+    path.write_bytes(text.encode() + PROBE.replace(b"tolerance_um = 3.0", b"tolerance_um = 0.5"))
+    assert main(["check", "--config", str(path)]) == 0
+    said = capsys.readouterr()
+    assert "probe_tolerance" in said.err and "probes: on, one value ±1 µm, correction at most 40 µm" in said.out
 
 
 async def test_the_first_probe_is_asked_for(tmp_path: Path) -> None:
@@ -462,13 +537,14 @@ async def test_a_correction_at_its_limit_is_a_reason(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        (b'"measured_um":', b'"measured_um":1'),
-        (b'"feature":"sphere-1"', b'"feature":"sphere-2"'),
-        (b'"taken":true', b'"taken":false'),
+        (rb'"measured_um":[^,]+', b'"measured_um":1.25'),
+        (rb'"feature":"sphere-1"', b'"feature":"sphere-2"'),
+        (rb'"taken":true', b'"taken":false'),
+        (rb'"measured_um":[^,]+', b'"measured_um":null'),
     ],
 )
 async def test_a_changed_probe_is_found_even_under_a_new_chain(tmp_path: Path, old: bytes, new: bytes) -> None:
-    machine = ProbedMachine(tmp_path, noise_um=0.0)
+    machine = ProbedMachine(tmp_path)
     for at in (60, 90, 120):
         machine.at_sample[at] = machine.probe
     await machine.run(130)
@@ -477,14 +553,16 @@ async def test_a_changed_probe_is_found_even_under_a_new_chain(tmp_path: Path, o
 
     def change(lines: list[Line]) -> list[Line]:
         at = [i for i, line in enumerate(lines) if line.topic == "probe"][1]
-        lines[at] = replace(lines[at], data=lines[at].data.replace(old, new, 1))
+        changed = re.sub(old, new, lines[at].data, count=1)
+        assert changed != lines[at].data
+        lines[at] = replace(lines[at], data=changed)
         return with_new_values(lines, contents)
 
     rewrite(path, change)
     found = look(machine)
     assert not found.clean
     (file,) = found.files
-    assert file.difference is not None and file.difference.topic == "probe"
+    assert file.difference is not None and file.differing > 0
 
 
 async def test_without_the_table_everything_is_as_without_probes(tmp_path: Path) -> None:

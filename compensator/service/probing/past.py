@@ -1,7 +1,7 @@
 """The last samples: what was predicted at the time of a probe, and which offset was published then.
 
-A probe is a point in time, and a sample is a mean over its period, so the prediction of a sample belongs to the middle
-of it. The offset of a sample is published at its end and then followed with its rate (`compensator.receiver`).
+A probe is a point in time; the prediction goes from sample to sample, each at its end. That is when its offset is
+published, which is then followed with its rate (`compensator.receiver`): a probe shows what this offset leaves.
 """
 
 from __future__ import annotations
@@ -17,8 +17,6 @@ from compensator.service.probing.state import PastSample
 _GAP = 1.5
 #: A receiver follows the rate for this many periods, and holds the offset after twice as many.
 _FOLLOWED = 1.25
-#: The offset of a sample may be published this much after its end, s: see `daemon.PATIENCE_S`.
-_LATE_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,22 +31,21 @@ class Predicted:
 def predicted_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -> Predicted | None:
     """Return what the model predicted for a time; None if there is no prediction for it."""
     period_ns = round(period_s * NS)
-    middle_ns = time_ns + period_ns // 2
-    after = next((i for i, sample in enumerate(samples) if sample.time_ns >= middle_ns), len(samples))
+    after = next((i for i, sample in enumerate(samples) if sample.time_ns > time_ns), len(samples))
     if after == 0:
         return None
     before = samples[after - 1]
     later = samples[after] if after < len(samples) else None
     has_gap = later is not None and later.time_ns - before.time_ns > _GAP * period_ns
     if later is not None and not has_gap:
-        part = (middle_ns - before.time_ns) / (later.time_ns - before.time_ns)
+        part = (time_ns - before.time_ns) / (later.time_ns - before.time_ns)
         pairs = zip(before.contributions_um, later.contributions_um, strict=True)
         return Predicted(
             before.y_um + part * (later.y_um - before.y_um),
             tuple(then + part * (now - then) for then, now in pairs),
             max(before.noise_um, later.noise_um),
         )
-    ahead_ns = middle_ns - before.time_ns
+    ahead_ns = time_ns - before.time_ns
     if ahead_ns > (1.0 if has_gap else _GAP) * period_ns:
         return None
     return Predicted(
@@ -65,12 +62,11 @@ def published_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -
 def offsets_at(samples: Sequence[PastSample], time_ns: int, period_s: float) -> tuple[float, float]:
     """Return the smallest and the largest offset that a control may have applied at a time, µm.
 
-    A control follows the rate or only the offset, and receives the offset of a sample a little after its end.
+    A control follows the rate or only the offset, receives it some time after the end of the sample, and moves at its
+    own permitted rate: it is between the last two.
     """
-    *earlier, newest = _published_until(samples, time_ns)
-    followed = [newest, *(earlier[-1:] if time_ns - newest.time_ns <= _LATE_S * NS else [])]
     values = []
-    for sample in followed:
+    for sample in _published_until(samples, time_ns)[-2:]:
         minutes = min((time_ns - sample.time_ns) / NS, _FOLLOWED * period_s) / 60.0
         values += [sample.offset_um, sample.offset_um + sample.offset_rate_um_per_min * minutes]
     return min(values), max(values)

@@ -132,6 +132,9 @@ class Probing:
         except ValueError as error:
             raise DataError(f"state: {error}") from error
         sizes = {len(sample.contributions_um) for sample in state.samples} | {len(correction.names)}
+        numbers = [n for s in state.samples for n in (s.y_um, s.rate_um_per_min, s.noise_um, *s.contributions_um)]
+        if not all(map(math.isfinite, numbers)):
+            raise DataError("state: a number of the samples for probes is not finite")
         if correction.names != self._names or sizes != {len(self._names)}:
             raise DataError(f"state: probes of {list(correction.names)}, expected {list(self._names)}")
         self._correction, self._state = correction, state

@@ -158,7 +158,8 @@ def unread_probe(machine: str, probe_utc_ns: int, text: str, by: str, by_proof: 
     )
 
 
-def undecided_probe(machine: str, seq: int, probe: ReceivedProbe) -> Probe:
-    """Return the message for a probe of a sample that could not be processed."""
-    text = "probe: not decided, because of an internal error"
-    return recorded_probe(machine, seq, probe, Verdict(taken=False, code=Reason.INTERNAL_ERROR, text=text))
+def undecided_probe(machine: str, seq: int, probe: ReceivedProbe, *, ends: bool = False) -> Probe:
+    """Return the message for a probe whose sample could not be processed, or does not come because the service ends."""
+    code: str = ProbeCode.TIME_UNKNOWN if ends else Reason.INTERNAL_ERROR
+    why = "because the service ended before the next sample" if ends else "because of an internal error"
+    return recorded_probe(machine, seq, probe, Verdict(taken=False, code=code, text=f"probe: not decided, {why}"))

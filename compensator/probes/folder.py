@@ -1,0 +1,243 @@
+"""A watched folder of CSV files: each line is sent once, with its own time, over restarts and rewritten files."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from compensator.atomic_write import atomic_write
+from compensator.codes import ProbeSourceRemark, Remark
+from compensator.errors import ConfigError, UsageError
+from compensator.probes.probe import Probe
+from compensator.probes.sender import Outcome, Report, pause
+from compensator.probes.settings import Folder, convention
+from compensator.probes.table import BadLine, Row, columns, row
+
+#: Longest file, bytes; 100 000 lines.
+LONGEST = 10_000_000
+
+
+class _Signature(NamedTuple):
+    """A file's content has not changed while this has not."""
+
+    inode: int
+    size: int
+    mtime_ns: int
+
+
+class Handled:
+    """Which lines were handled, kept over a restart.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        State file.
+    keep_s : float
+        Lines older than this are forgotten, s.
+
+    Raises
+    ------
+    ConfigError
+        If the file is there and cannot be read: lines might be sent twice.
+    """
+
+    def __init__(self, path: Path, keep_s: float) -> None:
+        self._path = path
+        self._keep_ns = round(keep_s * 1e9)
+        self._lines: dict[str, str] = {}
+        if not path.parent.is_dir():
+            raise ConfigError(f"{path}: no such folder for the state of folders")
+        try:
+            kept = json.loads(path.read_text(encoding="utf-8"))["handled"] if path.exists() else {}
+            if not all(isinstance(part, str) for pair in kept.items() for part in pair):
+                raise TypeError("expected texts")
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            raise ConfigError(f"{path}: {error}; expected the state of folders; delete it to begin anew") from error
+        self._lines.update(kept)
+
+    def values(self, identity: str) -> str | None:
+        """Return the values with which a line was handled; None if it was not."""
+        return self._lines.get(identity)
+
+    def add(self, line: Row, now_utc_ns: int) -> None:
+        """Note that a line was handled, on disk when this returns.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        self._lines[line.identity] = line.values
+        oldest = now_utc_ns - self._keep_ns
+        self._lines = {key: value for key, value in self._lines.items() if int(key.partition(" ")[0]) >= oldest}
+        with atomic_write(self._path) as file:
+            json.dump({"handled": self._lines}, file)
+
+
+class WatchedFolder:
+    """Looks into a folder.
+
+    Parameters
+    ----------
+    settings : Folder
+        The folder.
+    handled : Handled
+        Which lines were handled; shared by all folders.
+    submit : callable
+        Called with each probe, the name of its file, and a function to call with the outcome.
+    applied_at : callable
+        Returns the offset that the control had at a time, µm, or None; for lines without it.
+    send_within_s : float
+        A line older than this is not sent, s.
+    report : callable
+        Called with a line for each line that is not sent.
+    utc_ns : callable, optional
+        Wall clock, ns.
+    """
+
+    def __init__(
+        self,
+        settings: Folder,
+        handled: Handled,
+        submit: Callable[[Probe, str, Callable[[Outcome], None]], None],
+        applied_at: Callable[[int], float | None],
+        report: Report,
+        *,
+        send_within_s: float,
+        utc_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._settings = settings
+        self._handled = handled
+        self._submit = submit
+        self._applied_at = applied_at
+        self._report = report
+        self._send_within_ns = round(send_within_s * 1e9)
+        self._utc_ns = utc_ns
+        self._seen: dict[Path, _Signature] = {}
+        self._read: dict[Path, _Signature] = {}
+        self._pending: dict[str, str] = {}
+        self._reported: set[tuple[Path, str]] = set()
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Look until `stop` is set."""
+        while not stop.is_set():
+            self.poll()
+            await pause(stop, self._settings.poll_s)
+
+    def poll(self) -> None:
+        """Look once; a file is read when it is the same as at the call before, so that no write is under way."""
+        found = dict(self._files())
+        for path, signature in found.items():
+            if self._read.get(path) != signature and self._seen.get(path) == signature:
+                self._read[path] = signature
+                self._read_file(path)
+        self._seen = found
+        self._read = {path: signature for path, signature in self._read.items() if path in found}
+
+    def _files(self) -> Iterator[tuple[Path, _Signature]]:
+        folder = Path(self._settings.path)
+        try:
+            paths = sorted(folder.glob(self._settings.pattern))
+            if not folder.is_dir():
+                raise FileNotFoundError(2, "no such folder")
+        except OSError as error:
+            self._trouble(folder, error)
+            return
+        for path in paths:
+            try:
+                status = path.stat()
+            except OSError:
+                continue  # removed meanwhile
+            if path.is_file():
+                yield path, _Signature(status.st_ino, status.st_size, status.st_mtime_ns)
+
+    def _read_file(self, path: Path) -> None:
+        try:
+            if path.stat().st_size > LONGEST:
+                raise OSError(27, f"longer than {LONGEST} bytes")
+            content = path.read_bytes()
+        except OSError as error:
+            self._read.pop(path, None)
+            self._trouble(path, error)
+            return
+        text = content.decode("utf-8", "surrogateescape").replace("\r\n", "\n").replace("\r", "\n")
+        *lines, rest = text.split("\n")
+        if rest:
+            self._refuse(path, ProbeSourceRemark.LINE_INCOMPLETE, rest, "no line end")
+        if not lines:
+            return
+        try:
+            names = columns(lines[0])
+        except BadLine as bad:
+            self._refuse(path, ProbeSourceRemark.LINE_BROKEN, lines[0], str(bad))
+            return
+        old = sum(self._handle(path, names, line) for line in lines[1:])
+        if old:
+            why = f"{old} line(s) older than {self._send_within_ns / 1e9:g} s"
+            self._refuse(path, ProbeSourceRemark.PROBE_NOT_SENT, "", why)
+
+    def _handle(self, path: Path, names: list[str], text: str) -> bool:
+        """Submit a line that is new; return whether it was not because it is too old."""
+        if not text.strip():
+            return False
+        try:
+            line = row(names, text)
+        except BadLine as bad:
+            self._refuse(path, ProbeSourceRemark.LINE_BROKEN, text, str(bad))
+            return False
+        before = self._handled.values(line.identity) or self._pending.get(line.identity)
+        if before is not None:
+            if before != line.values:
+                self._refuse(path, ProbeSourceRemark.LINE_CHANGED, text, "sent before with other values")
+            return False
+        if self._utc_ns() - line.time_utc_ns > self._send_within_ns:
+            return True
+        offset_um = line.offset_applied_um
+        if offset_um is None:
+            offset_um = self._applied_at(line.time_utc_ns)
+        if offset_um is None:
+            self._refuse(path, ProbeSourceRemark.LINE_OFFSET_UNKNOWN, text, "no offset_applied_um")
+            return False
+        self._pending[line.identity] = line.values
+        self._submit(self._probe(line, offset_um), path.name, lambda _: self._done(line))
+        return False
+
+    def _probe(self, line: Row, offset_um: float) -> Probe:
+        return Probe(
+            time_utc_ns=line.time_utc_ns,
+            measured_um=convention(self._settings).measured_um(line.measured_um, offset_um),
+            offset_applied_um=offset_um,
+            feature=line.feature,
+            tool=line.tool,
+            std_um=line.std_um,
+            stopped_s=line.stopped_s,
+        )
+
+    def _done(self, line: Row) -> None:
+        """Keep a line as handled; until this is on disk, a restart sends it again, and the service refuses it twice."""
+        try:
+            self._handled.add(line, self._utc_ns())
+        except (OSError, UsageError) as error:
+            self._trouble(Path(self._settings.path), error)
+            return
+        self._pending.pop(line.identity, None)
+
+    def _trouble(self, path: Path, error: OSError | UsageError) -> None:
+        why = getattr(error, "strerror", None) or error
+        self._once(path, Remark(ProbeSourceRemark.SOURCE_LOST, f"{path}: {why}.").marked)
+
+    def _refuse(self, path: Path, code: ProbeSourceRemark, text: str, why: str) -> None:
+        shown = f"{text.strip()[:120]!r}: " if text else ""
+        self._once(path, Remark(code, f"{path}: not sent: {shown}{why}.").marked)
+
+    def _once(self, path: Path, words: str) -> None:
+        """Report once what every look would find again."""
+        if (path, words) not in self._reported:
+            if len(self._reported) > 10_000:
+                self._reported.clear()
+            self._reported.add((path, words))
+            self._report(words)

@@ -1,0 +1,84 @@
+"""All sources of a file, together with the sender."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+from compensator.probes.folder import Handled, WatchedFolder
+from compensator.probes.linuxcnc import ProbeFile
+from compensator.probes.printed import PrintedProbes
+from compensator.probes.probe import Probe, ProbeSink
+from compensator.probes.sender import Outcome, Report, Sender
+from compensator.probes.settings import ProbeSettings
+from compensator.probes.stream import Stream
+from compensator.receiver.applied_record import applied_at
+
+log = logging.getLogger("compensator")
+#: How long a handled line is remembered beyond the time in which lines are sent, s: clocks may be set.
+_MARGIN_S = 86400.0
+
+
+async def serve(
+    settings: ProbeSettings,
+    sink: ProbeSink,
+    stop: asyncio.Event,
+    *,
+    report: Report = log.info,
+    utc_ns: Callable[[], int] = time.time_ns,
+) -> None:
+    """Read all sources and send what they yield, until `stop` is set.
+
+    Parameters
+    ----------
+    settings : ProbeSettings
+        Sources and service.
+    sink : ProbeSink
+        Where probes go.
+    stop : asyncio.Event
+        Ends it.
+    report : callable, optional
+        Called with a line for each probe and each line that is no probe; the log by default.
+    utc_ns : callable, optional
+        Wall clock, ns.
+
+    Raises
+    ------
+    ConfigError
+        If the state file cannot be read.
+    """
+    service = settings.service
+    sender = Sender(sink, send_within_s=service.send_within_s, retry_s=service.retry_s, report=report, utc_ns=utc_ns)
+
+    def applied(time_utc_ns: int) -> float | None:
+        return applied_at(Path(service.applied_file), time_utc_ns) if service.applied_file else None
+
+    def submitting(source: str) -> Callable[[Probe], None]:
+        return lambda probe: sender.submit(probe, source)
+
+    def submit_line(probe: Probe, source: str, done: Callable[[Outcome], None]) -> None:
+        sender.submit(probe, source, done)
+
+    runs: list[Coroutine[Any, Any, None]] = []
+    if settings.folders:
+        handled = Handled(Path(service.state_file), service.send_within_s + _MARGIN_S)
+        within_s = service.send_within_s
+        for folder in settings.folders:
+            watched = WatchedFolder(
+                folder, handled, submit_line, applied, report, send_within_s=within_s, utc_ns=utc_ns
+            )
+            runs.append(watched.run(stop))
+    runs.append(sender.run(stop))
+    for dprnt in settings.dprnt:
+        printed = PrintedProbes(dprnt, submitting(dprnt.name), applied, report)
+        runs.append(Stream(dprnt, printed, report, utc_ns=utc_ns).run(stop))
+    for linuxcnc in settings.linuxcnc:
+        file = ProbeFile(linuxcnc, submitting(Path(linuxcnc.file).name), applied, report, utc_ns=utc_ns)
+        runs.append(file.run(stop))
+    async with asyncio.TaskGroup() as group:
+        for run in runs:
+            group.create_task(run)

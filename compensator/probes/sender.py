@@ -1,0 +1,138 @@
+"""Sends probes one after the other, in order; what cannot be sent is retried with its own time, and then given up."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+from compensator.codes import ProbeSourceRemark, Remark
+from compensator.probes.probe import NotSent, Probe, ProbeSink
+
+log = logging.getLogger("compensator")
+
+#: Called with each line for the log.
+Report = Callable[[str], None]
+#: What became of a probe.
+Outcome = Literal["sent", "refused", "given up"]
+#: Largest number of probes that wait; a source that floods must not fill the memory.
+WAITING = 200
+
+
+class _Waiting(NamedTuple):
+    probe: Probe
+    source: str
+    done: Callable[[Outcome], None]
+
+
+class Sender:
+    """Sends what the sources submit.
+
+    Parameters
+    ----------
+    sink : ProbeSink
+        Where probes go; called on a separate thread, one at a time.
+    send_within_s : float
+        A probe older than this is not sent any more, s.
+    retry_s : float
+        Pause after an attempt without answer, s.
+    report : callable, optional
+        Called with a line for each probe that was sent or not; the log by default.
+    utc_ns : callable, optional
+        Wall clock, ns.
+    """
+
+    def __init__(
+        self,
+        sink: ProbeSink,
+        *,
+        send_within_s: float,
+        retry_s: float = 5.0,
+        report: Report = log.info,
+        utc_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._sink = sink
+        self.send_within_s = send_within_s
+        self._retry_s = retry_s
+        self._report = report
+        self._utc_ns = utc_ns
+        self._waiting: deque[_Waiting] = deque()
+        self._changed = asyncio.Event()
+        self._trouble = ""
+
+    def submit(self, probe: Probe, source: str, done: Callable[[Outcome], None] = lambda _: None) -> None:
+        """Send a probe as soon as possible.
+
+        Parameters
+        ----------
+        probe : Probe
+            The measured value.
+        source : str
+            Its source, for the log.
+        done : callable, optional
+            Called with the outcome; not called for what is still waiting when the sender ends.
+        """
+        if len(self._waiting) >= WAITING:
+            self._give_up(self._waiting.popleft(), f"{WAITING} probes are waiting")
+        self._waiting.append(_Waiting(probe, source, done))
+        self._changed.set()
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Send until `stop` is set; reports what is then still waiting."""
+        while not stop.is_set():
+            self._changed.clear()
+            if self._waiting and not await self._send_first():
+                await pause(stop, self._retry_s)
+            elif not self._waiting:
+                await _either(stop, self._changed)
+        for waiting in self._waiting:
+            self._report(f"{waiting.source}: not sent before the end: {waiting.probe.text}")
+
+    async def _send_first(self) -> bool:
+        """Send the first probe, or give it up; return whether to go on at once."""
+        first = self._waiting[0]
+        age_s = (self._utc_ns() - first.probe.time_utc_ns) / 1e9
+        if age_s > self.send_within_s:
+            self._waiting.popleft()
+            self._give_up(first, f"{age_s:.0f} s old, sent within {self.send_within_s:g} s")
+            return True
+        try:
+            reply = await asyncio.to_thread(self._sink.send, first.probe)
+        except NotSent as error:
+            if str(error) != self._trouble:
+                self._trouble = str(error)
+                self._report(f"{first.source}: {error}; retrying")
+            return False
+        self._trouble = ""
+        if self._waiting and self._waiting[0] is first:  # else it was given up meanwhile
+            self._waiting.popleft()
+        outcome = "sent" if reply.ok else "refused"
+        code = f" [{reply.code}]" if reply.code else ""
+        self._report(f"{first.source}: {outcome}: {first.probe.text}: {reply.text}{code}")
+        first.done("sent" if reply.ok else "refused")
+        return True
+
+    def _give_up(self, waiting: _Waiting, why: str) -> None:
+        figures = f"{waiting.source}: given up: {waiting.probe.text}: {why}."
+        self._report(Remark(ProbeSourceRemark.PROBE_NOT_SENT, figures).marked)
+        waiting.done("given up")
+
+
+async def pause(stop: asyncio.Event, seconds: float) -> None:
+    """Wait, at most until `stop` is set."""
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(stop.wait(), seconds)
+
+
+async def _either(*events: asyncio.Event) -> None:
+    waits = [asyncio.ensure_future(event.wait()) for event in events]
+    try:
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for wait in waits:
+            wait.cancel()
+        await asyncio.gather(*waits, return_exceptions=True)
