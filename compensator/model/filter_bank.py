@@ -154,6 +154,8 @@ class FilterBank:
             wrong += weight * as_wrong
             found.append(weight * (as_right + as_wrong))
         total = right + wrong
+        if total == 0.0:  # So far off that no density is left.
+            return Weighing(0.0, 0.0, list(self.weights))
         return Weighing(right / total, total, _spread([value / total for value in found], FORGETTING))
 
     def correct(self, expected: Expected) -> None:

@@ -239,7 +239,7 @@ class ProbeCorrection:
             return
         doubt = self._doubt * self._weigh(self._without, probe).density
         belief = (1.0 - self._doubt) * self._weigh(self._bank, probe).density
-        self._doubt = doubt / (doubt + belief)
+        self._doubt = doubt / (doubt + belief) if doubt + belief > 0.0 else self._doubt
         if self._doubt > 0.5:
             self._bank, self._without, self._doubt = self._without, self._bank, 1.0 - self._doubt
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import dataclasses
 import io
 import json
 
@@ -11,6 +12,7 @@ import pytest
 import compensator as tc
 from compensator.cli import main
 from compensator.codes import DataRemark
+from compensator.model.effects.gain import Gain
 from compensator.model.engine import Engine
 from compensator.model.probe_correction import ProbeCorrection
 from tests.diagnose.scenarios import record
@@ -97,6 +99,18 @@ def test_it_is_what_the_service_computes_sample_by_sample(machine):
         if not np.isnan(y):
             correction = ProbeCorrection.from_dict(json.loads(json.dumps(correction.to_dict())))
             correction.update(y, STD_UM, estimate.y_um, shares)
+
+
+def test_an_effect_has_a_gain_of_its_own():
+    model = tc.load_model("quill")
+    engine = Engine(dataclasses.replace(model, effects=(Gain(path="DTF", change=0.1), Gain(path="DTF", change=0.2))))
+    assert len(set(engine.contribution_names)) == 4 and engine.contribution_names[:2] == ("DTF", "TDTF")
+    engine.set_reference(20.0, 20.0)
+    estimate = [engine.step(25.0, 20.5) for _ in range(60)][-1]
+    dtf, tdtf, *effects = estimate.contributions_um
+    assert (dtf, tdtf) == (estimate.y_dtf_um, estimate.y_tdtf_um) and dtf > 1.0
+    assert effects == pytest.approx([0.1 * dtf, 0.2 * dtf])
+    assert 0.0 < engine.y_noise_std_um < estimate.y_std_um
 
 
 def test_dense_y_is_followed_without_its_noise(machine):

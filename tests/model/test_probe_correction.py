@@ -122,6 +122,14 @@ def test_a_chip_is_refused_and_moves_nothing():
     assert found.std_um(shares(720)) >= deviation
 
 
+def test_what_is_beyond_every_density_is_refused():
+    found, *_ = run(nothing, hours=12.0)
+    before = found.correction_um(REST)
+    assert not found.update(1e30, 1.5, 0.0, REST).taken
+    assert found.correction_um(REST) == before
+    assert found.update(0.0, 1.5, 0.0, REST).taken
+
+
 def test_chips_cost_little():
     lacking = lambda minute, now: -0.1 * now[0]  # noqa: E731
     _, clean, *_ = run(lacking, hours=48.0)

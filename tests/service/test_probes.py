@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +29,9 @@ from compensator.recording.container import Container
 from compensator.recording.reading import recordings
 from compensator.service.command_client import send_probe
 from compensator.service.compensation import Compensation
+from compensator.service.probing.past import offsets_at, predicted_at, published_at
 from compensator.service.probing.received import ProbeRefused, read_probe
+from compensator.service.probing.state import PastSample
 from compensator.service.publisher import Publisher
 from compensator.service.state import decode_state
 from tests.audit.made import CONFIG, other_model
@@ -529,6 +532,38 @@ async def test_a_correction_at_its_limit_is_a_reason(tmp_path: Path) -> None:
     # What is not applied is unknown to the receiver, too.
     assert number(after.offset.y_offset_std_um) > 4.5
     assert nothing_jumped(machine)
+
+
+# ---------------------------------------------------------------------- the last samples
+
+
+def past(*values: tuple[float, float, float]) -> list[PastSample]:
+    """Samples with minute, prediction and offset; the rate is 1 µm/min."""
+    return [PastSample(round(t * MINUTE_NS), y, 1.0, (y, 0.0), 0.1, offset, -1.0, False) for t, y, offset in values]
+
+
+def test_a_time_between_two_samples_is_between_their_predictions() -> None:
+    samples = past((1, 10.0, -10.0), (2, 12.0, -12.0), (5, 20.0, math.nan))
+    found = predicted_at(samples, round(1.25 * MINUTE_NS), 60.0)
+    assert found is not None and found.y_um == pytest.approx(10.5)
+    assert found.contributions_um == pytest.approx((10.5, 0.0))
+    # Before the first, in a gap, and just behind its edge, where the rate foretells it.
+    assert predicted_at(samples, round(0.9 * MINUTE_NS), 60.0) is None
+    assert predicted_at(samples, round(3.5 * MINUTE_NS), 60.0) is None
+    behind = predicted_at(samples, round(2.5 * MINUTE_NS), 60.0)
+    assert behind is not None and behind.y_um == pytest.approx(12.5)
+    assert predicted_at(samples, round(6.6 * MINUTE_NS), 60.0) is None
+
+
+def test_the_offset_of_a_time_is_followed_with_its_rate_and_expires() -> None:
+    samples = past((1, 10.0, -10.0), (2, 12.0, -13.0), (3, 12.0, math.nan))
+    assert offsets_at(samples, round(2.5 * MINUTE_NS), 60.0) == pytest.approx((-13.5, -10.0))
+    assert offsets_at(samples[:1], round(1.5 * MINUTE_NS), 60.0) == pytest.approx((-10.5, -10.0))
+    # The rate is followed for 75 s, the offset is valid for 150 s.
+    assert offsets_at(samples[:1], round(3.2 * MINUTE_NS), 60.0) == pytest.approx((-11.25, -10.0))
+    assert published_at(samples[:1], round(3.4 * MINUTE_NS), 60.0) is not None
+    assert published_at(samples[:1], round(3.6 * MINUTE_NS), 60.0) is None
+    assert published_at(samples, round(0.5 * MINUTE_NS), 60.0) is None
 
 
 # ---------------------------------------------------------------------- audit, and a machine without probes

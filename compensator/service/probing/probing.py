@@ -27,6 +27,7 @@ from compensator.service.probing.checks import check_probe
 from compensator.service.probing.past import predicted_at
 from compensator.service.probing.received import ProbeRefused, ReceivedProbe, Verdict, recorded_probe
 from compensator.service.probing.state import KnownProbe, PastSample, ProbingState
+from compensator.service.probing.wanted import Wanted, wanted_after
 
 #: Samples that are kept beyond `probe.oldest_min`: a probe is compared with the one after it, and waits for a sample.
 _MORE_SAMPLES = 4
@@ -39,8 +40,6 @@ _NOT_ASKED = (ProbeCode.DUPLICATE, ProbeCode.TOO_MANY_FEATURES, ProbeCode.AXIS)
 _WORDS = {"": "taken", ProbeCode.OUTLIER: "refused", ProbeCode.BELIEVED: "taken against earlier ones"}
 #: From this standard deviation on nothing was known about the value, µm.
 _UNKNOWN_UM = 200.0
-#: How far ahead the next probe is foreseen, min, and the step of the forecast.
-_AHEAD_MIN, _FORECAST_MIN = 1440.0, 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,17 +60,6 @@ class Corrected:
     rate_um_per_min: float = 0.0
     std_um: float = NAN
     is_limited: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Wanted:
-    """Whether, by when and why a probe is wanted; see `messages.Status`."""
-
-    is_wanted: bool
-    by_ns: int | None
-    why: str
-    std_um: float
-    tolerance_um: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,36 +301,9 @@ class Probing:
         Parameters
         ----------
         y_std_um : float
-            Standard deviation that was published with it, µm.
+            Standard deviation of the prediction, µm.
         """
-        tolerance, samples = self._settings.tolerance_um, self._state.samples
-        if not samples or math.isnan(samples[-1].offset_um) or samples[-1].is_held:
-            # A probe could not be used now.
-            return Wanted(is_wanted=False, by_ns=None, why="", std_um=y_std_um, tolerance_um=tolerance)
-        now_ns, why = samples[-1].time_ns, ""
-        by_ns: int | None = now_ns
-        if self._state.refused:
-            why = self._state.refused
-        elif not self._correction.active:
-            why = ProbeCode.FIRST
-        elif tolerance is not None and y_std_um > tolerance:
-            why = ProbeCode.DEVIATION
-        else:
-            by_ns = self._exceeded_ns(tolerance, y_std_um) if tolerance is not None else None
-        return Wanted(is_wanted=bool(why), by_ns=by_ns, why=why, std_um=y_std_um, tolerance_um=tolerance)
-
-    def _exceeded_ns(self, tolerance_um: float, y_std_um: float) -> int | None:
-        """Return when the standard deviation will exceed the tolerance; None if not within a day."""
-        last = self._state.samples[-1]
-        ahead = ProbeCorrection.from_dict(self._correction.to_dict())
-        now_um2 = ahead.std_um(last.contributions_um) ** 2
-        ahead.step(last.contributions_um, _FORECAST_MIN)
-        # The variance grows in proportion to the time, as the states walk.
-        growth = (ahead.std_um(last.contributions_um) ** 2 - now_um2) / _FORECAST_MIN
-        if growth <= 0.0:
-            return None
-        minutes = max(tolerance_um**2 - y_std_um**2, 0.0) / growth
-        return last.time_ns + round(minutes * 60.0 * NS) if minutes <= _AHEAD_MIN else None
+        return wanted_after(self._state, self._correction, y_std_um, self._settings.tolerance_um)
 
 
 def _known(probe: ReceivedProbe) -> KnownProbe:
