@@ -195,10 +195,13 @@ class ProbeCorrection:
         if len(agreeing) + 1 >= min(AGREEING, self._probes + 2):
             reason = BELIEVED
             self._believe(agreeing, probe)
+            weighing = self._weigh(self._bank, probe)
         elif weighing.right < 0.5:
             for bank in self._banks():
                 bank.weights = self._weigh(bank, probe).weights
             self._refused = [*self._refused[1 - REFUSED_KEPT :], probe]
+            if not self.active:  # The first feature is the first of which a probe is taken.
+                self._features.clear()
             self._mix()
             return ProbeVerdict(False, OUTLIER, innovation, math.sqrt(variance))
         self._accept(probe, 1.0 - weighing.right)
@@ -237,9 +240,12 @@ class ProbeCorrection:
         """Let the bank without the probe on probation take over where this one makes that more probable."""
         if self._without is None:
             return
-        doubt = self._doubt * self._weigh(self._without, probe).density
+        undone = self._weigh(self._without, probe)
+        doubt = self._doubt * undone.density
         belief = (1.0 - self._doubt) * self._weigh(self._bank, probe).density
-        self._doubt = doubt / (doubt + belief) if doubt + belief > 0.0 else self._doubt
+        if doubt >= belief and undone.right < 0.5:
+            return  # Wrong for both banks: it will be refused, and a refused probe moves nothing.
+        self._doubt = doubt / (doubt + belief)
         if self._doubt > 0.5:
             self._bank, self._without, self._doubt = self._without, self._bank, 1.0 - self._doubt
 

@@ -149,6 +149,7 @@ def test_three_refused_ones_that_agree_are_believed():
         quiet.update(y - 25.0, 1.5, 0.0, REST)
     assert reasons == [OUTLIER, OUTLIER, BELIEVED]
     assert found.correction_um(REST) == pytest.approx(25.0, abs=1.5)
+    assert found.to_dict()["doubt"] < 0.5  # What was believed is not on probation as what was refused.
     found.step(REST, 60.0)
     quiet.step(REST, 60.0)
     assert found.std_um(REST) > 1.3 * quiet.std_um(REST)  # What jumped once is not as well known as before.
@@ -192,6 +193,29 @@ def test_a_chip_near_the_zero_is_refused_at_the_first_probe():
     found = ProbeCorrection(NAMES)
     assert not found.update(20.0, 1.5, 0.0, REST).taken
     assert not found.active and found.correction_um(REST) == 0.0
+
+
+def test_the_first_feature_is_the_first_of_which_a_probe_is_taken():
+    found = ProbeCorrection(NAMES)
+    assert not found.update(20.0, 1.5, 0.0, REST, feature="with a chip").taken
+    assert found.update(2.0, 1.5, 0.0, REST, feature="sphere").taken
+    assert found.correction_um(REST) == pytest.approx(2.0, abs=1.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_refused_probe_moves_the_correction(seed):
+    """Whatever was on probation before it."""
+    found, rng = ProbeCorrection(NAMES), np.random.default_rng(seed)
+    refused = 0
+    for minute in range(0, 6000, 30):
+        now = shares(minute)
+        found.step(now, 30.0)
+        before = found.correction_um(now)
+        y = sum(now) + rng.normal(0.0, 1.5) + rng.choice([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 14.0, -20.0])
+        if not found.update(y, 1.5, sum(now), now).taken:
+            refused += 1
+            assert found.correction_um(now) == before
+    assert refused > 5
 
 
 def test_a_further_feature_makes_no_jump_and_teaches_changes():
