@@ -126,6 +126,8 @@ class Search:
                 break
             best = self._exchanged(better)
         best = self._with_simpler_name(self._exchanged(self._pruned(best), len(best.terms)))
+        if hidden := self._hidden(undecided, best):
+            best = hidden
         return Selection(
             before=before,
             fit=best,
@@ -172,6 +174,17 @@ class Search:
         """Return what an effect must add to the evidence."""
         unseen = UNSEEN if self.evidence.context.approximate and not hypothesis.effect.observed else 0.0
         return unseen + MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
+
+    def _hidden(self, undecided: Sequence[Fit], best: Fit) -> Fit | None:
+        """Return a source that no channel shows, if few values show that something acts and nothing else comes nearer.
+
+        The slow rest is such a source, too, only without times: it must not keep the one with times from its name.
+        """
+        if best.terms or not self._something_acts or not undecided:
+            return None
+        first = undecided[0]
+        is_source = first.terms[-1].hypothesis.effect.kind == "unobserved"
+        return first if is_source and self._leaves_noise(first) else None
 
     def _leaves_noise(self, fit: Fit) -> bool:
         return self.evidence.noise.is_explained(self.rms(fit) ** 2 * self.evidence.count)
