@@ -180,11 +180,10 @@ class Search:
 
         The slow rest is such a source, too, only without times: it must not keep the one with times from its name.
         """
-        if best.terms or not self._something_acts or not undecided:
+        if best.terms or not self._something_acts:
             return None
-        first = undecided[0]
-        is_source = first.terms[-1].hypothesis.effect.kind == "unobserved"
-        return first if is_source and self._leaves_noise(first) else None
+        first = next((fit for fit in undecided if self._leaves_noise(fit)), None)
+        return first if first and first.terms[-1].hypothesis.effect.kind == "unobserved" else None
 
     def _leaves_noise(self, fit: Fit) -> bool:
         return self.evidence.noise.is_explained(self.rms(fit) ** 2 * self.evidence.count)
