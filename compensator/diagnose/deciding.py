@@ -155,7 +155,9 @@ class Deciding:
         wait_h : float
             How long it takes until it acts by itself, h.
         """
-        trials = [trial for trial in self.trials.of([event]) if event and trial.driver == event]
+        # Nobody can drive the day: it is waited for.
+        driver = "" if event == DAY else event
+        trials = [trial for trial in self.trials.of([driver]) if driver and trial.driver == driver]
         planned = []
         for trial in trials or [trial for trial in self.trials.of(()) if not trial.driver]:
             joint = self._of(trial, self._every_min[0])

@@ -121,6 +121,8 @@ class Search:
             grown, undecided = self._grown(before, unobserved=unobserved, apart_from=grown.places)
             best = self._pruned(grown)
         best = self._with_simpler_name(self._exchanged(best, len(best.terms)))
+        if hidden := self._hidden(undecided, best):
+            best = hidden
         return Selection(
             before=before,
             fit=best,
@@ -192,6 +194,16 @@ class Search:
         """Return what an effect must add to the evidence."""
         unseen = UNSEEN if self.evidence.context.approximate and not hypothesis.effect.observed else 0.0
         return unseen + MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
+
+    def _hidden(self, undecided: Sequence[Fit], best: Fit) -> Fit | None:
+        """Return a source that no channel shows, if few values show that something acts and nothing else comes nearer.
+
+        The slow rest is such a source, too, only without times: it must not keep the one with times from its name.
+        """
+        if best.terms or not self._something_acts:
+            return None
+        first = next((fit for fit in undecided if self._leaves_noise(fit)), None)
+        return first if first and first.terms[-1].hypothesis.effect.kind == "unobserved" else None
 
     def _leaves_noise(self, fit: Fit) -> bool:
         return self.evidence.noise.is_explained(self.rms(fit) ** 2 * self.evidence.count)

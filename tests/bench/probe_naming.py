@@ -11,7 +11,7 @@ Only effects that move the model's residual by at least the noise of one value (
 named           a right name of the true effect, and no other effect; without an effect: nothing.
 undecided       nothing named, verdict `unexplained`: the values show that something acts, or could not have shown it.
 false           an effect acts and the verdict is `adequate`.
-A source and a period that come and go between two probes cannot be named from them: `unexplained` is right there.
+A source that comes and goes between two probes cannot be named from them: `unexplained` is right there.
 """
 
 import sys
@@ -28,7 +28,7 @@ from sim_hardware.drawn_machines.catalogue import EFFECTS
 from tests.bench.figures import Figure, rows, told
 
 HOURS, EVERY_MIN, STD_UM = 48, 60, 1.5
-SETS = {"development": (20_000, 4), "judging": (550_000, 5)}
+SETS = {"development": (20_000, 4), "judging": (550_000, 2)}
 #: What may come and go between two probes.
 FAST = ("period", "hidden")
 

@@ -12,7 +12,7 @@ from compensator.diagnose.likelihood import Likelihood, Points, Rest, Whitening
 from compensator.diagnose.search import Search
 from compensator.errors import DataError
 from compensator.model.model_file import load_model
-from tests.diagnose.scenarios import draw, record
+from tests.diagnose.scenarios import draw, lag, record
 from tests.identify.quill_runs import runs_from
 
 QUILL = load_model("quill")
@@ -96,6 +96,16 @@ def test_what_comes_and_goes_between_two_probes_is_no_all_clear(kind):
     assert found["verdict"] == "unexplained"
     assert found["effects"] == []
     assert found["advice"]["tests"][0]["probes"] > 0
+
+
+def test_a_source_that_no_channel_shows_is_named_where_its_times_explain_all():
+    columns = probed("none", 5)
+    on = lag(np.searchsorted([700, 1200, 1900], np.arange(2880)) % 2.0, 45.0)
+    columns["y_um"] = columns["y_um"] + 12.0 * on
+    why = tc.diagnose("quill", columns, y_std_um=STD_UM)
+    assert [effect.kind for effect in why.effects] == ["unobserved"]
+    assert why.verdict == "unexplained"
+    assert why.model is not None and not why.model.effects
 
 
 def test_values_that_could_not_show_what_matters_are_no_all_clear():
