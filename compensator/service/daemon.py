@@ -238,7 +238,9 @@ class Daemon:
         machine, sequence = self._config.machine.name, self._events.sequence
         undecided = [undecided_probe(machine, sequence, probe, ends=True) for probe in probes]
         unread = [replace_fields(probe, seq=sequence) for probe in unread]
-        await self._journal.close(self._compensation.state(), [*unread, *undecided])
+        if unread or undecided:
+            await self._journal.record(self._clock.utc_ns(), self._compensation.state(), probes=[*unread, *undecided])
+        await self._journal.close(self._compensation.state())
         await self._sampler.close()
 
     # ------------------------------------------------------------------ one sample

@@ -162,10 +162,10 @@ class Journal:
             self._events.note(EventKind.RECORDING, text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
         self._reason, self._error = reason, error or self._error
 
-    async def close(self, state: bytes, probes: Sequence[Probe] = ()) -> None:
-        """Note that the service ends, record the probes that were not decided, and finish without a time limit."""
+    async def close(self, state: bytes) -> None:
+        """Note that the service ends, and finish the recording without a time limit."""
         self._events.note(EventKind.STOP, "the service ends")
-        await self.record(self._clock.utc_ns(), state, probes=probes)
+        await self.record(self._clock.utc_ns(), state)
         closing = self._writer.close()
         while not (await asyncio.wait([closing], timeout=CLOSING_S))[0]:
             figures = f"The disk has not accepted the rest of the recording for {CLOSING_S:g} s."
