@@ -29,8 +29,12 @@ def remarks() -> set[str]:
     """Codes of all warnings that the sources make."""
     found = set()
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        for node in nodes:
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Remark":
+                if isinstance(node.args[0], ast.Name):  # handed over: any code that the module names
+                    found |= {str(code) for code in map(member, nodes) if code is not None}
+                    continue
                 code = member(node.args[0])
                 assert code is not None, f"{path}: {node.lineno}: a code that is not a member of its domain"
                 found.add(str(code))
