@@ -42,14 +42,14 @@ class SentProbe:
     ----------
     time_utc_ns : int
         When it was measured, ns since 1970 UTC.
-    wrong_um : float
-        Error by a chip, µm.
+    chip_um : float
+        Error by a chip on the feature, µm; 0 without one.
     asked_because : str
         Code of why the service wanted it; empty for those of each hour.
     """
 
     time_utc_ns: int
-    wrong_um: float
+    chip_um: float
     asked_because: str
 
 
@@ -117,17 +117,17 @@ class HourlyProbes:
         if t_s >= self._due_s:
             self._due_s += EVERY_S
             self._each_hour += 1
-            wrong_um = CHIP_UM if self._each_hour == self._chip_at else 0.0
-            await self._probe(t_s, running, offset, wrong_um, "")
+            chip_um = CHIP_UM if self._each_hour == self._chip_at else 0.0
+            await self._probe(t_s, running, offset, chip_um, "")
         elif status.probe_wanted is True:
             await self._probe(t_s, running, offset, 0.0, str(status.wanted_why))
         else:
             self._look_s = math.inf
 
-    async def _probe(self, t_s: float, running: Running, offset: Offset, wrong_um: float, why: str) -> None:
+    async def _probe(self, t_s: float, running: Running, offset: Offset, chip_um: float, why: str) -> None:
         time_ns = START_NS + round(t_s * NS)
         applied_um = _applied_um(offset, time_ns)
-        found_um = self._deformation_um(running.world) + applied_um + TOUCH_STD_UM * self._rng.normal() + wrong_um
+        found_um = self._deformation_um(running.world) + applied_um + TOUCH_STD_UM * self._rng.normal() + chip_um
         probe = ProbeRequest(
             schema=SCHEMA,
             time_utc_ns=time_ns,
@@ -141,7 +141,7 @@ class HourlyProbes:
         reply = await asyncio.to_thread(send_probe, self._zenoh, probe)
         if not reply["ok"]:
             raise ServiceError(f"the service did not accept a probe of the demo: {reply['text']}")
-        self.sent.append(SentProbe(time_utc_ns=time_ns, wrong_um=wrong_um, asked_because=why))
+        self.sent.append(SentProbe(time_utc_ns=time_ns, chip_um=chip_um, asked_because=why))
         self._look_s = t_s + LOOK_AFTER_S
 
     def _deformation_um(self, world: World) -> float:
