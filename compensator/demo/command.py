@@ -20,7 +20,7 @@ from compensator.demo.machine import MACHINES
 from compensator.demo.shop import run_shop_day
 from compensator.report.demonstration import closed, page_of, verdict
 from compensator.report.formats import write
-from compensator.report.shop import ShopDay, probed, shop_table
+from compensator.report.shop import ShopDay, probe_words, shop_table
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -95,7 +95,7 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
         f"Second day: {loop['second_day_rms_um']['without']:.2f} µm rms without compensation. {closed(loop)}"
     )
     result = {"machines": results, "loop": loop, "shop": shop.figures, "report": str(page)}
-    tables = f"{table.text()}\n\n{verdict(days)}\n{summary}\n\n{shop_table(shop).text()}\n\n{probed(shop)}"
+    tables = f"{table.text()}\n\n{verdict(days)}\n{summary}\n\n{shop_table(shop).text()}\n\n{probe_words(shop).text()}"
     return result, f"{tables}\n{pages_text(page, also)}"
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.report.page import Figure, Line, Marks, Section, Table
+from compensator.report.page import Cell, CodeLink, Figure, Line, Marks, Section, Table, Words
 
 _CASES = {
     "without": "no compensation",
@@ -58,29 +58,25 @@ def shop_table(day: ShopDay) -> Table:
     )
 
 
-def probed(day: ShopDay) -> str:
-    """Return in sentences how many probes there were, and which were refused and asked for."""
+def probe_words(day: ShopDay) -> Words:
+    """Return how many probes there were, which of them were refused, and which the service asked for."""
     probes = day.figures["probes"]
-    refused = [probe for probe in probes if not probe["taken"]]
-    asked = [probe for probe in probes if probe["asked_because"]]
-    words = [f"{len(probes)} probes; refused: {_list([_refused(probe) for probe in refused])}."]
-    words += [
-        f"At {probe['time_h']:.2f} h the service wanted another one ({probe['asked_because']}), which was "
-        f"{'taken' if probe['taken'] else 'refused'}."
-        for probe in asked
-    ]
-    missed = [probe for probe in probes if probe["chip_um"] and probe["taken"]]
-    words += [f"The chip at {probe['time_h']:.2f} h was not recognised." for probe in missed]
-    return " ".join(words)
+    refused = sum(not probe["taken"] for probe in probes)
+    lines: list[Cell] = [f"{len(probes)} probes with a noise of {day.figures['probe_std_um']:g} µm; {refused} refused."]
+    lines += [_remark(one) for one in probes if one["code"] or one["chip_um"] or one["asked_because"]]
+    return Words(title="Probes", lines=lines)
 
 
-def _refused(probe: Mapping[str, Any]) -> str:
-    why = f", a chip of {probe['chip_um']:.0f} µm" if probe["chip_um"] else ""
-    return f"{probe['time_h']:.2f} h ({probe['code']}{why})"
-
-
-def _list(words: list[str]) -> str:
-    return ", ".join(words) or "none"
+def _remark(probe: Mapping[str, Any]) -> Cell:
+    parts: list[str | CodeLink] = [f"{probe['time_h']:.2f} h: "]
+    if probe["asked_because"]:
+        parts += ["asked for by the service ", CodeLink(probe["asked_because"]), "; "]
+    if probe["chip_um"]:
+        parts.append(f"a chip of {probe['chip_um']:.0f} µm lay on the feature; ")
+    parts.append(probe["text"])
+    if probe["code"]:
+        parts += [" ", CodeLink(probe["code"])]
+    return tuple(parts)
 
 
 def shop_section(day: ShopDay) -> Section:
@@ -103,8 +99,9 @@ def shop_section(day: ShopDay) -> Section:
                 y_label=_ERROR,
                 lines=(lines["model"], lines["model_and_probe"]),
                 marks=_marks(day),
-                note=f"A probe shows this error with a noise of {day.figures['probe_std_um']:g} µm. {probed(day)}",
+                note="A probe shows this error, with its noise. Changes between two probes are not corrected.",
             ),
+            probe_words(day),
             shop_table(day),
         ],
     )

@@ -19,7 +19,7 @@ from compensator.demo.shop import CHIP_UM, LOOK_AFTER_S, HourlyProbes, SentProbe
 from compensator.messages import Offset, number
 from compensator.recording.reading import messages, recordings
 from compensator.report.page import Page, html_of
-from compensator.report.shop import ShopDay, probed, shop_section, shop_table
+from compensator.report.shop import ShopDay, probe_words, shop_section, shop_table
 from sim_hardware.physics.effects.mechanical import SizeDependent
 from tests.demo.made import SHOP_DAY
 
@@ -133,16 +133,18 @@ def test_table_and_words(made: Made) -> None:
     for name in CASES:
         figures = made.shown.figures[name]
         assert re.search(rf"{figures['rms_um']:.2f} +{figures['peak_to_peak_um']:.2f}", table)
-    words = probed(made.shown)
-    assert words.startswith("5 probes; refused: 3.01 h (probe_outlier, a chip of 20 µm).")
-    assert "At 3.08 h the service wanted another one (probe_outlier), which was taken." in words
-    assert "not recognised" not in words
+    words = probe_words(made.shown).text().splitlines()
+    assert words[1] == "- 5 probes with a noise of 1.5 µm; 1 refused."
+    assert words[2].startswith("- 3.01 h: a chip of 20 µm lay on the feature; probe refused")
+    assert words[2].endswith("[probe_outlier]")
+    assert words[3].startswith("- 3.08 h: asked for by the service [probe_outlier]; probe taken")
+    assert len(words) == 4
 
 
 def test_a_chip_that_was_taken_is_not_passed_over() -> None:
-    probes = [{**probe, "taken": True, "code": ""} for probe in SHOP_DAY.figures["probes"]]
-    words = probed(ShopDay(figures={**SHOP_DAY.figures, "probes": probes}, errors=SHOP_DAY.errors))
-    assert "refused: none." in words and "The chip at 2.00 h was not recognised." in words
+    probes = [{**probe, "taken": True, "code": "", "text": "probe taken"} for probe in SHOP_DAY.figures["probes"]]
+    words = probe_words(ShopDay(figures={**SHOP_DAY.figures, "probes": probes}, errors=SHOP_DAY.errors)).text()
+    assert "; 0 refused." in words and "2.00 h: a chip of 20 µm lay on the feature; probe taken" in words
 
 
 def test_the_page_shows_curves_probes_and_table() -> None:
