@@ -53,8 +53,8 @@ def shop_table(day: ShopDay) -> Table:
         title="Errors in Y without displacement sensor, with a touch probe each hour",
         head=["conduction machine with the undeclared effect", "rms µm", "peak to peak µm", "left %"],
         rows=rows,
-        note="Whole second day, first model. Probe alone: the same probes, each held until the next. "
-        "Left: rms, of no compensation.",
+        note="Whole second day, first model, rms about the zero. Probe alone: the same probes, each held until "
+        "the next. Left: rms, of no compensation.",
     )
 
 
@@ -99,7 +99,8 @@ def shop_section(day: ShopDay) -> Section:
                 y_label=_ERROR,
                 lines=(lines["model"], lines["model_and_probe"]),
                 marks=_marks(day),
-                note="A probe shows this error, with its noise. Changes between two probes are not corrected.",
+                note="A probe shows the error that model and probe leave, with its noise. A correction stays until the "
+                "next probe: where the effect changes in between, more may be left than by the model alone.",
             ),
             probe_words(day),
             shop_table(day),
