@@ -152,3 +152,12 @@ def test_the_page_shows_curves_probes_and_table() -> None:
     for words in ("no compensation", "probe alone, last value held", "model alone", "model and probe"):
         assert page.count(words) >= 2  # in a figure and in the table
     assert "probe taken" in page and "probe refused" in page and "a chip of 20 µm" in page
+
+
+def test_a_day_shorter_than_an_hour_has_no_probe(tmp_path: Path) -> None:
+    day, sent = run_shop_day(tmp_path, machine="published", hours=0.2, seed=SEED, model="quill", effects=[])
+    shown = shop_day(day, day, sent)
+    assert sent == [] and shown.figures["probes"] == []
+    assert np.array_equal(shown.errors["probe"], shown.errors["without"])
+    page = html_of(Page(title="demo", verdict="", blocks=[shop_section(shown)]))
+    assert "0 probes with a noise of 1.5 µm; 0 refused." in page and "probe taken" not in page
