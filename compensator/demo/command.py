@@ -13,12 +13,14 @@ from compensator.commands import Answer
 from compensator.commands.outputs import checked_page, pages_text
 from compensator.demo.calibration import calibrate, paper_case
 from compensator.demo.day import run_day
-from compensator.demo.figures import shown, table_of
+from compensator.demo.figures import shop_day, shown, table_of
 from compensator.demo.live import run_live
-from compensator.demo.loop import close_the_loop
+from compensator.demo.loop import FIRST_MODEL, SECOND_DAY, Loop, close_the_loop
 from compensator.demo.machine import MACHINES
+from compensator.demo.shop import run_shop_day
 from compensator.report.demonstration import closed, page_of, verdict
 from compensator.report.formats import write
+from compensator.report.shop import ShopDay, probe_words, shop_table
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -81,8 +83,10 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
     results = {day.name: day.figures for day in days}
     page = out / "report.html"
     table = table_of(results)
-    loop, second_day = close_the_loop(out / "conduction", hours=hours, seed=seed)
-    made = page_of(days, table, loop, second_day, paper_case(out / "paper", seed=seed))
+    closed_loop = close_the_loop(out / "conduction", hours=hours, seed=seed)
+    loop = closed_loop.figures
+    shop = _shop(out / "conduction", closed_loop, hours=hours, seed=seed)
+    made = page_of(days, table, loop, closed_loop.second_day, shop, paper_case(out / "paper", seed=seed))
     for path in filter(None, (page, also)):
         write(path, made)
     summary = (
@@ -90,5 +94,19 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
         f"the first day: {', '.join(loop['found']) or 'nothing'}.\n"
         f"Second day: {loop['second_day_rms_um']['without']:.2f} µm rms without compensation. {closed(loop)}"
     )
-    result = {"machines": results, "loop": loop, "report": str(page)}
-    return result, f"{table.text()}\n\n{verdict(days)}\n{summary}\n{pages_text(page, also)}"
+    result = {"machines": results, "loop": loop, "shop": shop.figures, "report": str(page)}
+    tables = f"{table.text()}\n\n{verdict(days)}\n{summary}\n\n{shop_table(shop).text()}\n\n{probe_words(shop).text()}"
+    return result, f"{tables}\n{pages_text(page, also)}"
+
+
+def _shop(folder: Path, loop: Loop, *, hours: float, seed: int) -> ShopDay:
+    """Run the second day of the loop as a shop would, with the effect and the first model."""
+    day, sent = run_shop_day(
+        folder / "shop",
+        machine="conduction",
+        hours=hours,
+        seed=seed + SECOND_DAY,
+        model=FIRST_MODEL,
+        effects=[loop.effect],
+    )
+    return shop_day(loop.first_model, day, sent)

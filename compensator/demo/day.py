@@ -11,8 +11,8 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,40 @@ from sim_hardware.physics.effects.base import UndeclaredEffect
 START_NS = 1_767_592_800 * NS
 #: Time at which the service of the second day is sent the extended model, and how long each poll then waits for it, s.
 ADOPT_AFTER_S, ADOPT_PATIENCE_S = 3600.0, 0.02
+
+
+@dataclass(slots=True)
+class Received:
+    """What a separate Zenoh subscriber has received, as a control does: all offsets, and the last status."""
+
+    offsets: list[Offset] = field(default_factory=list)
+    status: bytes = b""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Running:
+    """A day while it is running.
+
+    Parameters
+    ----------
+    config : pathlib.Path
+        Configuration of the service.
+    world : World
+        The simulated machine.
+    outcomes : list of Outcome
+        One per sample so far.
+    received : Received
+        What the control has received.
+    """
+
+    config: Path
+    world: World
+    outcomes: list[Outcome]
+    received: Received
+
+
+#: What is done at the machine: called with the time since the start, s, whenever that has advanced.
+AtMachine = Callable[[float, Running], Awaitable[None]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,6 +111,7 @@ def run_day(
     model: str = "quill",
     effects: Sequence[UndeclaredEffect] = (),
     adopt: Path | None = None,
+    probe: AtMachine | None = None,
 ) -> Day:
     """Run one simulated machine through its devices, the service, disk and Zenoh.
 
@@ -96,6 +131,8 @@ def run_day(
         Effects in the machine that are absent from its calibration.
     adopt : pathlib.Path, optional
         A model that the running service adopts after `ADOPT_AFTER_S`.
+    probe : AtMachine, optional
+        Probes Y; the machine then has no displacement sensor.
 
     Raises
     ------
@@ -111,13 +148,17 @@ def run_day(
     with hardware(world) as devices:
         port = _free_port()
         config = folder / "config.toml"
-        config.write_text(configuration(f"sim-{machine}", devices.lines, port, model), encoding="utf-8")
-
+        text = configuration(f"sim-{machine}", devices.lines, port, model, is_probed=probe is not None)
+        config.write_text(text, encoding="utf-8")
+        running = Running(config=config, world=world, outcomes=[], received=Received())
         asked: list[asyncio.Future[dict[str, Any] | None]] = []
 
         async def advance(t_s: float) -> None:
             world.advance_to(t_s)
-            devices.capa.push(1)
+            if probe is None:
+                devices.capa.push(1)
+            else:
+                await probe(t_s, running)
             if adopt is not None and t_s >= ADOPT_AFTER_S:
                 if not asked:
                     asked.append(asyncio.ensure_future(asyncio.to_thread(_ask_to_adopt, config, adopt)))
@@ -125,24 +166,22 @@ def run_day(
                     # Simulated time pauses briefly for a command that takes real time.
                     await asyncio.sleep(ADOPT_PATIENCE_S)
 
-        outcomes: list[Outcome] = []
-        received: list[Offset] = []
         clock = VirtualClock(START_NS, advance)
         samples = round(hours * 60)
         with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
             bar = progress.add_task(f"simulated machine {machine}", total=samples)
 
             def append(outcome: Outcome) -> None:
-                outcomes.append(outcome)
+                running.outcomes.append(outcome)
                 progress.advance(bar)
 
-            asyncio.run(_serve(config, clock, samples, append, received, port))
+            asyncio.run(_serve(config, clock, samples, append, running.received, port))
     return Day(
-        outcomes=outcomes,
-        received=received,
+        outcomes=running.outcomes,
+        received=running.received.offsets,
         truth=world.history(),
         seconds=time.perf_counter() - began,
-        adopted_at=_adopted_at(outcomes) if adopt is not None else 0,
+        adopted_at=_adopted_at(running.outcomes) if adopt is not None else 0,
     )
 
 
@@ -165,12 +204,15 @@ async def _serve(
     clock: VirtualClock,
     samples: int,
     on_sample: Callable[[Outcome], None],
-    received: list[Offset],
+    received: Received,
     port: int,
 ) -> None:
     """Run the service with a subscriber in a separate Zenoh session."""
     subscriber: Any = None
     ready = asyncio.Event()
+
+    def keep_status(sample: zenoh.Sample) -> None:
+        received.status = sample.payload.to_bytes()
 
     async def listen() -> None:
         nonlocal subscriber
@@ -179,8 +221,9 @@ async def _serve(
         subscriber = await asyncio.to_thread(zenoh.open, session_config(settings))
         subscriber.declare_subscriber(
             "shop/sim/thermal/y/offset",
-            lambda s: received.append(msgspec.json.decode(s.payload.to_bytes(), type=Offset)),
+            lambda s: received.offsets.append(msgspec.json.decode(s.payload.to_bytes(), type=Offset)),
         )
+        subscriber.declare_subscriber("shop/sim/thermal/status", keep_status)
 
     task = asyncio.create_task(listen())
     try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,13 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.demo.day import START_NS, Day
+from compensator.demo.machine import TOUCH_STD_UM
+from compensator.demo.shop import SentProbe
 from compensator.display import Table
 from compensator.messages import number
 from compensator.model.simulation import scores
 from compensator.report.demonstration import MachineDay
+from compensator.report.shop import ShopDay
 
 
 def errors_of(day: Day) -> dict[str, Vector]:
@@ -39,13 +42,7 @@ def figures_of(day: Day, errors: Mapping[str, Vector]) -> dict[str, Any]:
     estimate = [outcome.estimate for outcome in day.outcomes]
     fit = scores(np.array([number(e.y_um) for e in estimate]), np.array([number(e.y_pred_um) for e in estimate]))
     remaining = errors["followed"]
-    part: dict[str, Any] = {
-        name: {
-            "rms_um": float(np.sqrt(np.mean(errors[name] ** 2))),
-            "peak_to_peak_um": float(np.ptp(errors[name])),
-        }
-        for name in ("without", "held", "followed")
-    }
+    part: dict[str, Any] = {name: _spread(errors[name]) for name in ("without", "held", "followed")}
     part |= {
         "samples": len(day.outcomes),
         "received": len(day.received),
@@ -55,6 +52,50 @@ def figures_of(day: Day, errors: Mapping[str, Vector]) -> dict[str, Any]:
         "states": {s: sum(o.offset.state == s for o in day.outcomes) for s in {o.offset.state for o in day.outcomes}},
     }
     return part
+
+
+def _spread(error_um: Vector) -> dict[str, float]:
+    return {"rms_um": float(np.sqrt(np.mean(error_um**2))), "peak_to_peak_um": float(np.ptp(error_um))}
+
+
+def shop_day(alone: Day, probed: Day, sent: Sequence[SentProbe]) -> ShopDay:
+    """Return the content of the page for a day as a shop runs it.
+
+    Parameters
+    ----------
+    alone, probed : Day
+        The same day by the model alone, and by model and probe.
+    sent : sequence of SentProbe
+        The probes, as they were measured.
+    """
+    records = [record for outcome in probed.outcomes for record in outcome.probes]
+    before, errors = errors_of(alone), errors_of(probed)
+    times_h = [(record.time_utc_ns - START_NS) / NS / 3600.0 for record in records]
+    # A shop without a model sets the offset to what the last probe showed; before the first one it has none.
+    shown_um = np.array([0.0, *(number(record.deformation_um) for record in records)])
+    errors = {
+        "t_h": errors["t_h"],
+        "without": errors["without"],
+        "probe": errors["without"] - shown_um[np.searchsorted(times_h, errors["t_h"], side="right")],
+        "model": before["followed"],
+        "model_and_probe": errors["followed"],
+    }
+    figures: dict[str, Any] = {name: _spread(values) for name, values in errors.items() if name != "t_h"}
+    figures["probe_std_um"] = TOUCH_STD_UM
+    by_time = {probe.time_utc_ns: probe for probe in sent}
+    figures["probes"] = [
+        {
+            "time_h": time_h,
+            "measured_um": number(record.measured_um),
+            "chip_um": by_time[record.time_utc_ns].chip_um,
+            "asked_because": by_time[record.time_utc_ns].asked_because,
+            "taken": record.taken,
+            "code": record.code,
+            "text": record.text,
+        }
+        for time_h, record in zip(times_h, records, strict=True)
+    ]
+    return ShopDay(figures=figures, errors=errors)
 
 
 def shown(name: str, day: Day) -> MachineDay:

@@ -11,17 +11,44 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.commands.diagnose import diagnose_files
 from compensator.demo.calibration import PERIOD_S
-from compensator.demo.day import run_day
+from compensator.demo.day import Day, run_day
 from compensator.demo.figures import errors_of
 from compensator.model.model_file import load_model
 from compensator.model.model_writer import dump_model
 from sim_hardware.physics import draw_effect
+from sim_hardware.physics.effects.base import UndeclaredEffect
 
 #: Approximate standard deviation of the undeclared effect in Y, µm.
 EFFECT_UM = 5.0
+#: The model of the calibration, from the folder of a day.
+FIRST_MODEL = "../calibration/model.toml"
+#: Added to the demo's seed for the duty and the sensors of the second day.
+SECOND_DAY = 2
 
 
-def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, Any], dict[str, tuple[Vector, Vector]]]:
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Loop:
+    """The closed loop.
+
+    Parameters
+    ----------
+    figures : dict
+        Effect drawn, effects found, and the error on the second day.
+    second_day : dict of str to (numpy.ndarray, numpy.ndarray)
+        That error over time by model, h and µm.
+    effect : UndeclaredEffect
+        The effect.
+    first_model : Day
+        The second day with the first model.
+    """
+
+    figures: dict[str, Any]
+    second_day: dict[str, tuple[Vector, Vector]]
+    effect: UndeclaredEffect
+    first_model: Day
+
+
+def close_the_loop(folder: Path, *, hours: float, seed: int) -> Loop:
     """Run a day with an undeclared effect, diagnose its recordings, and run a second day with the extended model.
 
     The effect is drawn by the seed and not disclosed before the results are written.
@@ -34,16 +61,10 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, 
         Length of each of the two days, h.
     seed : int
         Seed of the effect and of the duties.
-
-    Returns
-    -------
-    (dict, dict)
-        Effect drawn, effects found, and the error on the second day; that error over time, h and µm.
     """
     effect = draw_effect(seed, EFFECT_UM, hours)
-    first = "../calibration/model.toml"
     before = folder / "with-effect"
-    run_day(before, machine="conduction", hours=hours, seed=seed + 1, model=first, effects=[effect])
+    run_day(before, machine="conduction", hours=hours, seed=seed + 1, model=FIRST_MODEL, effects=[effect])
     recordings = sorted((before / "recordings").glob("*.mcap"))
     first_model, extended = folder / "calibration" / "model.toml", folder / "diagnosis" / "model.toml"
     found = diagnose_files(recordings, first_model, extended.parent).result
@@ -54,8 +75,8 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, 
             folder / f"second-day-{name}",
             machine="conduction",
             hours=hours,
-            seed=seed + 2,
-            model=first,
+            seed=seed + SECOND_DAY,
+            model=FIRST_MODEL,
             effects=[effect],
             adopt=model,
         )
@@ -69,7 +90,7 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, 
         counted = values["t_h"] >= adopted_h + values["t_h"][0]
         errors[name], errors["without"] = values["followed"][counted], values["without"][counted]
     drawn = effect.reveal().describe()
-    return {
+    figures = {
         "drawn": " ".join(str(drawn[key]) for key in ("kind", "path", "channel") if drawn.get(key)),
         "found": [" ".join(filter(None, (e["kind"], e["path"], e["channel"]))) for e in found["effects"]],
         "verdict": found["verdict"],
@@ -79,7 +100,8 @@ def close_the_loop(folder: Path, *, hours: float, seed: int) -> tuple[dict[str, 
         "adopted": adopt is not None,
         "adopted_after_h": adopted_h,
         "second_day_rms_um": {name: float(np.std(values)) for name, values in errors.items()},
-    }, curves
+    }
+    return Loop(figures=figures, second_day=curves, effect=effect, first_model=days["first"])
 
 
 def _dynamics(model: Path) -> str:

@@ -22,6 +22,15 @@ from sim_hardware.wire import (
 MACHINES = {"conduction": QuillMachine, "published": PublishedQuill}
 POLL_INTERVAL_S = 10.0
 PROBE_RANGE_UM = 500.0
+#: Standard deviation of one value of the touch probe, µm.
+TOUCH_STD_UM = 1.5
+TOUCH_PROBE = f"""
+[probe]
+std_um = {TOUCH_STD_UM}
+measured_max_um = 60.0
+largest_um = 40.0
+oldest_min = 5.0
+"""
 
 
 class Hardware(NamedTuple):
@@ -84,9 +93,16 @@ def hardware(world: World) -> Iterator[Hardware]:
 
 
 def configuration(
-    machine: str, lines: Mapping[str, Any], zenoh_port: int, model: str = "quill", *, prefix: str = "shop/sim"
+    machine: str,
+    lines: Mapping[str, Any],
+    zenoh_port: int,
+    model: str = "quill",
+    *,
+    prefix: str = "shop/sim",
+    is_probed: bool = False,
 ) -> str:
-    """Return the configuration of the simulated machine."""
+    """Return the configuration of the simulated machine, with a touch probe instead of the displacement sensor."""
+    sensor = {"line": "", "device": "", "channel": ""} if is_probed else displacement_sensor(lines)
     return f"""# Configuration of a simulated machine.
 [machine]
 name = "{machine}"
@@ -139,13 +155,7 @@ tcp_port = {lines["plc"]}
 name = "base-line"
 protocol = "dcon"
 port = "{lines["dcon"]}"
-[[line]]
-name = "probe-line"
-protocol = "capancdt"
-host = "127.0.0.1"
-data_port = {lines["data"]}
-command_port = {lines["command"]}
-
+{sensor["line"]}
 [[device]]
 name = "spindle-thermocouples"
 line = "rs485"
@@ -175,12 +185,7 @@ line = "base-line"
 model = "dcon"
 address = 2
 inputs = [{{ input = 0, couple = "K" }}]
-[[device]]
-name = "probe"
-line = "probe-line"
-model = "capancdt-6200"
-inputs = [{{ input = 0 }}]
-
+{sensor["device"]}
 [[channel]]
 name = "t_q_degc"
 device = "spindle-thermocouples"
@@ -195,14 +200,7 @@ input = 0
 range = [5.0, 45.0]
 rate_max_per_min = 2.0
 stuck_after_min = 240.0
-[[channel]]
-name = "y_um"
-device = "probe"
-input = 0
-range = [10.0, 490.0]
-rate_max_per_min = 30.0
-stuck_after_min = 60.0
-[[channel]]
+{sensor["channel"]}[[channel]]
 name = "base_degc"
 device = "base-thermocouples"
 input = 0
@@ -214,4 +212,31 @@ input = 0
 name = "coolant_degc"
 device = "control"
 input = 1
-"""
+{TOUCH_PROBE if is_probed else ""}"""
+
+
+def displacement_sensor(lines: Mapping[str, Any]) -> dict[str, str]:
+    """Return the tables of the configuration for the displacement sensor."""
+    return {
+        "line": f"""[[line]]
+name = "probe-line"
+protocol = "capancdt"
+host = "127.0.0.1"
+data_port = {lines["data"]}
+command_port = {lines["command"]}
+""",
+        "device": """[[device]]
+name = "probe"
+line = "probe-line"
+model = "capancdt-6200"
+inputs = [{ input = 0 }]
+""",
+        "channel": """[[channel]]
+name = "y_um"
+device = "probe"
+input = 0
+range = [10.0, 490.0]
+rate_max_per_min = 30.0
+stuck_after_min = 60.0
+""",
+    }

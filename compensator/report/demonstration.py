@@ -11,6 +11,7 @@ from compensator.arrays import Vector
 from compensator.identify.comparison import Row as Comparison
 from compensator.identify.summary import comparison_table
 from compensator.report.page import Block, Cell, Details, Figure, Line, Link, Page, Section, Table
+from compensator.report.shop import ShopDay, shop_section
 
 #: Names of the machines in text.
 _KINDS = {"conduction": "heat-conduction machine", "published": "machine of the published equations"}
@@ -44,6 +45,7 @@ def page_of(
     table: Table,
     loop: Mapping[str, Any],
     second_day: Mapping[str, tuple[Vector, Vector]],
+    shop: ShopDay,
     paper: Sequence[Comparison],
 ) -> Page:
     """Make the page.
@@ -58,6 +60,8 @@ def page_of(
         Effect drawn, effects found, remaining errors.
     second_day : dict of str to (numpy.ndarray, numpy.ndarray)
         Time in h and error in µm of the second day, by model.
+    shop : ShopDay
+        The second day without displacement sensor, with a touch probe.
     paper : sequence of Comparison
         Coefficients of the paper's case, compared with the printed ones.
     """
@@ -65,6 +69,7 @@ def page_of(
     blocks += [
         table,
         _loop(loop, second_day),
+        shop_section(shop),
         _pages(days),
         Details(title="Heat, true and estimated", blocks=[_heat(day) for day in days]),
         Details(title="The paper's case, compared with the printed coefficients", blocks=[_comparison(paper)]),

@@ -9,6 +9,7 @@ import pytest
 
 from compensator.report.demonstration import MachineDay, page_of
 from compensator.report.page import Table, html_of
+from tests.demo.made import SHOP_DAY
 
 T_H = np.arange(240) / 60.0
 
@@ -18,7 +19,7 @@ def words(loop: dict[str, Any]) -> str:
     errors = {"t_h": T_H, "without": 90.0 * np.sin(T_H), "followed": np.sin(9.0 * T_H)}
     day = MachineDay(name="conduction", figures=figures, errors=errors, heat=(T_H, T_H, T_H, T_H))
     lines = dict.fromkeys(("first", "extended"), (T_H, errors["followed"]))
-    return html_of(page_of([day], Table(head=["a"], rows=[["b"]]), loop, lines, []))
+    return html_of(page_of([day], Table(head=["a"], rows=[["b"]]), loop, lines, SHOP_DAY, []))
 
 
 @pytest.mark.parametrize(

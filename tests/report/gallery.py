@@ -14,6 +14,7 @@ from compensator.report.demonstration import MachineDay, page_of
 from compensator.report.page import Table, write_page
 from tests.audit.made import MACHINE, Service, other_model, readings
 from tests.audit.test_command import tampered
+from tests.demo.made import SHOP_DAY
 from tests.identify.quill_runs import CALIBRATION_W, published
 
 
@@ -98,4 +99,4 @@ def _demo(path: Path) -> None:
     paper = [Row(path="TTF", figure="gain at rest, K/W", found=0.25, std=0.01, reference=0.25)]
     second_day = dict.fromkeys(("first", "extended"), (t, errors["followed"]))
     table = Table(head=["machine", "", "rms µm"], rows=[["conduction", "no compensation", "62.74"]])
-    write_page(path, page_of(days, table, loop, second_day, paper))
+    write_page(path, page_of(days, table, loop, second_day, SHOP_DAY, paper))
