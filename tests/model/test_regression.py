@@ -437,7 +437,7 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
         before = after = page.Scores(fit_pct=1.0, rms_um=2.0, peak_to_peak_um=3.0)
         remainder: Remainder | None = None
         ceiling: Ceiling | None = None
-        advice = None
+        advice = could_hide = None
 
     found: Any = Bare()
     assert figures(found)["remainder"] is None and figures(found)["ceiling"] is None

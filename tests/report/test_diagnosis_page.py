@@ -199,7 +199,7 @@ def test_an_effect_that_was_not_deployed_does_not_claim_it(found: Diagnosis) -> 
 def axis(*records: dict[str, np.ndarray]) -> TimeAxis:
     runs = [run for columns in records for run in runs_from(columns)]
     evidence = evidence_of(QUILL, runs)
-    return TimeAxis.of(SimpleNamespace(evidence=evidence, model=QUILL))  # type: ignore[arg-type]
+    return TimeAxis.of(SimpleNamespace(evidence=evidence, model=QUILL, could_hide=None))  # type: ignore[arg-type]
 
 
 def test_edges_of_blocks_and_runs_are_marked_and_no_curve_crosses_from_run_to_run() -> None:
