@@ -10,6 +10,7 @@ not the model, blocks of a sensor that does not change at all, and probes that b
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -135,7 +136,9 @@ def described(found: ComparisonData) -> str:
 
 
 def _why(found: ComparisonData) -> str:
-    needed = f"at least {FEWEST} probes" if found.measured_by == "probe" else f"about {(FEWEST + 2) * BLOCK_MIN / 60:g} h"
+    needed = (
+        f"at least {FEWEST} probes" if found.measured_by == "probe" else f"about {(FEWEST + 2) * BLOCK_MIN / 60:g} h"
+    )
     return {
         None: "",
         NotJudged.NO_ZERO: "no zero was set yet",
@@ -143,7 +146,7 @@ def _why(found: ComparisonData) -> str:
         NotJudged.NO_Y: f"no measured Y in the last {COMPARED_H:g} h of the recordings",
         NotJudged.TOO_LITTLE: f"too little measured Y, {needed} without interruption are needed",
         NotJudged.SUSPECT: "the service suspected a sensor while Y was measured",
-        NotJudged.UNRELATED: "measured Y follows neither model; check its sensor",
+        NotJudged.UNRELATED: "measured Y does not move, or follows neither model; check its sensor",
     }[found.why]
 
 
@@ -245,7 +248,9 @@ def _judged_by_sensor(found: _Compared, samples_in_block: float) -> ComparisonDa
     changes = _changes([row[0] for row in found.samples], (present, candidate, y), _MEASURED * samples_in_block)
     own, other, moves = changes
     if own.size < FEWEST:
-        return _with(scores, why=NotJudged.SUSPECT if found.suspected else NotJudged.TOO_LITTLE)
+        still = float(np.mean(np.diff(y) == 0.0)) > 0.5 if y.size > 1 else False
+        suspected = NotJudged.SUSPECT if found.suspected > y.size else NotJudged.TOO_LITTLE
+        return _with(scores, why=NotJudged.UNRELATED if still else suspected)
     kept = followed(moves, own, own - other, parts=own.size // FEWEST, deviations=DEVIATIONS)
     if np.sum(kept) < FEWEST:
         return _with(scores, why=NotJudged.UNRELATED)
@@ -259,7 +264,7 @@ def _changes(
     rows: list[list[float]] = []
     before: tuple[tuple[int, int], list[float]] | None = None
     edges = [0, *(i for i in range(1, len(blocks)) if blocks[i] != blocks[i - 1]), len(blocks)]
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+    for begin, end in itertools.pairwise(edges):
         parts = [column[begin:end] for column in columns]
         if end - begin < fewest or np.ptp(parts[-1]) == 0.0:
             before = None
