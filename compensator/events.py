@@ -186,6 +186,8 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
         By how many standard deviations of the difference the other model is better; negative if it is worse.
     effective : float, optional
         Number of independent values that this rests on.
+    y_moved : bool
+        Whether the errors about the zero contradict the verdict, because measured Y has moved by itself.
     offset_change_um : float, optional
         By how much the offset would move at the end of the recordings, µm.
     """
@@ -201,6 +203,7 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
     candidate_rms_um: float | None = None
     deviations: float | None = None
     effective: float | None = None
+    y_moved: bool = False
     offset_change_um: float | None = None
 
 

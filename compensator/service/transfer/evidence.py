@@ -38,10 +38,21 @@ _MEDIAN_TO_STD = 1.4826
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """By how many standard deviations the other model is better, from how many effective values."""
+    """How strongly measured Y speaks for the other model.
+
+    Parameters
+    ----------
+    deviations : float
+        By how many standard deviations the other model is better; negative if the present one is.
+    effective : float
+        Number of independent values.
+    ratio : float
+        Root mean square of the changes of the other model's residual over that of the present one's, by the weights.
+    """
 
     deviations: float
     effective: float
+    ratio: float = 1.0
 
 
 def evidence(residual_um: Vector, difference_um: Vector) -> Evidence:
@@ -82,7 +93,10 @@ def evidence(residual_um: Vector, difference_um: Vector) -> Evidence:
     clipped = weights * left
     variance = max(float(np.sum(clipped**2)) / (n - 2), FLOOR_UM**2)
     effective = n * _independent(clipped * moves)
-    return Evidence((beta - 0.5) / math.sqrt(variance / square * n / effective), effective)
+    own, other = (
+        float(np.sum(weights * part**2)) + n * FLOOR_UM**2 for part in (residual_um, residual_um - difference_um)
+    )
+    return Evidence((beta - 0.5) / math.sqrt(variance / square * n / effective), effective, math.sqrt(other / own))
 
 
 def _independent(products: Vector) -> float:

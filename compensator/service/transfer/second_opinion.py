@@ -37,7 +37,7 @@ from compensator.service.transfer.evidence import evidence, followed
 COMPARED_H = 24.0
 #: From this number of standard deviations of the difference on a model is better or worse.
 DEVIATIONS = 4.0
-#: A model whose error is larger by less than this part is not worse.
+#: A model whose changes are wrong by more than the present one's by less than this part is not worse.
 WORSE_PART = 0.05
 #: Fewer changes of block means, or probes, do not judge a model.
 FEWEST = 8
@@ -131,7 +131,8 @@ def described(found: ComparisonData) -> str:
     if found.why is not None:
         text += f" (not judged: {_why(found)})"
     elif found.deviations is not None:
-        text += f" ({found.verdict}, {abs(found.deviations):.1f} standard deviations of the difference)"
+        moved = "measured Y has moved by itself; by its changes this one is " if found.y_moved else ""
+        text += f" ({moved}{found.verdict}, {abs(found.deviations):.1f} standard deviations of the difference)"
     return "; ".join(filter(None, (text, moves)))
 
 
@@ -297,12 +298,13 @@ def _judged_by_probes(found: _Compared) -> ComparisonData:
 def _judged(scores: ComparisonData, own: Vector, difference: Vector) -> ComparisonData:
     weighed = evidence(own, difference)
     assert scores.present_rms_um is not None and scores.candidate_rms_um is not None
-    verdict = ComparisonVerdict.ALIKE
-    # The error about the zero must agree with the changes: where they disagree, measured Y has moved by itself.
-    if weighed.deviations >= DEVIATIONS and scores.candidate_rms_um < scores.present_rms_um:
+    verdict, is_larger = ComparisonVerdict.ALIKE, scores.candidate_rms_um > scores.present_rms_um
+    if weighed.deviations >= DEVIATIONS and weighed.ratio < 1.0:
         verdict = ComparisonVerdict.BETTER
-    elif weighed.deviations <= -DEVIATIONS and scores.candidate_rms_um > (1.0 + WORSE_PART) * scores.present_rms_um:
+    elif weighed.deviations <= -DEVIATIONS and weighed.ratio > 1.0 + WORSE_PART:
         verdict = ComparisonVerdict.WORSE
+    y_moved = verdict != ComparisonVerdict.ALIKE and is_larger != (verdict == ComparisonVerdict.WORSE)
+    scores = _with(scores, y_moved=y_moved)
     return _with(scores, verdict=verdict, deviations=weighed.deviations, effective=weighed.effective)
 
 
