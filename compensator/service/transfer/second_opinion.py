@@ -120,7 +120,7 @@ def refuse_if_worse(found: ComparisonData, model: ThermalModel, *, force: bool) 
 def described(found: ComparisonData) -> str:
     """Return a comparison in words."""
     move = found.offset_change_um
-    moves = f"the offset would move by {move:+.1f} µm" if move is not None else ""
+    moves = f"the offset would move by {round(move, 1) + 0.0:+.1f} µm" if move is not None else ""
     if found.present_rms_um is None or found.candidate_rms_um is None:
         return "; ".join(filter(None, (f"not judged: {_why(found)}", moves)))
     probes = f", {found.probes} probe(s)" if found.measured_by == "probe" else ""
@@ -130,9 +130,11 @@ def described(found: ComparisonData) -> str:
     )
     if found.why is not None:
         text += f" (not judged: {_why(found)})"
-    elif found.deviations is not None:
-        moved = "measured Y has moved by itself; by its changes this one is " if found.y_moved else ""
-        text += f" ({moved}{found.verdict}, {abs(found.deviations):.1f} standard deviations of the difference)"
+    elif found.verdict == ComparisonVerdict.ALIKE or found.deviations is None:
+        text += " (no clear difference)"
+    else:
+        moved = "measured Y has moved by itself, by its changes this one is " if found.y_moved else ""
+        text += f" ({moved}{found.verdict} by {abs(found.deviations):.0f} standard deviations of the difference)"
     return "; ".join(filter(None, (text, moves)))
 
 
