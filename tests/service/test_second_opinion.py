@@ -219,9 +219,11 @@ async def test_probes_judge_where_there_is_no_sensor(tmp_path: Path) -> None:
     assert not refused.answer["ok"] and found["verdict"] == "worse" and found["measured_by"] == "probe"
     assert found["probes"] >= 13 and f"{found['probes']} probe(s)" in refused.answer["text"]
     assert found["present_rms_um"] < 1.5 and found["candidate_rms_um"] > 2.0
-    # With probes the corrected deformation stays as it is: the offset does not move, and that is foreseen.
-    assert abs(found["offset_change_um"]) < 0.05
+    # It would need a larger correction than `largest_um`, so the offset would move.
+    assert abs(found["offset_change_um"]) > 10.0
     assert taken.answer["ok"] and taken.answer["comparison"]["verdict"] in ("alike", "better")
+    # Otherwise the corrected deformation stays as it is at the exchange, and that is foreseen.
+    assert abs(taken.answer["comparison"]["offset_change_um"]) < 0.05
     assert check_files(machine) == len(machine.outcomes)
     for path in recordings(machine.recordings, MACHINE):
         assert audit_recording(path).ok
