@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from compensator.audit.recording_audit import audit_recording
+from compensator.audit.series import audit
 from compensator.config import parse_config
 from compensator.model.model_file import parse_model
 from compensator.recording.reading import messages, recordings
@@ -98,8 +98,8 @@ async def test_the_model_of_another_machine_is_refused_with_figures_and_taken_by
     assert told[1]["comparison"]["offset_change_um"] == pytest.approx(told[1]["difference_um"], abs=1.0)
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
     assert check_files(machine) == len(machine.outcomes)
-    for path in recordings(machine.recordings, MACHINE):
-        assert audit_recording(path).ok
+    audited = audit(recordings(machine.recordings, MACHINE))
+    assert audited.clean and audited.samples == len(machine.outcomes)
 
 
 async def test_a_better_model_is_taken_with_figures(tmp_path: Path) -> None:
@@ -225,8 +225,8 @@ async def test_probes_judge_where_there_is_no_sensor(tmp_path: Path) -> None:
     # Otherwise the corrected deformation stays as it is at the exchange, and that is foreseen.
     assert abs(taken.answer["comparison"]["offset_change_um"]) < 0.05
     assert check_files(machine) == len(machine.outcomes)
-    for path in recordings(machine.recordings, MACHINE):
-        assert audit_recording(path).ok
+    audited = audit(recordings(machine.recordings, MACHINE))
+    assert audited.clean and audited.samples == len(machine.outcomes)
 
 
 async def test_a_chip_on_the_probe_refuses_no_model(tmp_path: Path) -> None:
