@@ -29,7 +29,7 @@ class EventKind(StrEnum):
     #: A command that acts with the sample of the same number, see `command_of`.
     COMMAND = "command"
     COMMAND_REFUSED = "command_refused"
-    #: Another model was adopted or refused.
+    #: Another model was adopted or refused, with `comparison` in its data (`ComparisonData`).
     ADOPT = "adopt"
     #: A probe was taken or refused (`ProbeData`).
     PROBE = "probe"
@@ -141,6 +141,70 @@ class ProbeData(_Data, frozen=True, kw_only=True):
     innovation_std_um: float | None = None
     by: str
     by_proof: str
+
+
+class ComparisonVerdict(StrEnum):
+    """Verdict on another model by the measured Y on record."""
+
+    BETTER = "better"
+    ALIKE = "alike"
+    WORSE = "worse"
+    NOT_JUDGED = "not_judged"
+
+
+class NotJudged(StrEnum):
+    """Why measured Y does not judge another model, `why` in the data of a comparison."""
+
+    NO_ZERO = "no_zero"
+    NO_RECORD = "no_record"
+    NO_Y = "no_y"
+    TOO_LITTLE = "too_little"
+    SUSPECT = "suspect"
+    UNRELATED = "unrelated"
+
+
+class ComparisonData(_Data, frozen=True, kw_only=True):
+    """Another model compared with the present one by the measured Y on record.
+
+    Parameters
+    ----------
+    verdict : ComparisonVerdict
+        The verdict.
+    why : NotJudged, optional
+        Why it could not be judged.
+    remark : str
+        Why the recordings could not be replayed, in words.
+    measured_by : {"sensor", "probe", ""}
+        What measured Y; empty if nothing did.
+    hours : float
+        Time from the first compared value to the end of the recordings, h.
+    samples, probes : int
+        Number of compared samples of a displacement sensor, or of compared probes.
+    present_rms_um, candidate_rms_um : float, optional
+        Root mean square of measured − predicted Y: of the present model and of the other one, µm.
+    deviations : float, optional
+        By how many standard deviations of the difference the other model is better; negative if it is worse.
+    effective : float, optional
+        Number of independent values that this rests on.
+    y_moved : bool
+        Whether the errors about the zero contradict the verdict, because measured Y has moved by itself.
+    offset_change_um : float, optional
+        By how much the offset would move at the end of the recordings, µm.
+    """
+
+    verdict: ComparisonVerdict
+    why: NotJudged | None = None
+    remark: str = ""
+    measured_by: Literal["sensor", "probe", ""] = ""
+    hours: float = 0.0
+    samples: int = 0
+    probes: int = 0
+    present_rms_um: float | None = None
+    candidate_rms_um: float | None = None
+    deviations: float | None = None
+    effective: float | None = None
+    y_moved: bool = False
+    offset_change_um: float | None = None
 
 
 class RecordingCode(StrEnum):

@@ -10,11 +10,12 @@ from compensator.clock import SystemClock
 from compensator.commands import Answer
 from compensator.commands.order import answered, operator_of
 from compensator.errors import ServiceError
-from compensator.events import CommandName
+from compensator.events import CommandName, ComparisonData
 from compensator.model.model_file import read_model_bytes
 from compensator.service.command_client import NotReached, ask
 from compensator.service.loading import Setup, load
 from compensator.service.transfer.model_store import check_model
+from compensator.service.transfer.second_opinion import described, refuse_if_worse, second_opinion
 
 NOT_REACHED = "The service could not be reached; it will use the model from its next start."
 
@@ -32,13 +33,14 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     model = check_model(setup.config, data, source=arguments.model)
     wanted = {"sha256": model.sha256, "model": data.decode(), "force": arguments.force}
     reply = _ask(CommandName.ADOPT, wanted, setup, arguments)
-    if reply is None:
-        if model.sha256 == setup.model.sha256:
-            raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is already the service's model")
-        setup.store.adopt(data, name=model.name, time_utc_ns=SystemClock().utc_ns())
-    return _answered(
-        reply, f"model {model.name} ({model.sha256[:12]}) is stored in {setup.store.folder}.", model.sha256
-    )
+    if reply is not None:
+        return answered(reply, service_reached=True)
+    if model.sha256 == setup.model.sha256:
+        raise ServiceError(f"model {model.name} ({model.sha256[:12]}) is already the service's model")
+    found = second_opinion(setup.recordings, setup.config, setup.model, model)
+    refuse_if_worse(found, model, force=arguments.force)
+    setup.store.adopt(data, name=model.name, time_utc_ns=SystemClock().utc_ns())
+    return _stored(f"model {model.name} ({model.sha256[:12]}) is stored in {setup.store.folder}", model.sha256, found)
 
 
 def back(arguments: argparse.Namespace) -> Answer:
@@ -52,10 +54,11 @@ def back(arguments: argparse.Namespace) -> Answer:
     setup = load(arguments.config)
     reply = _ask(CommandName.BACK, {"force": arguments.force}, setup, arguments)
     if reply is not None:
-        return _answered(reply, "", "")
+        return answered(reply, service_reached=True)
     model = check_model(setup.config, setup.store.before(), source="previous model")
+    found = second_opinion(setup.recordings, setup.config, setup.model, model)
     setup.store.back(name=model.name, time_utc_ns=SystemClock().utc_ns())
-    return _answered(None, f"back to model {model.name} ({model.sha256[:12]}).", model.sha256)
+    return _stored(f"back to model {model.name} ({model.sha256[:12]})", model.sha256, found)
 
 
 def _ask(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Namespace) -> dict[str, Any] | None:
@@ -67,8 +70,8 @@ def _ask(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Na
         return None
 
 
-def _answered(reply: dict[str, Any] | None, kept: str, sha256: str) -> Answer:
-    if reply is None:
-        text = f"{kept} {NOT_REACHED}"
-        return Answer({"ok": True, "service_reached": False, "model_sha256": sha256, "text": text}, text)
-    return answered(reply, service_reached=True)
+def _stored(kept: str, sha256: str, found: ComparisonData) -> Answer:
+    """Return the answer without a service: the comparison was made here."""
+    text = f"{kept}; {described(found)}. {NOT_REACHED}"
+    record = {"ok": True, "service_reached": False, "model_sha256": sha256, "text": text}
+    return Answer(record | {"comparison": found.table()}, text)

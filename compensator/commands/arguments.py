@@ -165,7 +165,10 @@ def back(parser: argparse.ArgumentParser) -> None:
     run(parser)
     add = parser.add_argument
     add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
-    words = "adopt the model even if the recordings do not determine its state; its standard deviation is then larger"
+    words = (
+        "adopt the model even if measured Y shows that it is clearly worse, or the recordings do not determine its "
+        "state; its standard deviation is then larger"
+    )
     add("--force", action="store_true", help=words)
     add("--timeout", type=float, default=60.0, metavar="S", help="how long to wait for the service's reply, s (60)")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
 import signal
@@ -21,6 +22,7 @@ from compensator.recording.reading import read_messages, recordings
 from compensator.service.transfer.model_store import sha256_of
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
 from tests.cli.test_commands import load_fast_model
+from tests.service.living import Machine
 
 LINES = {"rtu": "/dev/ttyS90", "dcon": "/dev/ttyS91", "tcp": 1502, "plc": 1503, "data": 10001, "command": 10023}
 PREFIX = "shop/sim"
@@ -83,6 +85,76 @@ def test_without_the_service_the_model_is_kept_for_its_next_start(
     assert main(["back", "--config", str(idle)]) == 1
     error = capsys.readouterr().err
     assert "no previous model" in error and error.count("\n") == 1
+
+
+#: The channels of `tests.service.simulated` on devices that a configuration can name.
+RECORDED = """
+[[device]]
+name = "probe"
+line = "probe-line"
+model = "capancdt-6200"
+inputs = [{ input = 0 }]
+[[channel]]
+name = "t_q_degc"
+device = "spindle-thermocouples"
+input = 0
+range = [0.0, 80.0]
+rate_max_per_min = 30.0
+stuck_after_min = 90.0
+[[channel]]
+name = "at_degc"
+device = "cabinet-thermocouples"
+input = 0
+range = [0.0, 50.0]
+rate_max_per_min = 30.0
+stuck_after_min = 90.0
+[[channel]]
+name = "y_um"
+device = "probe"
+input = 0
+range = [-200.0, 200.0]
+rate_max_per_min = 30.0
+stuck_after_min = 90.0
+"""
+
+
+@pytest.fixture
+def recorded(idle: Path) -> Path:
+    """A configuration whose service does not run, and ten hours on record."""
+    text = idle.read_text(encoding="utf-8")
+    idle.write_text(text[: text.index('[[device]]\nname = "probe"')] + RECORDED, encoding="utf-8")
+    machine = Machine(idle.parent)
+    asyncio.run(machine.run(600))
+    machine.recordings.rename(idle.parent / "recordings")
+    return idle
+
+
+def test_without_the_service_a_worse_model_is_refused_and_stored_only_by_force(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configured = in_use(recorded, capsys)
+    model = stronger(tmp_path, Path(__file__).parents[2] / "compensator/model/quill.toml")
+    assert main(["adopt", str(model), "--config", str(recorded)]) == 1
+    error = capsys.readouterr().err
+    assert "clearly worse: last" in error and "µm rms, this one" in error and "--force" in error
+    assert error.count("\n") == 1 and in_use(recorded, capsys) == configured
+    assert main(["adopt", str(model), "--config", str(recorded), "--force", "--json"]) == 0
+    answer = result(capsys)
+    assert answer["comparison"]["verdict"] == "worse" and answer["comparison"]["deviations"] < -10.0
+    assert f"this one {answer['comparison']['candidate_rms_um']:.1f}" in answer["text"]
+    assert in_use(recorded, capsys) == sha256_of(model.read_bytes())
+    assert main(["back", "--config", str(recorded), "--json"]) == 0
+    answer = result(capsys)
+    assert answer["comparison"]["verdict"] == "better" and "the offset would move by" in answer["text"]
+    assert in_use(recorded, capsys) == configured
+
+
+def test_without_recordings_it_is_said_that_nothing_was_judged(
+    idle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = stronger(tmp_path, Path(__file__).parents[2] / "compensator/model/quill.toml")
+    assert main(["adopt", str(model), "--config", str(idle)]) == 0
+    assert "not judged" in capsys.readouterr().out
 
 
 def test_an_adopted_model_that_was_damaged_is_said_and_the_configured_one_stands_in(
@@ -192,6 +264,7 @@ def test_killed_restarted_and_given_another_model(tmp_path: Path, capsys: pytest
             assert main(["adopt", str(model), "--config", str(config), "--json"]) == 0
             answer = result(capsys)
             assert answer["service_reached"] and answer["model_sha256"] == new and answer["state_known"]
+            assert answer["comparison"]["verdict"] == "not_judged" and "not judged: " in answer["text"]
             receiver.until(lambda offsets: offsets[-1]["model_sha256"] == new)
             process.send_signal(signal.SIGTERM)
             assert process.wait(timeout=20) == 0

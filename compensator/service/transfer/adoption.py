@@ -1,6 +1,7 @@
 """Changes the model of the running service: prepared on a separate thread, swapped in between two samples.
 
-The thread checks the model, warms it up on the recordings and stores it for the next start; samples have priority.
+The thread checks the model, warms it up on the recordings, compares it with the present one by the measured Y on
+record (`second_opinion`) and stores it for the next start; samples have priority.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import msgspec
 from compensator.clock import Clock
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError, ServiceError
-from compensator.events import CommandName, EventKind
+from compensator.events import CommandName, ComparisonData, EventKind, NotJudged
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.event_log import EventLog
@@ -29,6 +30,7 @@ from compensator.service.publisher import Sender, refusal
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import WARM_UP, ModelCandidate, warm_up
 from compensator.service.transfer.model_store import ModelStore, check_model, sha256_of
+from compensator.service.transfer.second_opinion import described, not_judged, refuse_if_worse, second_opinion
 
 log = logging.getLogger("compensator")
 
@@ -50,7 +52,7 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     model : str
         The model file; empty if it is already in the store.
     force : bool
-        Adopt it even if the recordings do not determine its state.
+        Adopt it even if the recordings do not determine its state, or it is clearly worse than the present one.
     """
 
     sha256: str = ""
@@ -78,15 +80,25 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return request
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Prepared:
+    """The file of a model, its candidate, and how it compares with the present model."""
+
+    data: bytes
+    candidate: ModelCandidate
+    comparison: ComparisonData
+
+
 @dataclass(slots=True)
 class _Order:
-    """A command that is being executed, with the samples since its arrival."""
+    """A command that is being executed, with the samples since its arrival, and the comparison once it is made."""
 
     action: str
     request: ModelRequest
     reply: Future[dict[str, Any]]
     since: list[Outcome] = field(default_factory=list)
-    ready: tuple[bytes, ModelCandidate] | None = None
+    ready: _Prepared | None = None
+    comparison: ComparisonData | None = None
     task: asyncio.Task[None] | None = None
 
 
@@ -155,7 +167,7 @@ class Adoption:
         if order is None or order.ready is None:
             return old
         self._order = None
-        data, candidate = order.ready
+        candidate, comparison = order.ready.candidate, order.ready.comparison
         for outcome in order.since:
             candidate.update(outcome)
         new = candidate.compensation
@@ -164,12 +176,12 @@ class Adoption:
         new.continue_from(replace(before.handover, model_changed=has_offset))
         after = new.status
         difference = after.target_um - before.target_um
-        self._journal.start_new_file(data)
+        self._journal.start_new_file(order.ready.data)
         named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
         self._events.note(
             EventKind.ADOPT,
-            f"model {named[0]} replaces {named[1]}, "
-            f"warm-up {candidate.minutes / 60.0:.1f} h, the offset moves by {difference:+.2f} µm",
+            f"model {named[0]} replaces {named[1]}, warm-up {candidate.minutes / 60.0:.1f} h, "
+            f"the offset moves by {difference:+.2f} µm; {described(comparison)}",
             {
                 "ok": True,
                 "action": order.action,
@@ -178,6 +190,7 @@ class Adoption:
                 **candidate.figures(),
                 "difference_um": difference,
                 "y_std_um": after.std_um,
+                "comparison": comparison.table(),
             },
         )
         return new
@@ -194,7 +207,7 @@ class Adoption:
         """Prepare the model on another thread, then answer; the swap follows at the next sample."""
         running, now_ns = self._running(), self._clock.utc_ns()
         order.ready = await asyncio.to_thread(self._prepared, store, order, running.model, running.status.zero, now_ns)
-        _, candidate = order.ready
+        candidate, comparison = order.ready.candidate, order.ready.comparison
         model = candidate.compensation.model
         how = f"warmed up on {candidate.samples} sample(s) of {candidate.minutes / 60.0:.1f} h"
         if not candidate.is_known:
@@ -203,10 +216,12 @@ class Adoption:
         order.reply.set_result(
             {
                 "ok": True,
-                "text": f"model {model.name} ({model.sha256[:12]}) is adopted with the next sample, {how}",
+                "text": f"model {model.name} ({model.sha256[:12]}) is adopted with the next sample, {how}; "
+                + described(comparison),
                 "model": model.name,
                 "model_sha256": model.sha256,
                 **candidate.figures(),
+                "comparison": comparison.table(),
             }
         )
 
@@ -220,15 +235,16 @@ class Adoption:
         if not isinstance(error, CompensatorError):
             log.error("internal error", exc_info=error)
             text = f"internal error: {type(error).__name__}: {error}"
-        self._events.note(EventKind.ADOPT, f"refused: {text}", {"ok": False, "action": order.action})
-        order.reply.set_result(refusal(text))
+        figures = {"comparison": order.comparison.table()} if order.comparison is not None else {}
+        self._events.note(EventKind.ADOPT, f"refused: {text}", {"ok": False, "action": order.action} | figures)
+        order.reply.set_result(refusal(text) | figures)
 
     # ------------------------------------------------------------------ on a separate thread
 
     def _prepared(
         self, store: ModelStore, order: _Order, running: ThermalModel, zero: Zero | None, now_ns: int
-    ) -> tuple[bytes, ModelCandidate]:
-        """Return the file of a model and its candidate, and store it for the next start; this takes time."""
+    ) -> _Prepared:
+        """Return the file of a model, its candidate and its comparison; store it for the next start; takes time."""
         data = _model_file(store, order)
         model = check_model(self._config, data, source=f"model {sha256_of(data)[:12]}")
         if model.sha256 == running.sha256:
@@ -238,11 +254,18 @@ class Adoption:
                 f"model {model.name}: sample_period_s = {model.period_s:g}, the service runs at {running.period_s:g} s"
             )
         candidate = self._candidate(model, zero, order.request.force)
+        comparison = order.comparison = self._compared(running, model, zero)
+        refuse_if_worse(comparison, model, force=order.request.force or order.action == CommandName.BACK)
         if order.action == CommandName.BACK:
             store.back(name=model.name, time_utc_ns=now_ns)
         else:
             store.adopt(data, name=model.name, time_utc_ns=now_ns)
-        return data, candidate
+        return _Prepared(data=data, candidate=candidate, comparison=comparison)
+
+    def _compared(self, running: ThermalModel, model: ThermalModel, zero: Zero | None) -> ComparisonData:
+        if zero is None:
+            return not_judged(NotJudged.NO_ZERO)
+        return second_opinion(self._recordings, self._config, running, model, between_samples=_give_way())
 
     def _candidate(self, model: ThermalModel, zero: Zero | None, force: bool) -> ModelCandidate:
         if zero is None:

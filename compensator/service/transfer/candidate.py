@@ -97,25 +97,10 @@ def warm_up(
     """
     compensation = Compensation(config, model)
     compensation.begin(None)
-    window = _window(folder, config.machine.name, slowest_min(model), between_samples)
-    zero, free = window.zero, FreeRun(compensation)
-    names = {channel.name for channel in config.channel}
-    first_ns, samples, newest = 0, 0, zero
-
-    def run(step: RecordedStep) -> None:
-        nonlocal first_ns, samples, newest
-        if step.sample is not None:
-            if step.zero is not None:
-                compensation.zero(step.zero)
-            channels = {name: channel for name, channel in step.sample.channels.items() if name in names}
-            step = replace(step, sample=msgspec.structs.replace(step.sample, channels=channels))
-        result = free.run(step, commands=False)
-        if isinstance(result, Outcome):
-            first_ns, samples = first_ns or free.time_ns, samples + 1
-            newest = Zero.of_estimate(result.estimate)
-
+    window = window_of(folder, config.machine.name, slowest_min(model), between_samples)
+    zero, run = window.zero, RecordedRun(config, compensation)
     if window.at_rest is not None:
-        run(window.at_rest)
+        run.process(window.at_rest)
     elif zero.is_absolute and model.inputs == "changes":
         raise DataError(f"{folder}: no recorded zero, and the previous model used absolute temperatures")
     else:
@@ -123,37 +108,130 @@ def warm_up(
     for path in window.files:
         for step in steps_of(path):
             sample = step.sample
-            if sample is None or (sample.seq > free.seq and sample.time_utc_ns >= window.from_ns):
-                run(step)
+            if sample is None or (sample.seq > run.seq and sample.time_utc_ns >= window.from_ns):
+                run.process(step)
             between_samples()
-    if not samples:
+    if not run.samples:
         raise DataError(f"{folder}: no recorded samples for a warm-up")
+    newest = run.zero or zero
     same = (zero.t_q_ref_degc, zero.at_ref_degc) == (newest.t_q_ref_degc, newest.at_ref_degc)
     if not same and model.inputs == "changes" and not zero.is_absolute:
         raise DataError(f"{folder}: the recordings do not contain the current zero")
-    return ModelCandidate(compensation=compensation, samples=samples, minutes=(free.time_ns - first_ns) / (60.0 * NS))
+    return ModelCandidate(compensation=compensation, samples=run.samples, minutes=run.minutes)
+
+
+class RecordedRun:
+    """Runs recorded samples through the compensation of another model, with the zeros of the record.
+
+    Parameters
+    ----------
+    config : Config
+        Settings of the service; recorded channels that it does not name are left out.
+    compensation : Compensation
+        In its state before the first sample.
+    probes : bool
+        Whether recorded probes that passed the checks correct its prediction, as they did in the service.
+    """
+
+    def __init__(self, config: Config, compensation: Compensation, *, probes: bool = False) -> None:
+        self.compensation = compensation
+        self.samples = 0
+        #: The zero with the newest sample; None before the first.
+        self.zero: Zero | None = None
+        self._free = FreeRun(compensation)
+        self._names = {channel.name for channel in config.channel}
+        self._probes = probes
+        self._first_ns = 0
+
+    @property
+    def seq(self) -> int:
+        """Number of the last sample or held offset; −1 before the first."""
+        return self._free.seq
+
+    @property
+    def minutes(self) -> float:
+        """Time from the first sample to the last, min."""
+        return (self._free.time_ns - self._first_ns) / (60.0 * NS)
+
+    def process(self, step: RecordedStep) -> Outcome | None:
+        """Process one recorded group; return the outcome of its sample.
+
+        Raises
+        ------
+        DataError
+            As in `FreeRun.run`.
+        """
+        if step.sample is not None:
+            if step.zero is not None:
+                self.compensation.zero(step.zero)
+            channels = {name: channel for name, channel in step.sample.channels.items() if name in self._names}
+            # The zero is set above; of the other events only the pauses concern another model.
+            events = [event for event in step.events if event.kind == EventKind.RESTART]
+            sample = msgspec.structs.replace(step.sample, channels=channels)
+            step = replace(step, sample=sample, events=events)
+        result = self._free.run(step, commands=self._probes and step.sample is not None)
+        if not isinstance(result, Outcome):
+            return None
+        self._first_ns, self.samples = self._first_ns or self._free.time_ns, self.samples + 1
+        self.zero = Zero.of_estimate(result.estimate)
+        return result
 
 
 @dataclass(slots=True)
-class _Window:
-    """The part of the recordings that a warm-up uses, and the current zero at their end."""
+class Window:
+    """The part of the recordings that a run uses.
+
+    Parameters
+    ----------
+    zero : Zero
+        The zero at their end.
+    files : list of pathlib.Path
+        The files.
+    from_ns, end_ns : int
+        Where the run must start, and the last sample, ns since 1970 UTC.
+    at_rest : RecordedStep or None
+        The zero at rest with which it starts; None if there is none.
+    """
 
     zero: Zero
     files: list[Path]
     from_ns: int
+    end_ns: int
     at_rest: RecordedStep | None = None
 
 
-def _window(folder: Path, machine: str, slowest: float, between_samples: Callable[[], None]) -> _Window:
-    """Find the current zero, and where the warm-up must start."""
+def window_of(
+    folder: Path, machine: str, slowest: float, between_samples: Callable[[], None], *, compared_ns: int = 0
+) -> Window:
+    """Find the current zero, and where a run must start so that its state is known.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Recordings.
+    machine : str
+        Name of the machine.
+    slowest : float
+        Slowest time constant, min.
+    between_samples : callable
+        Called after each sample that is read.
+    compared_ns : int
+        How long before the end the state must be known, ns.
+
+    Raises
+    ------
+    DataError
+        If there is no recorded zero.
+    """
     files = recordings(folder, machine)
     last = _last_estimate(files)
     if last is None or math.isnan((zero := Zero.of_estimate(last)).t_q_ref_degc):
         raise DataError(f"{folder}: no recorded zero")
-    span_ns = round(WARM_UP * slowest * 60 * NS)
-    window = _Window(zero=zero, files=files, from_ns=last.time_utc_ns - span_ns)
+    span_ns, known_ns = round(WARM_UP * slowest * 60 * NS), last.time_utc_ns - compared_ns
+    window = Window(zero=zero, files=files, from_ns=known_ns - span_ns, end_ns=last.time_utc_ns)
     for path in reversed(files):
-        if _opens_with(path, zero):
+        opening = _opening_zero(path)
+        if opening is not None and opening.equals(zero):
             continue  # the zero was set before this file
         zeros = []
         for step in steps_of(path):
@@ -162,14 +240,17 @@ def _window(folder: Path, machine: str, slowest: float, between_samples: Callabl
             between_samples()
         for step in reversed(zeros):
             assert step.sample is not None
-            if step.zero == "rest":
+            at_ns = step.sample.time_utc_ns
+            if step.zero == "rest" and at_ns <= known_ns:
                 window.at_rest = step
-                window.from_ns = max(window.from_ns, step.sample.time_utc_ns)
+                window.from_ns = max(window.from_ns, at_ns)
                 break
-            # The deformation is relative to the model's prediction at this zero, so the state must be known there too.
-            window.from_ns = min(window.from_ns, step.sample.time_utc_ns - span_ns)
+            # The deformation is relative to the model's prediction at a zero on a warm machine, so the state must be
+            # known there too.
+            window.from_ns = min(window.from_ns, at_ns - span_ns)
         if window.at_rest is not None:
             break
+        zero = opening or zero
     window.files = files[_first_needed(files, window.from_ns) :]
     return window
 
@@ -192,10 +273,10 @@ def _last_estimate(files: list[Path]) -> EstimateMessage | None:
     return None
 
 
-def _opens_with(path: Path, zero: Zero) -> bool:
-    """Return whether a zero was current at the start of a recording."""
+def _opening_zero(path: Path) -> Zero | None:
+    """Return the zero at the start of a recording; None if it does not show one."""
     try:
         state = decode_state(opening_of(path).get("state.json", b""))
     except DataError:
-        return False
-    return Zero.of_references(state.engine.reference, state.zero).equals(zero)
+        return None
+    return Zero.of_references(state.engine.reference, state.zero)

@@ -1,0 +1,277 @@
+"""Before another model takes over, both are compared on the measured Y on record."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from compensator.audit.series import audit
+from compensator.config import parse_config
+from compensator.model.model_file import parse_model
+from compensator.recording.reading import messages, recordings
+from compensator.service.transfer.evidence import evidence
+from compensator.service.transfer.second_opinion import described, second_opinion
+from tests.audit.made import CONFIG
+from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
+from tests.service.probed import PROBED, ProbedMachine
+from tests.service.test_adoption import Asked, adopted, payload
+from tests.service.test_restart import QUILL, STRONGER
+
+HOURS_24 = 1440
+
+
+def gain(change: float, name: str = "other") -> bytes:
+    """The published model with a DTF that is stronger by a part."""
+    return QUILL.replace(b'name = "quill"', f'name = "{name}"'.encode()) + (
+        f'\n[[effect]]\nkind = "gain"\npath = "DTF"\nchange = {change}\n'.encode()
+    )
+
+
+class Measured(Machine):
+    """A machine whose displacement sensor has noise, and more that is not deformation."""
+
+    def __init__(self, folder: Path, more: Callable[[int], float] = lambda sample: 0.0, **options: Any) -> None:
+        data = CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0")
+        super().__init__(folder, options.pop("config", parse_config(data, source="test")), **options)
+        self.config_bytes = data
+        rng = np.random.default_rng(7)
+        self.device.sources[2] = lambda: (
+            self.world.truth("y_um") + 0.4 * float(rng.normal()) + float(more(len(self.outcomes)))
+        )
+
+    def opinion(self, present: bytes, candidate: bytes) -> Any:
+        models = (parse_model(data, source="test") for data in (present, candidate))
+        return second_opinion(self.recordings, self.config, *models)
+
+
+@pytest.fixture(scope="module")
+def day(tmp_path_factory: pytest.TempPathFactory) -> Measured:
+    """A shift on record with the right model."""
+    machine = Measured(tmp_path_factory.mktemp("day"))
+    asyncio.run(machine.run(700))
+    return machine
+
+
+async def test_the_model_of_another_machine_is_refused_with_figures_and_taken_by_force(tmp_path: Path) -> None:
+    machine = Measured(tmp_path)
+    wrong = gain(0.4)
+    refused = machine.at_sample[900] = Asked(machine, "adopt", payload(wrong))
+    forced = Asked(machine, "adopt", payload(wrong, force=True))
+    back = Asked(machine, "back")
+
+    def one_after_the_other(outcome: Any) -> bool:
+        if refused.reply is not None and refused.reply.done() and forced.reply is None:
+            assert machine.store.in_use() == QUILL
+            forced()
+        if outcome.offset.model_sha256 != machine.outcomes[0].offset.model_sha256 and back.reply is None:
+            back()
+        return back.reply is not None and outcome.offset.model_sha256 == machine.outcomes[0].offset.model_sha256
+
+    await machine.run(1300, one_after_the_other)
+    answer = refused.answer
+    assert not answer["ok"] and "clearly worse" in answer["text"] and "--force" in answer["text"]
+    found = answer["comparison"]
+    assert found["verdict"] == "worse" and found["measured_by"] == "sensor" and found["deviations"] < -10.0
+    assert found["present_rms_um"] < 1.0 and found["candidate_rms_um"] > 10.0 and 14.0 < found["hours"] < 16.0
+    for figure in (f"present {found['present_rms_um']:.1f} µm rms", f"this one {found['candidate_rms_um']:.1f}"):
+        assert figure in answer["text"]
+    assert "the offset would move by" in answer["text"] and "\n" not in answer["text"]
+    assert forced.answer["ok"] and forced.answer["comparison"]["verdict"] == "worse"
+    # The way back is better, and would not be refused in any case.
+    assert back.answer["ok"] and back.answer["comparison"]["verdict"] == "better"
+    # The recording carries the figures: refused, by force, back.
+    events = [event for path in recordings(machine.recordings, MACHINE) for event in messages(path, ("event",))]
+    told = [event.data for event in events if event.kind == "adopt"]
+    assert [(data["ok"], data["comparison"]["verdict"]) for data in told] == [
+        (False, "worse"), (True, "worse"), (True, "better"),
+    ]  # fmt: skip
+    assert told[0]["comparison"] == json.loads(json.dumps(found, allow_nan=False))
+    # What was foreseen of the offset is what it does.
+    assert told[1]["comparison"]["offset_change_um"] == pytest.approx(told[1]["difference_um"], abs=1.0)
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    assert check_files(machine) == len(machine.outcomes)
+    audited = audit(recordings(machine.recordings, MACHINE))
+    assert audited.clean and audited.samples == len(machine.outcomes)
+
+
+async def test_a_better_model_is_taken_with_figures(tmp_path: Path) -> None:
+    machine = Measured(tmp_path, model=STRONGER)
+    asked = machine.at_sample[700] = Asked(machine, "adopt", payload(QUILL))
+    await machine.run(1000, adopted(QUILL, then=1))
+    found = asked.answer["comparison"]
+    assert asked.answer["ok"] and found["verdict"] == "better" and found["deviations"] > 10.0
+    assert found["candidate_rms_um"] < 1.0 < found["present_rms_um"]
+    event = machine.events("adopt")[-1]
+    assert event.data["comparison"] == found and "µm rms, this one" in event.text
+
+
+async def test_without_measured_y_a_model_is_taken_and_that_is_said(tmp_path: Path) -> None:
+    channels = [channel for channel in settings().channel if channel.name != "y_um"]
+    machine = Machine(tmp_path, msgspec.structs.replace(settings(), channel=channels))
+    asked = machine.at_sample[600] = Asked(machine, "adopt", payload(STRONGER))
+    await machine.run(900, adopted(STRONGER, then=1))
+    assert asked.answer["ok"] and "not judged: no measured Y in the last 24 h" in asked.answer["text"]
+    found = asked.answer["comparison"]
+    assert (found["verdict"], found["why"]) == ("not_judged", "no_y") and found["offset_change_um"] != 0.0
+
+
+async def test_an_hour_of_measured_y_does_not_judge(tmp_path: Path) -> None:
+    machine = Measured(tmp_path)
+    asked = machine.at_sample[60] = Asked(machine, "adopt", payload(gain(0.5)))
+    await machine.run(300, adopted(gain(0.5)))
+    found = asked.answer["comparison"]
+    assert asked.answer["ok"] and (found["verdict"], found["why"]) == ("not_judged", "too_little")
+    assert found["hours"] == pytest.approx(1.0, abs=0.1) and "h: present" in asked.answer["text"]
+
+
+async def test_only_the_last_day_counts(tmp_path: Path) -> None:
+    """Y was wrong the day before, and the service was stopped between."""
+    machine = Measured(tmp_path, lambda sample: 0.2 * sample if sample < 600 else 0.0)
+    await machine.run(600)
+    machine.at_sample[640] = functools.partial(machine.command, "zero", b'{"mode": "warm"}')
+    await machine.run(HOURS_24 + 60)
+    found = machine.opinion(QUILL, gain(0.1))
+    assert found.verdict == "worse" and found.present_rms_um < 1.0 and found.hours == pytest.approx(24.0, abs=0.1)
+    assert found.samples > 0.97 * HOURS_24
+
+
+def test_models_that_predict_alike_are_not_refused(day: Measured) -> None:
+    found = day.opinion(QUILL, gain(0.0))
+    assert found.verdict == "alike" and "no clear difference" in described(found)
+    assert found.offset_change_um == pytest.approx(0.0, abs=1e-9)
+
+
+def test_both_models_are_judged_alike(day: Measured) -> None:
+    there, back = day.opinion(QUILL, gain(0.1)), day.opinion(gain(0.1), QUILL)
+    assert (there.verdict, back.verdict) == ("worse", "better")
+    assert there.deviations == pytest.approx(-back.deviations)
+    assert there.present_rms_um == back.candidate_rms_um
+    assert there.offset_change_um == pytest.approx(-back.offset_change_um)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        lambda sample: -30.0 * (sample > 500),
+        lambda sample: 25.0 * (sample > 250) - 25.0 * (sample > 700),
+        lambda sample: -0.05 * sample,
+    ],
+    ids=["step", "twice", "creep"],
+)
+async def test_a_sensor_that_was_moved_refuses_no_better_model(tmp_path: Path, more: Callable[[int], float]) -> None:
+    """By its values Y would speak for the weaker model; by its changes it speaks for the right one."""
+    machine = Measured(tmp_path, more)
+    await machine.run(900)
+    for present in (gain(0.1), gain(-0.1)):
+        assert machine.opinion(present, QUILL).verdict == "better"
+        assert machine.opinion(QUILL, present).verdict == "worse"
+    odd = [machine.opinion(QUILL, gain(change)) for change in (-0.1, 0.1)]
+    assert any(found.y_moved and "has moved by itself" in described(found) for found in odd)
+
+
+@pytest.mark.parametrize("noise_um", [0.0, 0.3])
+async def test_a_dead_sensor_judges_no_model(tmp_path: Path, noise_um: float) -> None:
+    channels = [msgspec.structs.replace(channel, stuck_after_min=None) for channel in settings().channel]
+    machine = Measured(tmp_path, config=msgspec.structs.replace(settings(), channel=channels))
+    rng = np.random.default_rng(4)
+    machine.device.sources[2] = lambda: 5.0 + noise_um * float(rng.normal())
+    await machine.run(900)
+    for change in (0.4, -0.4):
+        found = machine.opinion(QUILL, gain(change))
+        assert (found.verdict, found.why) == ("not_judged", "unrelated")
+
+
+async def test_a_suspected_sensor_judges_no_model(tmp_path: Path) -> None:
+    """The service names measured Y, and not the model, for nearly the whole record."""
+    checks = {"false_alarm_days": 365.0, "residual_std_um": 2.0, "residual_correlation_min": 240.0}
+    machine = Measured(tmp_path, lambda sample: 40.0 * (sample > 60), config=settings(plausibility=checks))
+    await machine.run(700)
+    suspected = ["implausible:y_um" in outcome.offset.reasons for outcome in machine.outcomes]
+    assert sum(suspected) > 450
+    found = machine.opinion(QUILL, gain(0.4))
+    assert (found.verdict, found.why) == ("not_judged", "suspect") and "suspected a sensor" in described(found)
+
+
+async def test_probes_judge_where_there_is_no_sensor(tmp_path: Path) -> None:
+    """A model without most of the DTF; the one that is right up to 10 % is corrected by the probes and stays."""
+    machine = ProbedMachine(tmp_path)
+    machine.each_hour(1400, every=90)
+    wrong, better = gain(-0.8), gain(0.1)
+    refused = machine.at_sample[1300] = Asked(machine, "adopt", payload(wrong))
+    taken = Asked(machine, "adopt", payload(better))
+
+    def then(outcome: Any) -> bool:
+        if refused.reply is not None and refused.reply.done() and taken.reply is None:
+            taken()
+        return arrived(outcome)
+
+    arrived = adopted(better, then=2)
+    await machine.run(1500, then)
+    found = refused.answer["comparison"]
+    assert not refused.answer["ok"] and found["verdict"] == "worse" and found["measured_by"] == "probe"
+    assert found["probes"] >= 13 and f"{found['probes']} probe(s)" in refused.answer["text"]
+    assert found["present_rms_um"] < 1.5 and found["candidate_rms_um"] > 2.0
+    # It would need a larger correction than `largest_um`, so the offset would move.
+    assert abs(found["offset_change_um"]) > 10.0
+    assert taken.answer["ok"] and taken.answer["comparison"]["verdict"] in ("alike", "better")
+    # Otherwise the corrected deformation stays as it is at the exchange, and that is foreseen.
+    assert abs(taken.answer["comparison"]["offset_change_um"]) < 0.05
+    assert check_files(machine) == len(machine.outcomes)
+    audited = audit(recordings(machine.recordings, MACHINE))
+    assert audited.clean and audited.samples == len(machine.outcomes)
+
+
+async def test_a_chip_on_the_probe_refuses_no_model(tmp_path: Path) -> None:
+    machine = ProbedMachine(tmp_path, gain=1.0, config=PROBED)
+    machine.each_hour(1300, every=80)
+    for sample in (400, 960):
+        machine.at_sample[sample] = functools.partial(machine.probe, wrong_um=35.0)
+    await machine.run(1300)
+    models = [parse_model(data, source="test") for data in (QUILL, gain(0.05))]
+    found = second_opinion(machine.recordings, machine.config, *models)
+    assert found.verdict == "alike" and found.present_rms_um < 1.5
+    assert found.probes == len([probe for probe in machine.recorded() if probe.taken]) - 1  # the first is the zero
+
+
+async def test_few_probes_do_not_judge(tmp_path: Path) -> None:
+    machine = ProbedMachine(tmp_path)
+    machine.each_hour(700, every=150)
+    await machine.run(700)
+    models = [parse_model(data, source="test") for data in (QUILL, gain(-0.8))]
+    found = second_opinion(machine.recordings, machine.config, *models)
+    assert (found.verdict, found.why, found.probes) == ("not_judged", "too_little", 4)  # the first one is the zero
+    assert "at least 8 probes" in described(found)
+
+
+def test_a_record_that_cannot_be_replayed_is_said(tmp_path: Path) -> None:
+    found = Measured(tmp_path).opinion(QUILL, STRONGER)
+    assert (found.verdict, found.why) == ("not_judged", "no_record") and "no recorded zero" in described(found)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6, 0.8])
+def test_errors_that_are_alike_for_hours_are_not_counted_as_independent(correlation: float) -> None:
+    """Two equally wrong models: a verdict by chance is rare, also where a plain count would give many."""
+    rng, by_chance, plain = np.random.default_rng(11), 0, 0
+    count, trials = 47, 400
+
+    def walk() -> np.ndarray:
+        values = [float(rng.normal())]
+        for _ in range(count - 1):
+            values.append(correlation * values[-1] + float(rng.normal()))
+        return np.array(values)
+
+    for _ in range(trials):
+        difference, error = 3.0 * walk(), 3.0 * walk()
+        found = evidence(0.5 * difference + error, difference)
+        by_chance += abs(found.deviations) > 4.0
+        plain += abs(found.deviations) * np.sqrt(count / found.effective) > 4.0
+    assert by_chance <= 0.01 * trials
+    assert plain > by_chance or correlation < 0.7
