@@ -10,6 +10,20 @@ from typing import Any, Protocol
 NS = 1_000_000_000
 
 
+def duration(seconds: float) -> str:
+    """Return a duration in a unit that suits it.
+
+    Examples
+    --------
+    >>> duration(7.4), duration(900.0), duration(43_200.0), duration(200_000.0)
+    ('7 s', '15 min', '12.0 h', '2.3 days')
+    """
+    for unit, length_s, most in (("s", 1.0, 120.0), ("min", 60.0, 120.0), ("h", 3600.0, 48.0)):
+        if round(abs(seconds) / length_s) < most:
+            return f"{seconds / length_s:.{1 if unit == 'h' else 0}f} {unit}"
+    return f"{seconds / 86400.0:.1f} days"
+
+
 class Clock(Protocol):
     """Interface of a clock for the service."""
 

@@ -553,6 +553,11 @@ class ServiceWarning(Code):
         "The tolerance for probes is smaller than the standard deviation of one of them: one is wanted nearly always.",
         "Raise probe.tolerance_um, or lower probe.std_um if ten probes of one feature scatter less.",
     )
+    PROBE_BOUNDS = (
+        "probe_bounds",
+        "Probes that show the largest permitted correction are refused: probe.measured_max_um is below it.",
+        "Set probe.measured_max_um to about three times probe.largest_um.",
+    )
     SERVICE_RUNS = (
         "service_runs",
         "The service is running and uses the devices; a second program may be refused or disturb its readings.",
@@ -637,6 +642,21 @@ class ProbeSourceRemark(Code):
         "line_broken",
         "A line does not have the agreed form, so nothing of it is used.",
         "Probe again. If it happens often: check baud rate, parity, cable and macro.",
+    )
+    ROW_BROKEN = (
+        "row_broken",
+        "The header or a line of a CSV file does not have the agreed form, so it is not used.",
+        "Correct the program that writes the file: a header row with the columns' names first, comma, dot, UTF-8.",
+    )
+    NO_FEATURE = (
+        "no_feature",
+        "A probe has no feature: each feature has its own zero, so a value without one cannot be used.",
+        "Give the feature a name, always the same: in the line or, for one feature alone, in the settings.",
+    )
+    NO_OFFSET_SOURCE = (
+        "no_offset_source",
+        "Nothing shows the offset that acted at the touch for this source, unless each of its lines has it.",
+        "Set applied_file for the receiver and for the bridge, or let each line have the offset.",
     )
     LINE_INCOMPLETE = (
         "line_incomplete",

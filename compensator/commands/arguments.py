@@ -54,7 +54,13 @@ check = probe = run
 def simulate(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `simulate`."""
     add = parser.add_argument
-    add("data", type=Path, metavar="DATA", help="CSV or MAT file, or recording")
+    add(
+        "data",
+        type=Path,
+        nargs="+",
+        metavar="DATA",
+        help="CSV or MAT file, or recording; several files are several runs",
+    )
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="CSV")
     words = "correct each row by the measured Y of earlier rows, as the service does by probes (default: run free)"

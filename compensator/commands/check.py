@@ -23,8 +23,11 @@ def run(arguments: argparse.Namespace) -> Answer:
         f"plausibility: {checks}"
     )
     if config.probe is not None:
+        probe = config.probe
+        tolerance = f"{probe.tolerance_um:g} µm" if probe.tolerance_um is not None else "none"
         text += (
-            f"\nprobes: on, one value ±{config.probe.std_um:g} µm, correction at most {config.probe.largest_um:g} µm"
+            f"\nprobes: on, one value ±{probe.std_um:g} µm, at most {probe.measured_max_um:g} µm, correction at most "
+            f"{probe.largest_um:g} µm, tolerance {tolerance}"
         )
     result = {
         "ok": True,

@@ -10,7 +10,8 @@ from pathlib import Path
 import msgspec
 import zenoh
 
-from compensator.commands import Answer
+from compensator.codes import ProbeSourceRemark, Remark
+from compensator.commands import Answer, log_warnings, warnings_as_json
 from compensator.commands.stopping import on_stop
 from compensator.config import Zenoh
 from compensator.errors import ConfigError, ServiceError
@@ -95,8 +96,25 @@ def _checked(config: str, settings: ProbeSettings) -> Answer:
         *(f"{dprnt.name}, sign {dprnt.sign:+d} ({dprnt.sign_checked})" for dprnt in settings.dprnt),
         *(f"{file.file}, sign {file.sign:+d} ({file.sign_checked})" for file in settings.linuxcnc),
     ]
+    warnings = _without_offset(settings)
+    log_warnings(config, warnings)
     text = f"{config}: valid. To {settings.service.prefix} from {'; '.join(sources)}. Nothing was opened."
-    return Answer({"ok": True, "prefix": settings.service.prefix, "sources": sources}, text)
+    result = {"ok": True, "prefix": settings.service.prefix, "sources": sources, **warnings_as_json(warnings)}
+    return Answer(result, text)
+
+
+def _without_offset(settings: ProbeSettings) -> list[Remark]:
+    """Warn of sources whose probes may all be refused, because nothing shows the offset."""
+    if settings.service.applied_file:
+        return []
+    sources = [
+        *((f"{one.path}/{one.pattern}", "a line without offset_applied_um is refused") for one in settings.folders),
+        *((one.name, "a line without OUM, OMM or OIN is refused") for one in settings.dprnt),
+        *((one.file, "its lines have no offset, so every probe is refused") for one in settings.linuxcnc),
+    ]
+    return [
+        Remark(ProbeSourceRemark.NO_OFFSET_SOURCE, f"{name}: no probes.applied_file: {why}.") for name, why in sources
+    ]
 
 
 async def _serve(settings: ProbeSettings, sink: CommandSink) -> None:

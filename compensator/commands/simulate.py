@@ -17,7 +17,7 @@ log = logging.getLogger("compensator")
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     given = arguments
-    out = checked_file(given.out, "--out", read=(given.data, Path(given.model)), ending=".csv")
+    out = checked_file(given.out, "--out", read=(*given.data, Path(given.model)), ending=".csv")
     columns = roles_of(given.column)
     found = simulate(given.model, given.data, columns=columns, correct=given.correct, y_std_um=given.y_std)
     for remark in found.remarks:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import bisect
 import csv
+import logging
+import math
 import os
+from collections import defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,9 +16,12 @@ from typing import Any
 import msgspec
 
 from compensator.atomic_write import atomic_write
+from compensator.data.files import of_one_feature, shows_deformation
 from compensator.errors import DataError
-from compensator.messages import EstimateMessage, Offset, Sample
+from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
 from compensator.recording.reading import machines_in, messages
+
+log = logging.getLogger("compensator")
 
 PathLike = str | os.PathLike[str]
 
@@ -26,7 +33,8 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     """Write the recordings of one machine as one CSV, in the order of their samples.
 
     Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
-    offset, its state and reasons. `heat_w` is the estimate; a measured heat is in `heat_measured_w`.
+    offset, its state and reasons. `heat_w` is the estimate; a measured heat is in `heat_measured_w`. Where no
+    displacement sensor measured Y, `y_um` is the deformation that a touch probe showed, at the sample of its time.
 
     Parameters
     ----------
@@ -49,11 +57,18 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     """
     paths = [Path(recordings)] if isinstance(recordings, (str, os.PathLike)) else [Path(path) for path in recordings]
     rows: dict[int, dict[str, Any]] = {}
+    probes: list[Probe] = []
+    periods_s: dict[int, float] = {}
     machines: dict[str, Path] = {}
     for recording in paths:
         before = len(rows)
-        for message in messages(recording, ("sample", "estimate", "offset"), prefix=machine):
+        for message in messages(recording, ("sample", "estimate", "offset", "probe"), prefix=machine):
             machines.setdefault(message.machine, recording)
+            if isinstance(message, Probe):
+                probes += [message] if shows_deformation(message) else []
+                continue
+            if isinstance(message, Sample):
+                periods_s[message.seq] = message.period_s
             rows.setdefault(message.seq, {}).update(_cells(message))
         if len(rows) == before:
             raise _without_samples(recording, machine, alone=len(paths) == 1)
@@ -61,6 +76,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         (one, first), (other, second) = list(machines.items())[:2]
         raise DataError(f"{first} is of {one}, {second} of {other}; expected recordings of one machine")
     rows = dict(sorted(rows.items()))
+    _add_probes(str(paths[0]), rows, probes, periods_s)
     start = min(row["_ns"] for row in rows.values())
     for row in rows.values():
         row["t_s"] = (row.pop("_ns") - start) / 1e9
@@ -71,6 +87,27 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         writer.writeheader()
         writer.writerows(rows.values())
     return len(rows)
+
+
+def _add_probes(
+    name: str, rows: dict[int, dict[str, Any]], probes: Sequence[Probe], periods_s: dict[int, float]
+) -> None:
+    """Add `y_um` to the rows in whose time a probe was measured; a probe outside of all samples is left out."""
+    if not probes or any(row.get("y_um") is not None for row in rows.values()):
+        return
+    probes, remarks = of_one_feature(name, probes)
+    for remark in remarks:
+        log.warning("%s", remark.marked)
+    ends = sorted((rows[seq]["_ns"], seq) for seq in periods_s)
+    values: defaultdict[int, list[float]] = defaultdict(list)
+    for probe in probes:
+        i = bisect.bisect_left(ends, (probe.time_utc_ns, 0))
+        if i < len(ends) and ends[i][0] - probe.time_utc_ns < periods_s[ends[i][1]] * 1e9:
+            values[ends[i][1]].append(number(probe.deformation_um))
+    for row in rows.values():
+        row.setdefault("y_um", None)
+    for seq, measured in values.items():
+        rows[seq]["y_um"] = math.fsum(measured) / len(measured)
 
 
 def _without_samples(recording: Path, machine: str, *, alone: bool) -> DataError:

@@ -159,7 +159,7 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
     }
     remarks: tuple[Remark, ...] = ()
     if np.isnan(columns.get("y_um", np.array([np.nan]))).all():
-        probes, remarks = _of_one_feature(str(paths[0]), [probe for _, some in parts for probe in some])
+        probes, remarks = of_one_feature(str(paths[0]), [probe for _, some in parts for probe in some])
         if probes:
             blank = np.full(len(probes), np.nan)
             columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
@@ -171,7 +171,7 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
     return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks
 
 
-def _of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tuple[Remark, ...]]:
+def of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tuple[Remark, ...]]:
     """Return the probes of the feature that has most: each feature has a zero of its own."""
     counts = Counter(probe.feature for probe in probes)
     if len(counts) < 2:
@@ -181,7 +181,7 @@ def _of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tu
     return [probe for probe in probes if probe.feature == feature], (Remark(DataRemark.FEATURES_LEFT_OUT, words),)
 
 
-def _shows_deformation(probe: Probe) -> bool:
+def shows_deformation(probe: Probe) -> bool:
     """Whether a probe is a measured Y: it was taken, or refused only because the control applied nothing."""
     if probe.deformation_um is None:
         return False
@@ -196,7 +196,7 @@ def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
     probes: list[Probe] = []
     for message in messages(path, ("sample", "probe")):
         if isinstance(message, Probe):
-            probes += [message] if _shows_deformation(message) else []
+            probes += [message] if shows_deformation(message) else []
             continue
         times.append(message.time_utc_ns)
         samples.append(

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from compensator.atomic_write import atomic_write
+from compensator.clock import duration
 from compensator.codes import ProbeSourceRemark, Remark
 from compensator.errors import ConfigError, UsageError
 from compensator.probes.probe import Probe
 from compensator.probes.sender import Outcome, Report, pause
 from compensator.probes.settings import Folder, convention
-from compensator.probes.table import BadLine, Row, columns, row
+from compensator.probes.table import BadLine, NoFeature, Row, columns, row
 
 #: Longest file, bytes; 100 000 lines.
 LONGEST = 10_000_000
@@ -173,11 +174,11 @@ class WatchedFolder:
         try:
             names = columns(lines[0])
         except BadLine as bad:
-            self._refuse(path, ProbeSourceRemark.LINE_BROKEN, lines[0], str(bad))
+            self._refuse(path, ProbeSourceRemark.ROW_BROKEN, lines[0], str(bad))
             return
         old = sum(self._handle(path, names, line) for line in lines[1:])
         if old:
-            why = f"{old} line(s) older than {self._send_within_ns / 1e9:g} s"
+            why = f"{old} line(s) older than {duration(self._send_within_ns / 1e9)}"
             self._refuse(path, ProbeSourceRemark.PROBE_NOT_SENT, "", why)
 
     def _handle(self, path: Path, names: list[str], text: str) -> bool:
@@ -187,7 +188,8 @@ class WatchedFolder:
         try:
             line = row(names, text)
         except BadLine as bad:
-            self._refuse(path, ProbeSourceRemark.LINE_BROKEN, text, str(bad))
+            code = ProbeSourceRemark.NO_FEATURE if isinstance(bad, NoFeature) else ProbeSourceRemark.ROW_BROKEN
+            self._refuse(path, code, text, str(bad))
             return False
         before = self._handled.values(line.identity) or self._pending.get(line.identity)
         if before is not None:

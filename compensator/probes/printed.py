@@ -7,6 +7,7 @@ import zoneinfo
 from collections.abc import Callable
 from typing import cast
 
+from compensator.clock import duration
 from compensator.codes import ProbeSourceRemark, Remark
 from compensator.probes.dprnt import Printed, Unusable, parse
 from compensator.probes.lines import Bits, Line, Lines
@@ -88,7 +89,7 @@ class PrintedProbes:
         elif line.late:
             self._refuse(ProbeSourceRemark.LINE_AGE_UNKNOWN, line.text, "not read as it arrived")
         elif not (printed.feature or self._settings.feature):
-            self._refuse(ProbeSourceRemark.LINE_BROKEN, line.text, "no F, and no feature in the settings")
+            self._refuse(ProbeSourceRemark.NO_FEATURE, line.text, "no F, and no feature in the settings")
         else:
             self._probe(printed, line.text, now_utc_ns)
 
@@ -99,7 +100,8 @@ class PrintedProbes:
             printed_ns = self._utc_ns(printed.printed_at)
             difference_s = (now_utc_ns - printed_ns) / 1e9
             if abs(difference_s) > settings.clock_tolerance_s:
-                why = f"printed {difference_s:.0f} s before its arrival by the control's clock"
+                order = "before" if difference_s > 0.0 else "after"
+                why = f"printed {duration(abs(difference_s))} {order} its arrival by the control's clock"
                 self._refuse(ProbeSourceRemark.LINE_CLOCK_DISAGREES, text, why)
                 return
             time_utc_ns = printed_ns - round(printed.age_s * 1e9)

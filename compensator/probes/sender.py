@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+from compensator.clock import duration
 from compensator.codes import ProbeSourceRemark, Remark
 from compensator.probes.probe import NotSent, Probe, ProbeSink
 
@@ -98,7 +99,7 @@ class Sender:
         age_s = (self._utc_ns() - first.probe.time_utc_ns) / 1e9
         if age_s > self.send_within_s:
             self._waiting.popleft()
-            self._give_up(first, f"{age_s:.0f} s old, sent within {self.send_within_s:g} s")
+            self._give_up(first, f"{duration(age_s)} old, sent within {duration(self.send_within_s)}")
             return True
         try:
             reply = await asyncio.to_thread(self._sink.send, first.probe)

@@ -16,6 +16,8 @@ from compensator.receiver.settings import load_tables, read_table
 #: µm for each unit of a control.
 UNITS_UM = {"mm": 1000.0, "inch": 25400.0}
 _TABLES = ("folder", "dprnt", "linuxcnc")
+#: `sign_checked` of probes.example.toml, which nobody has checked.
+PLACEHOLDER = "date, who, how"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -304,8 +306,10 @@ def _require_sign(where: str, table: Mapping[str, Any]) -> None:
 def _check_sign(where: str, settings: _Signed) -> None:
     if settings.sign not in (1, -1):
         raise ReceiverError(f"{where}.sign = {settings.sign!r}: expected 1 or -1, determined on this machine")
-    if not settings.sign_checked.strip():
-        raise ReceiverError(f"{where}.sign_checked = '': expected who determined the sign, when and how")
+    if settings.sign_checked.strip() in ("", PLACEHOLDER):
+        raise ReceiverError(
+            f"{where}.sign_checked = {settings.sign_checked!r}: expected who determined the sign, when and how"
+        )
 
 
 def _within(settings: object, bounds: Mapping[str, tuple[float, float]], where: str) -> None:

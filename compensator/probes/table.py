@@ -29,6 +29,10 @@ class BadLine(ValueError):
     """A header or line that cannot be used; says why."""
 
 
+class NoFeature(BadLine):
+    """A line without a feature."""
+
+
 class Row(NamedTuple):
     """A line.
 
@@ -72,6 +76,8 @@ def columns(line: str) -> list[str]:
         If a column is unknown, occurs twice or is missing.
     """
     names = [name.strip() for name in _fields(line.removeprefix("\ufeff"))]
+    if not set(names) & set(COLUMNS):
+        raise BadLine(f"no header row, expected some of {', '.join(COLUMNS)}")
     for name in names:
         if name not in COLUMNS:
             raise BadLine(f"column {name!r}, expected some of {', '.join(COLUMNS)}")
@@ -109,7 +115,7 @@ def row(names: list[str], line: str) -> Row:
     if measured_um is None:
         raise BadLine("measured_um is empty")
     if not values["feature"]:
-        raise BadLine("feature is empty")
+        raise NoFeature("feature is empty, expected a name")
     for name in ("feature", "tool"):
         if len(values.get(name, "")) > 64 or not values.get(name, "").isprintable():
             raise BadLine(f"{name}: expected at most 64 printable characters")

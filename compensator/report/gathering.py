@@ -16,12 +16,23 @@ import numpy as np
 
 from compensator.codes import RecordingEnd, State
 from compensator.errors import DataError
-from compensator.messages import EstimateMessage, Event, Offset, Sample, number
+from compensator.messages import EstimateMessage, Event, Offset, Probe, Sample, number
 from compensator.model.effects.base import label_of
 from compensator.recording.container import Container, Contents, Damaged, Torn
 from compensator.recording.reading import decode, in_order, records_of
 from compensator.report.envelope import Envelope, Stretches
-from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, File, History, Missed, Period
+from compensator.report.history import (
+    EPISODES,
+    EVENTS,
+    NO_RECORDING,
+    PROBES,
+    Episode,
+    File,
+    History,
+    Missed,
+    Period,
+    ProbeShown,
+)
 
 _NS = 1e-9
 _DAY_S = 86400.0
@@ -68,6 +79,7 @@ class _Reader:
             "estimate": self._estimate,
             "offset": self._offset,
             "event": self._event,
+            "probe": self._probe,
         }
         self._buffers: dict[str, tuple[list[float], list[float]]] = {}
         self._period_s = 60.0
@@ -151,6 +163,9 @@ class _Reader:
             shares[self._effects[i] if i < len(self._effects) else f"effect {i + 1}"] = value
         if estimate.y_base_um or "share at the zero" in self._buffers:
             shares["at the zero"] = -estimate.y_base_um
+        if self.history.probes_count:
+            # Zero before the first probe taken; the prediction is the sum of all shares.
+            shares["probes"] = number(estimate.y_pred_um) - math.fsum(shares.values())
         for name, value in shares.items():
             self._append(f"share {name}", t, value)
         y, residual = number(estimate.y_um), number(estimate.residual_um)
@@ -186,6 +201,23 @@ class _Reader:
             period.offset.add(y_offset, t)
             period.left.add(y + y_offset, t)
             period.std.add(std, t)
+
+    def _probe(self, probe: Probe) -> None:
+        history, deformation_um = self.history, number(probe.deformation_um)
+        shown = ProbeShown(
+            at_s=probe.time_utc_ns * _NS,
+            feature=probe.feature,
+            deformation_um=deformation_um,
+            left_um=number(probe.measured_um),
+            predicted_um=deformation_um - number(probe.innovation_um),
+            taken=probe.taken,
+            code=probe.code,
+        )
+        history.probes = [*history.probes[1 - PROBES :], shown]
+        history.probes_count += 1
+        if probe.taken:
+            history.probes_taken += 1
+            history.probes_left.add(shown.left_um, shown.at_s)
 
     def _event(self, event: Event) -> None:
         self.history.events_count += 1

@@ -11,6 +11,8 @@ from compensator.report.envelope import Envelope, Stretches
 
 #: Numbers of events and episodes that are kept; the others are only counted.
 EVENTS, EPISODES = 500, 200
+#: Number of the last probes that are kept; a probe every ten minutes for two weeks.
+PROBES = 2000
 #: Shown as a state: the service did not run.
 NO_RECORDING = "no recording"
 
@@ -85,6 +87,35 @@ class Period:
             getattr(self, name).join(getattr(other, name))
 
 
+@dataclass(frozen=True, slots=True)
+class ProbeShown:
+    """A probe.
+
+    Parameters
+    ----------
+    at_s : float
+        When it was measured, s since 1970 UTC.
+    feature : str
+        Its feature.
+    deformation_um, left_um : float
+        Deformation that it shows, and the error that was left with the offset applied, µm; NaN if it was not read.
+    predicted_um : float
+        Corrected prediction for that time, µm; NaN if it was refused before it was compared.
+    taken : bool
+        Whether it corrects the prediction.
+    code : str
+        Why it was refused, or a remark.
+    """
+
+    at_s: float
+    feature: str
+    deformation_um: float
+    left_um: float
+    predicted_um: float
+    taken: bool
+    code: str
+
+
 @dataclass(slots=True)
 class Missed:
     """Missing values of a channel.
@@ -156,6 +187,7 @@ class History:
         In order of their start.
     curves : dict of str to Envelope
         `offset`, `predicted`, `measured`, `left`, `residual`, `heat`, `share …` and `channel …`.
+        `share probes` is the correction by probes.
     states, reasons : dict of str to Stretches
         When each was active; `no recording` counts as a state.
     reason_seconds : dict of str to float
@@ -168,6 +200,12 @@ class History:
         By channel name.
     events : list of (float, str, str)
         Time, kind and text of the last events.
+    probes : list of ProbeShown
+        The last probes.
+    probes_left : Spread
+        Error that all probes taken have found with the offset applied, µm.
+    probes_count, probes_taken : int
+        Numbers of all probes, and of those that correct the prediction.
     events_count, episodes_count : int
         Numbers of all events and episodes.
     episodes : list of Episode
@@ -186,6 +224,10 @@ class History:
     days: dict[str, Period] = field(default_factory=dict)
     channels: dict[str, Missed] = field(default_factory=dict)
     events: list[tuple[float, str, str]] = field(default_factory=list)
+    probes: list[ProbeShown] = field(default_factory=list)
+    probes_left: Spread = field(default_factory=Spread)
+    probes_count: int = 0
+    probes_taken: int = 0
     events_count: int = 0
     episodes: list[Episode] = field(default_factory=list)
     episodes_count: int = 0

@@ -6,10 +6,23 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from typing import Literal
+
+import numpy as np
 
 from compensator.codes import AuditRemark, RecordingEnd, Remark, State, explain
 from compensator.report.envelope import line_of
-from compensator.report.history import EPISODES, EVENTS, NO_RECORDING, Episode, History, Period, Spread
+from compensator.report.history import (
+    EPISODES,
+    EVENTS,
+    NO_RECORDING,
+    PROBES,
+    Episode,
+    History,
+    Period,
+    ProbeShown,
+    Spread,
+)
 from compensator.report.notation import plain, signed
 from compensator.report.page import (
     Block,
@@ -17,6 +30,7 @@ from compensator.report.page import (
     CodeLink,
     Details,
     Figure,
+    Marks,
     Page,
     Section,
     Span,
@@ -76,7 +90,14 @@ def page_of(history: History) -> Page:
         blocks.append(_reasons(history))
     if history.episodes:
         blocks.append(_episodes(history))
-    blocks += [_shares(history), *_residual(history), *_temperatures(history), *_days(history), _missed(history)]
+    blocks += [
+        _shares(history),
+        *_residual(history),
+        *_probes(history),
+        *_temperatures(history),
+        *_days(history),
+        _missed(history),
+    ]
     blocks += [_events(history), *_other_channels(history), _files(history)]
     return Page(
         title=f"{history.machine or 'Recordings'}: {span(history)}",
@@ -101,6 +122,7 @@ def figures(history: History) -> dict[str, object]:
         "measured_rms_um": _null(whole.measured.rms),
         "left_rms_um": _null(whole.left.rms),
         "models": list(history.models),
+        **_probe_figures(history),
         "events": history.events_count,
         "alarms": history.episodes_count,
     }
@@ -128,6 +150,9 @@ def verdict(history: History) -> str:
         )
     elif whole.offset.samples:
         words += f"; it reached {signed(whole.offset.peak, 1)} µm"
+    if history.probes_left.samples and not whole.left.samples:
+        left = history.probes_left
+        words += f"; {left.samples} probe(s) found {left.rms:.1f} µm rms with the offset applied"
     return f"{words}."
 
 
@@ -235,15 +260,78 @@ def _band(history: History) -> Figure:
 def _shares(history: History) -> Figure:
     curves = {key.removeprefix("share "): key for key in history.curves if key.startswith("share ")}
     note = "Since the zero. The offset is the negative sum, within its limits."
+    if "share probes" in history.curves:
+        note = (
+            "Since the zero. The correction by touch probes (probes) is a share of its own; the offset is the negative "
+            "sum of all shares, within its limits."
+        )
     return _curves(history, "Predicted deformation by path", "Y, µm", curves, note)
 
 
 def _residual(history: History) -> list[Block]:
     residual = history.whole.residual
     if not residual.samples:
+        if history.probes_count:
+            return []
         return [Words(title="Residual", lines=["Y was not measured: there is no residual."])]
     note = f"{residual.rms:.2f} µm rms; the largest is {signed(residual.peak, 1)} µm, {_utc(residual.at_s)}."
     return [_curves(history, "Residual, measured − predicted", "residual, µm", {"residual": "residual"}, note)]
+
+
+def _probes(history: History) -> list[Block]:
+    """Return measured against predicted deformation at the probes, and the probes that were refused."""
+    if not history.probes_count:
+        return []
+    taken = [probe for probe in history.probes if probe.taken]
+    refused = [probe for probe in history.probes if not probe.taken]
+    marks = [_marks("taken", taken, "o"), _marks("refused", refused, "x")]
+    lines = tuple(line_of(name, history.curves[name]) for name in ("predicted",) if name in history.curves)
+    left = history.probes_left
+    note = f"{history.probes_taken} of {history.probes_count} probe(s) taken."
+    if left.samples:
+        note += (
+            f" Remaining error at these, with the offset applied and the probe's own noise: {left.rms:.2f} µm rms, the "
+            f"largest {signed(left.peak, 1)} µm, {_utc(left.at_s)}."
+        )
+    figure = Figure(
+        title="Touch probes, measured against predicted deformation",
+        x_label=TIME,
+        y_label="Y, µm",
+        lines=lines,
+        marks=tuple(mark for mark in marks if mark.x.size),
+        clock=True,
+        note=note,
+        x_limits=(history.first_s, history.last_s),
+    )
+    rows: list[list[Cell]] = [
+        [
+            _utc(probe.at_s),
+            probe.feature or "without a name",
+            plain(probe.deformation_um, 2),
+            plain(probe.predicted_um, 2),
+            signed(probe.left_um, 2),
+            "taken" if probe.taken else "refused",
+            CodeLink(probe.code) if probe.code else "",
+        ]
+        for probe in history.probes
+    ]
+    head = ["time, UTC", "feature", "measured, µm", "predicted, µm", "left with the offset, µm", "", "code"]
+    last = f"The last {PROBES} of {history.probes_count}. " if history.probes_count > PROBES else ""
+    words = "Measured: the deformation, measured value less offset applied. Each feature has its own zero."
+    return [figure, _folded("Probes", head, rows, f"{last}{words}")]
+
+
+def _marks(name: str, probes: Sequence[ProbeShown], marker: Literal["x", "o"]) -> Marks:
+    read = [probe for probe in probes if not math.isnan(probe.deformation_um)]
+    x, y = (np.array([getattr(probe, key) for probe in read]) for key in ("at_s", "deformation_um"))
+    return Marks(name, x, y, marker=marker)
+
+
+def _probe_figures(history: History) -> dict[str, object]:
+    if not history.probes_count:
+        return {}
+    left_um = _null(history.probes_left.rms)
+    return {"probes": history.probes_count, "probes_taken": history.probes_taken, "probes_left_rms_um": left_um}
 
 
 def _temperatures(history: History) -> list[Block]:
@@ -288,7 +376,16 @@ def _figures(history: History) -> Table:
         ["residual, rms", plain(whole.residual.rms, 2), "µm", ""],
         ["samples", str(whole.samples), "", ""],
     ]
+    if history.probes_count:
+        left = history.probes_left
+        rows[-1:-1] = [
+            ["remaining error at the probes, rms", plain(left.rms, 2), "µm", ""],
+            ["largest remaining error at a probe", signed(left.peak, 1), "µm", _at(left)],
+            ["probes taken", f"{history.probes_taken} of {history.probes_count}", "", ""],
+        ]
     note = "" if whole.measured.samples else "Y was not measured: –."
+    if history.probes_count and not whole.measured.samples:
+        note = "Y was measured by touch probes only: a remaining error is known at their times."
     return Table(title="Figures", head=["", "value", "unit", "when"], rows=rows, note=note)
 
 

@@ -148,7 +148,7 @@ class Commands:
         if self._loop is None:
             raise ProbeRefused(ProbeCode.TIME_UNKNOWN, "probe: the service is ending")
         probing.check(received, waiting)
-        return "probe: compared with the prediction at the next sample"
+        return "received; compared with the prediction at the next sample; see thermal/event or watch"
 
     def _check_sender(self, name: str, payload: bytes, sender: Sender) -> None:
         """Refuse a command that is too long, or whose sender may be anyone."""

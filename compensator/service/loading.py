@@ -93,6 +93,12 @@ class Setup:
                 "wanted nearly always."
             )
             found.append(Remark(ServiceWarning.PROBE_TOLERANCE, figures))
+        if probe is not None and probe.measured_max_um < probe.largest_um:
+            figures = (
+                f"probe.measured_max_um = {probe.measured_max_um:g} is below probe.largest_um = {probe.largest_um:g}: "
+                "a probe that shows such an error is refused."
+            )
+            found.append(Remark(ServiceWarning.PROBE_BOUNDS, figures))
         if zenoh.secured():
             now = now or datetime.datetime.now(datetime.UTC)
             wrong = self.certificate.wrong_at(now) if self.certificate is not None else None

@@ -250,9 +250,11 @@ function pictures(machine, history, end) {
   const several = count > 3
     ? [line("effects together", history.effects.map((one) => one.length ? one.reduce((a, b) => a + (b ?? NaN), 0) : null))]
     : Array.from({length: count}, (_, i) => line(effects[i] ?? `effect ${i + 1}`, history.effects.map((one) => one[i] ?? null)));
+  const probes = machine.probe ? [line("probes", history.y_pred_um.map((y, i) => [y, history.y_base_um[i], history.y_dtf_um[i], history.y_tdtf_um[i], ...history.effects[i]].every(known)
+    ? y + history.y_base_um[i] - history.y_dtf_um[i] - history.y_tdtf_um[i] - history.effects[i].reduce((a, b) => a + b, 0) : null))] : [];
   $("pictures").replaceChildren(
     chart(frame, "Offset, added to the commanded Y, with its standard deviation", "µm", [line("offset", history.y_offset_um, history.y_offset_std_um)], history.state),
-    chart(frame, "Predicted deformation by path", "µm", [line("DTF (heat)", history.y_dtf_um), line("TDTF (air)", history.y_tdtf_um), ...several]),
+    chart(frame, "Predicted deformation by path", "µm", [line("DTF (heat)", history.y_dtf_um), line("TDTF (air)", history.y_tdtf_um), ...several, ...probes]),
     chart(frame, "Residual: measured − predicted deformation", "µm", [line("residual", history.residual_um)]),
     chart(frame, "Temperatures", "°C", [line("T_Q", history.t_q_degc), line("AT", history.at_degc)]));
 }

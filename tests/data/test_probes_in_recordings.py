@@ -1,5 +1,7 @@
 """The probes of a recording are its measured Y where no displacement sensor is; refused ones are not."""
 
+import csv
+import datetime
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +10,9 @@ import pytest
 import compensator as tc
 from compensator.data.runs import is_sparse
 from compensator.recording.reading import recordings
+from tests.audit.made import CONFIG
 from tests.service.living import MACHINE
-from tests.service.probed import PROBED, ProbedMachine
+from tests.service.probed import PROBE, PROBED, ProbedMachine
 
 
 def read(machine):
@@ -62,3 +65,41 @@ async def test_only_one_feature_is_used_and_said_so(tmp_path: Path) -> None:
     found = read(machine)
     assert np.isfinite(found.table.columns["y_um"]).sum() == 6
     assert [remark.code for remark in found.remarks] == ["features_left_out"]
+
+
+async def test_an_exported_table_has_the_probes_of_the_recording(tmp_path: Path, caplog) -> None:
+    """What identify and diagnose make of the table is what they make of the recording."""
+    machine = ProbedMachine(tmp_path, noise_um=0.0)
+    machine.each_hour(400, every=30)
+    machine.at_sample[200] = lambda: machine.probe(25.0)  # a chip
+    machine.at_sample[215] = lambda: machine.probe(feature="bore")
+    await machine.run(420)
+    out = tmp_path / "all.csv"
+    assert tc.export(recordings(machine.recordings, MACHINE), out) == 420
+    taken = [probe for probe in machine.recorded() if probe.taken and probe.feature == "sphere-1"]
+    with out.open() as file:
+        rows = [row for row in csv.DictReader(file) if row["y_um"]]
+    assert len(rows) == len(taken) == 12
+    for row, probe in zip(rows, taken, strict=True):
+        end_ns = datetime.datetime.fromisoformat(row["time_utc"]).timestamp() * 1e9
+        assert 0.0 <= end_ns - probe.time_utc_ns < 60e9
+        assert float(row["y_um"]) == probe.deformation_um == probe.measured_um - probe.offset_applied_um
+    assert "features_left_out" in caplog.text
+    (table,), (recorded,) = (
+        tc.read(one).at_period(60.0).records for one in (out, recordings(machine.recordings, MACHINE))
+    )
+    known = np.isfinite(recorded.columns["y_um"])
+    assert np.flatnonzero(np.isfinite(table.columns["y_um"])) == pytest.approx(np.flatnonzero(known), abs=1)
+    assert table.columns["y_um"][np.isfinite(table.columns["y_um"])] == pytest.approx(recorded.columns["y_um"][known])
+
+
+async def test_a_measured_y_is_exported_as_it_was(tmp_path: Path) -> None:
+    machine = ProbedMachine(
+        tmp_path, noise_um=0.0, config=CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0") + PROBE
+    )
+    machine.at_sample[60] = machine.probe
+    await machine.run(90)
+    out = tmp_path / "all.csv"
+    tc.export(recordings(machine.recordings, MACHINE), out)
+    with out.open() as file:
+        assert all(row["y_um"] for row in csv.DictReader(file))

@@ -59,9 +59,20 @@ def test_the_cycle_from_probes_to_a_checked_model(tmp_path, monkeypatch, capsys)
 
 
 def test_codes_and_links_of_the_guide_exist():
-    assert {"probe_mismatch", "quiet_ambient", "short_record", "drifting_mode"} <= set(WORDS)
+    assert {
+        "probe_mismatch",
+        "quiet_ambient",
+        "short_record",
+        "drifting_mode",
+        "twin_modes",
+        "no_offset_source",
+    } <= set(WORDS)
     for code in re.findall(r"`([a-z]+_[a-z_]+)`", TEXT):
-        known = code in WORDS or code.endswith(("_um", "_wanted")) or code in ("y_um",)
+        known = (
+            code in WORDS
+            or code.endswith(("_um", "_wanted"))
+            or code in ("sign_checked", "includes_offset", "applied_file")
+        )
         assert known, code
     for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", TEXT):
         assert (PAGE.parent / link).exists(), link

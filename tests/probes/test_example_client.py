@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from compensator.messages import ProbeRequest
 from tests.receiver.wire import PREFIX, ScriptedService, free_port, router
@@ -25,7 +26,7 @@ def test_it_sends_one_probe_and_prints_the_answer() -> None:
     with router(port), ScriptedService(port) as service:
         begin_ns = time.time_ns()
         done = call(port, "30")
-        assert (done.returncode, done.stdout) == (0, "accepted: heard\n"), done.stderr
+        assert (done.returncode, done.stdout) == (0, "heard\n"), done.stderr
         (payload,) = service.probes
         probe = msgspec.convert(payload, ProbeRequest)
         assert (probe.measured_um, probe.offset_applied_um, probe.feature, probe.axis) == (3.2, -12.3, "sphere-1", "y")
@@ -40,3 +41,21 @@ def test_no_answer_is_no_success() -> None:
     with router(port):
         done = call(port)
     assert done.returncode == 1 and "no answer" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], "expected: python probe.py ENDPOINT"),
+        (["tcp/127.0.0.1:1", PREFIX, "sphere-1", "3.2"], "expected: python probe.py ENDPOINT"),
+        (["tcp/127.0.0.1:1", PREFIX, "sphere-1", "3,2", "0"], "expected: python probe.py ENDPOINT"),
+        (["tcp/127.0.0.1:1", PREFIX, "", "3.2", "0"], "FEATURE is empty"),
+        (["tcp/127.0.0.1:1", PREFIX, "sphere-1", "3.2", "0"], "tcp/127.0.0.1:1: not reached"),
+        (["nonsense", PREFIX, "sphere-1", "3.2", "0"], "nonsense: not reached"),
+    ],
+)
+def test_a_mistake_is_one_line(words: list[str], expected: str) -> None:
+    command = [sys.executable, PROGRAM, *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (1, "") and len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith(expected)

@@ -17,7 +17,7 @@ from compensator.probes.folder import Handled, WatchedFolder
 from compensator.probes.probe import Probe
 from compensator.probes.sender import Outcome
 from compensator.probes.settings import Folder
-from compensator.probes.table import BadLine, columns, row
+from compensator.probes.table import BadLine, NoFeature, columns, row
 from tests.probes.helpers import touch_um
 
 HEADER = "time_utc,measured_um,offset_applied_um,feature,tool,std_um,stopped_s\n"
@@ -255,6 +255,15 @@ def test_a_value_that_cannot_be_used(old: str, new: str, why: str) -> None:
     assert row(NAMES, GOOD).time_utc_ns == T0_NS and old in GOOD
     with pytest.raises(BadLine, match=why):
         row(NAMES, GOOD.replace(old, new, 1))
+
+
+def test_a_file_without_a_header_row_is_told_apart_from_a_wrong_column() -> None:
+    with pytest.raises(BadLine, match="no header row"):
+        columns(GOOD)
+    with pytest.raises(BadLine, match="column 'measured_mm'"):
+        columns(HEADER.replace("measured_um", "measured_mm"))
+    with pytest.raises(NoFeature):
+        row(NAMES, GOOD.replace("sphere-1", ""))
 
 
 @settings(max_examples=100, deadline=None)

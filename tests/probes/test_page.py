@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from compensator.codes import ProbeSourceRemark
-from compensator.probes.dprnt import parse
+from compensator.probes.dprnt import CHECK_UM, parse
 from compensator.probes.table import COLUMNS, columns, row
 from sim_hardware.wire.printing import Maker, formatted
 
@@ -36,6 +36,18 @@ def test_each_makers_macro_prints_a_line_that_is_read(maker: Maker, reading_mm: 
     line = formatted(maker, with_offset, {101: um, 102: -um, 103: -0.0123, 9: 1, 20: 99, 3011: date, 3012: 0})
     found = parse(line)
     assert found is not None and found.offset_um == pytest.approx(-12.3)
+
+
+@pytest.mark.parametrize("maker", ["fanuc", "fanuc-no-blanks", "haas", "mitsubishi"])
+def test_the_line_of_a_calibration_has_the_offset_0(maker: Maker) -> None:
+    (block,) = re.findall(r"<!-- macro without offset -->\n```\nDPRNT\[(.*)\]\n```", TEXT)
+    found = parse(formatted(maker, block, {101: 3.2, 102: -3.2, 9: 1.0, 20: 99.0, 3011: 20260302.0, 3012: 505.0}))
+    assert found is not None and (found.offset_um, found.reading_um) == (0.0, 3.2)
+
+
+def test_the_check_of_a_line_is_as_sharp_as_the_page_states() -> None:
+    (stated,) = re.findall(r"changes the value by more than ([\d.]+) µm", TEXT)
+    assert float(stated) == CHECK_UM
 
 
 def test_the_line_of_the_page_is_read() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from compensator.cli import main
+from compensator.errors import ConfigError
 from compensator.probes.settings import load_probes
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "deploy/probes/probes.example.toml"
@@ -68,7 +69,12 @@ def test_all_sources_with_absolute_paths(tmp_path: Path) -> None:
         ("sign = 1\nsign_checked", "sign_checked", "folder.sign: missing; determine the sign"),
         ("sign = -1\nsign_checked", "sign_checked", "dprnt.sign: missing; determine the sign"),
         ("sign = -1\nsign_checked", "sign = -2\nsign_checked", "dprnt.sign = -2: expected 1 or -1"),
-        ('"2026-03-02, two offsets, J. Novak"', '" "', "folder.sign_checked = '': expected who"),
+        ('"2026-03-02, two offsets, J. Novak"', '" "', "folder.sign_checked = ' ': expected who"),
+        (
+            '"2026-03-02, two offsets, J. Novak"',
+            '"date, who, how"',
+            "folder.sign_checked = 'date, who, how': expected who",
+        ),
         ('address = "192.168.214.10:5062"', "", "dprnt.address = '': expected either address or port"),
         (':5062"', '"', "dprnt.address = '192.168.214.10': expected HOST:PORT"),
         (':5062"', ':99999"', "expected HOST:PORT"),
@@ -111,6 +117,23 @@ def test_check_opens_nothing_and_names_the_sources(tmp_path: Path, capsys: pytes
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_example_can_be_loaded() -> None:
-    settings = load_probes(EXAMPLE)
+def test_check_warns_of_sources_that_may_have_no_offset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "probes.toml"
+    path.write_text(GOOD)
+    assert main(["bridge", "probes", "--config", str(path), "--check"]) == 0
+    said = capsys.readouterr().err
+    assert (
+        said.count("[no_offset_source]") == 4 and "bore.txt: no probes.applied_file: its lines have no offset" in said
+    )
+    path.write_text(GOOD.replace("send_within_s", 'applied_file = "applied.txt"\nsend_within_s'))
+    assert main(["bridge", "probes", "--config", str(path), "--check"]) == 0
+    assert "no_offset_source" not in capsys.readouterr().err
+
+
+def test_the_example_can_be_loaded_once_its_signs_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="sign_checked = 'date, who, how'"):
+        load_probes(EXAMPLE)
+    path = tmp_path / "probes.toml"
+    path.write_text(EXAMPLE.read_text(encoding="utf-8").replace("date, who, how", "2026-03-02, two offsets, J. Novak"))
+    settings = load_probes(path)
     assert settings.folders and settings.dprnt and settings.linuxcnc

@@ -507,7 +507,14 @@ def test_a_tolerance_below_the_noise_of_a_probe_is_warned_of(
     path.write_bytes(text.encode() + PROBE.replace(b"tolerance_um = 3.0", b"tolerance_um = 0.5"))
     assert main(["check", "--config", str(path)]) == 0
     said = capsys.readouterr()
-    assert "probe_tolerance" in said.err and "probes: on, one value ±1 µm, correction at most 40 µm" in said.out
+    assert (
+        "probe_tolerance" in said.err
+        and "probes: on, one value ±1 µm, at most 60 µm, correction at most 40 µm" in said.out
+    )
+    assert "tolerance 0.5 µm" in said.out and "probe_bounds" not in said.err
+    path.write_bytes(text.encode() + PROBE.replace(b"measured_max_um = 60.0", b"measured_max_um = 30.0"))
+    assert main(["check", "--config", str(path)]) == 0
+    assert "[probe_bounds]" in capsys.readouterr().err
 
 
 async def test_the_first_probe_is_asked_for(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from compensator.clock import NS
+from compensator.clock import NS, duration
 from compensator.codes import ProbeCode
 from compensator.config import Probe as ProbeSettings
 from compensator.service.probing.past import offsets_at, predicted_at, published_at
@@ -76,11 +76,11 @@ def _check_time(probe: ReceivedProbe, state: ProbingState, settings: ProbeSettin
     time_ns, samples = probe.request.time_utc_ns, state.samples
     when, late_s = _clock(time_ns), (probe.received_utc_ns - time_ns) / NS
     if late_s < -AHEAD_S:
-        raise ProbeRefused(ProbeCode.FUTURE, f"probe of {when}: {-late_s:.1f} s ahead of the clock here")
+        raise ProbeRefused(ProbeCode.FUTURE, f"probe of {when}: {duration(-late_s)} ahead of the clock here")
     if late_s > 60.0 * settings.oldest_min:
         raise ProbeRefused(
             ProbeCode.TOO_OLD,
-            f"probe of {when}: {late_s / 60.0:.1f} min old, expected at most {settings.oldest_min:g} min",
+            f"probe of {when}: {duration(late_s)} old, expected at most {settings.oldest_min:g} min",
         )
     if any(_is_same(probe, known) for known in state.known):
         raise ProbeRefused(ProbeCode.DUPLICATE, f"probe of {when}: received before")
