@@ -132,15 +132,46 @@ def test_sparse_validation_is_zeroed_by_several_values(found):
     assert part.model.rms_um < 2.2
 
 
-def test_chips_are_left_out_and_said_so(found):
+@pytest.fixture(scope="module")
+def chipped():
     columns = probed()
     at = np.flatnonzero(np.isfinite(columns["y_um"]))[5::40]
     columns["y_um"][at] += 20.0
-    chipped = tc.identify(columns, y_std_um=STD_UM, order=(3, 3, 2))
-    assert f"y_um: {at.size} value(s) far from all others left out" in " ".join(chipped.to_dict()["remarks"])
-    gain, clean = (one.calibration.deformation.main.gain(0)[0] for one in (chipped, found))
+    return tc.identify(columns, y_std_um=STD_UM, order=(3, 3, 2)), at
+
+
+def test_chips_are_left_out_and_named(found, chipped):
+    result, at = chipped
+    (remark,) = [one for one in result.calibration.remarks if one.code == "y_left_out"]
+    assert f"{at.size} of 216 measured y_um do not fit the others" in remark
+    assert "at t_s = " + ", ".join(str(60 * row) for row in at) in remark
+    assert "loose contacts" not in remark
+    gain, clean = (one.calibration.deformation.main.gain(0)[0] for one in (result, found))
     assert gain == pytest.approx(clean, abs=0.02)
-    assert "far from all others" not in " ".join(found.to_dict()["remarks"])
+    assert "do not fit" not in " ".join(found.to_dict()["remarks"])
+
+
+def test_chips_are_no_held_out_data(chipped):
+    result, at = chipped
+    (part,) = result.calibration.parts
+    assert (part.role, part.y_um.size) == ("fitted", 216 - at.size)
+    assert part.model.peak_to_peak_um < 12.0
+    assert "On held-out blocks of time" in result.summary()
+    assert result.calibration.noise["y_um"] == STD_UM
+
+
+@pytest.mark.parametrize("how", ["validate", "fit_until_h"])
+def test_a_chip_in_held_out_data_is_no_error_of_the_model(how):
+    columns, checked = probed(), probed(8, every=60, hours=24.0)
+    data = checked if how == "validate" else columns
+    row = np.flatnonzero(np.isfinite(data["y_um"]))[-9]
+    data["y_um"][row] += 20.0
+    given = {"validate": checked} if how == "validate" else {"fit_until_h": 24.0}
+    result = tc.identify(columns, y_std_um=STD_UM, order=(3, 3, 2), **given)
+    part = next(p for p in result.calibration.parts if p.role == "held out")
+    assert part.model.rms_um < 2.5
+    assert 60.0 * row not in part.t_s
+    assert f"at t_s = {60 * row}." in " ".join(result.to_dict()["remarks"])
 
 
 def test_the_command_takes_the_standard_deviation(tmp_path, capsys):
