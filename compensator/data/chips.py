@@ -38,8 +38,8 @@ def left_out(runs: Sequence[Run], chips: Sequence[Mask]) -> Remark:
     of = sum(int(np.isfinite(run.y_um).sum()) for run in runs)
     where = ", ".join(f"{value:.0f}" for value in t_s[:_SHOWN].tolist())
     more = f" and {t_s.size - _SHOWN} more" if t_s.size > _SHOWN else ""
-    words = f"{t_s.size} of {of} measured y_um do not fit the others and were left out, at t_s = {where}{more}."
-    return Remark(DataRemark.Y_LEFT_OUT, f"{name}: {words}")
+    words = f"{name}: {t_s.size} of {of} measured y_um do not fit the others and were left out"
+    return Remark(DataRemark.Y_LEFT_OUT, f"{words}, at t_s = {where}{more} from the start.")
 
 
 def isolated(residual: Vector, noise_um: float) -> Mask:

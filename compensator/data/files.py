@@ -159,7 +159,9 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
     }
     remarks: tuple[Remark, ...] = ()
     if np.isnan(columns.get("y_um", np.array([np.nan]))).all():
-        probes, remarks = _of_one_feature(str(paths[0]), [probe for _, some in parts for probe in some])
+        shown, untold = _showing_deformation(str(paths[0]), [some for _, some in parts])
+        probes, several = _of_one_feature(str(paths[0]), shown)
+        remarks = (*untold, *several)
         if probes:
             blank = np.full(len(probes), np.nan)
             columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
@@ -169,6 +171,10 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
     order = np.argsort(t_s, kind="stable")
     columns, t_s = {name: values[order] for name, values in columns.items()}, t_s[order]
     return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks
+
+
+#: Why a probe is refused, too, if the control applied nothing.
+_APPLIED_NOTHING = (ProbeCode.MISMATCH, ProbeCode.DURING_HOLD)
 
 
 def _of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tuple[Remark, ...]]:
@@ -181,12 +187,28 @@ def _of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tu
     return [probe for probe in probes if probe.feature == feature], (Remark(DataRemark.FEATURES_LEFT_OUT, words),)
 
 
-def _shows_deformation(probe: Probe) -> bool:
-    """Whether a probe is a measured Y: it was taken, or refused only because the control applied nothing."""
-    if probe.deformation_um is None:
-        return False
-    applied_nothing = probe.code in (ProbeCode.MISMATCH, ProbeCode.DURING_HOLD) and probe.offset_applied_um == 0.0
-    return probe.taken or applied_nothing
+def _showing_deformation(name: str, recordings: Sequence[Sequence[Probe]]) -> tuple[list[Probe], tuple[Remark, ...]]:
+    """Return the probes of recordings that are a measured Y: taken, or refused only because nothing was applied.
+
+    That nothing was applied is believed of a calibration: where others show that an offset was, what a refused probe
+    shows is unknown.
+    """
+    shown: list[Probe] = []
+    untold = 0
+    for probes in recordings:
+        is_calibration = not any(probe.offset_applied_um for probe in probes)
+        for probe in probes:
+            if probe.deformation_um is None:
+                continue
+            applied_nothing = probe.code in _APPLIED_NOTHING and probe.offset_applied_um == 0.0
+            if probe.taken or (applied_nothing and is_calibration):
+                shown.append(probe)
+            else:
+                untold += applied_nothing
+    if not untold:
+        return shown, ()
+    words = f"{name}: {untold} refused probe(s) with offset_applied_um = 0 left out: others show that one was applied."
+    return shown, (Remark(DataRemark.PROBES_LEFT_OUT, words),)
 
 
 def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
@@ -196,7 +218,7 @@ def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
     probes: list[Probe] = []
     for message in messages(path, ("sample", "probe")):
         if isinstance(message, Probe):
-            probes += [message] if _shows_deformation(message) else []
+            probes.append(message)
             continue
         times.append(message.time_utc_ns)
         samples.append(

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from compensator.arrays import Mask, Matrix, Vector
+from compensator.arrays import Indices, Mask, Matrix, Vector
 from compensator.codes import Remark
 from compensator.data.chips import left_out, without
 from compensator.data.runs import Run
@@ -107,7 +107,7 @@ def _spikes(points: Points, values: Sequence[int]) -> Matrix:
     return table
 
 
-def _by_run(evidence: Evidence, at: Vector) -> list[Mask]:
+def _by_run(evidence: Evidence, at: Indices) -> list[Mask]:
     """Return a mask for each run of some samples of all runs, one after another."""
     chips = np.isin(np.arange(evidence.used.size), at)
     return np.split(chips, np.cumsum([run.t_s.size for run in evidence.runs])[:-1])

@@ -19,9 +19,7 @@ def with_time_errors(fit: Fit, errors: list[dict[str, float]]) -> list[dict[str,
 
     Between two values the time of a step changes nothing, so a slope says nothing of it: every interval is tried.
     """
-    return [
-        {**error, AT: _time_error(fit, i, error[AT])} if AT in error else error for i, error in enumerate(errors)
-    ]
+    return [{**error, AT: _time_error(fit, i, error[AT])} if AT in error else error for i, error in enumerate(errors)]
 
 
 def words_of(std: Mapping[str, float], every_min: float) -> str:

@@ -5,7 +5,7 @@ import pytest
 
 import compensator as tc
 from compensator.data.runs import is_sparse, noise_of
-from compensator.errors import DataError, UsageError
+from compensator.errors import CompensatorError, DataError, UsageError
 from compensator.identify.calibration import predict
 from tests.diagnose.scenarios import record, signals
 from tests.identify.quill_runs import fit_pct, runs_from
@@ -51,10 +51,28 @@ def test_the_noise_of_probes_is_asked_for_in_one_line():
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("std_um", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("std_um", [0.0, -1.0, float("nan"), float("inf"), "x", True])
 def test_a_standard_deviation_that_is_none_is_refused(std_um):
-    with pytest.raises(UsageError, match="--y-std"):
-        tc.identify(probed(), y_std_um=std_um)
+    for verb in (
+        lambda: tc.identify(probed(), y_std_um=std_um),
+        lambda: tc.diagnose("quill", probed(), y_std_um=std_um),
+        lambda: tc.simulate("quill", probed(), correct=True, y_std_um=std_um),
+    ):
+        with pytest.raises(UsageError, match=r"--y-std .* \(y_std_um in Python\)"):
+            verb()
+
+
+def test_the_noise_is_asked_for_in_the_same_words():
+    words = set()
+    for verb in (
+        lambda: tc.identify(probed()),
+        lambda: tc.diagnose("quill", probed()),
+        lambda: tc.simulate("quill", probed(), correct=True),
+    ):
+        with pytest.raises(CompensatorError) as refused:
+            verb()
+        words.add(str(refused.value))
+    assert len(words) == 1
 
 
 def test_a_stated_noise_is_used_as_stated_where_neighbours_show_one():
@@ -171,7 +189,7 @@ def test_a_chip_in_held_out_data_is_no_error_of_the_model(how):
     part = next(p for p in result.calibration.parts if p.role == "held out")
     assert part.model.rms_um < 2.5
     assert 60.0 * row not in part.t_s
-    assert f"at t_s = {60 * row}." in " ".join(result.to_dict()["remarks"])
+    assert f"at t_s = {60 * row} from the start." in " ".join(result.to_dict()["remarks"])
 
 
 def test_the_command_takes_the_standard_deviation(tmp_path, capsys):
