@@ -498,6 +498,16 @@ class DataRemark(Code):
         "Single readings far from their neighbours were left out.",
         "Check the sensor for loose contacts and noise.",
     )
+    PROBES_LEFT_OUT = (
+        "probes_left_out",
+        "Refused probes state that no offset was applied, while others of the recording show that offsets were.",
+        "Have the control send the offset that it had applied with each probe.",
+    )
+    Y_LEFT_OUT = (
+        "y_left_out",
+        "Measured values of Y do not fit what the others show and take part in nothing.",
+        "Check these measurements: a chip on the feature, or another feature.",
+    )
     Y_REFUSED = (
         "y_refused",
         "Measured values of Y are further from the prediction than their noise allows and did not correct it.",

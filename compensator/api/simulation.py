@@ -16,7 +16,7 @@ from compensator.codes import DataRemark, Reason, Remark, SampleQuality
 from compensator.data.measurement import DataLike, Measurement, measurements
 from compensator.data.record import SampledRecord, require
 from compensator.data.runs import is_sparse, noise_std
-from compensator.data.screening import DEAD_SAMPLES, check_scale
+from compensator.data.screening import DEAD_SAMPLES, check_scale, check_y_std, y_noise_needed
 from compensator.errors import UsageError
 from compensator.model.corrected_simulation import COLUMNS as CORRECTED_COLUMNS
 from compensator.model.corrected_simulation import CorrectedRun, compared, simulate_corrected
@@ -70,8 +70,7 @@ def simulate(
         If model or data cannot be read, or Y is measured too sparsely to show its noise and `y_std_um` is missing.
     """
     what = model_of(model)
-    if y_std_um is not None and not 0.0 < y_std_um < math.inf:
-        raise UsageError(f"--y-std {y_std_um:g}: expected the standard deviation of one measured Y, above 0 µm")
+    check_y_std(y_std_um)
     measured = measurements(data, "data", columns, needed=True)
     remarks: list[Remark] = []
     parts: list[dict[str, Vector]] = []
@@ -96,7 +95,7 @@ def simulate(
         table={name: _joined(parts, name) for name in order if any(name in part for part in parts)},
         records=len(parts),
         remarks=tuple(remarks),
-        scores=methods[-1][1] if correct else _scores(parts),
+        scores=(methods[-1][1] if methods else None) if correct else _scores(parts),
         beside=dict(methods[:-1]),
     )
     if not any(one.in_frame for one in measured):
@@ -130,10 +129,7 @@ def _y_std(one: Measurement, record: SampledRecord, period_s: float, given: floa
     known = np.isfinite(y)
     if given is None:
         if is_sparse(y) or not known.any():
-            raise UsageError(
-                f"{one.name}: y_um is measured in {np.sum(known)} of {y.size} samples, too sparsely to show its noise; "
-                "expected --y-std UM (y_std_um), the standard deviation of one measured value"
-            )
+            raise UsageError(y_noise_needed(one.name, int(np.sum(known)), y.size))
         return np.full(y.size, max(noise_std(y), _LEAST_STD_UM))
     t_s, values = one.table.t_s - one.table.t_s.min(), one.table.columns["y_um"]
     inside = np.isfinite(values) & (t_s >= record.t_s[0]) & (t_s < record.t_s[-1] + period_s)
@@ -160,9 +156,9 @@ def _methods(runs: list[CorrectedRun]) -> list[tuple[str, Scores]]:
     for run in runs:
         for name, pair in compared(run).items():
             found.setdefault(name, []).append(pair)
-    return [
-        (name, scores(*(np.concatenate(side) for side in zip(*pairs, strict=True)))) for name, pairs in found.items()
-    ]
+    joined = {name: [np.concatenate(side) for side in zip(*pairs, strict=True)] for name, pairs in found.items()}
+    # A single measured value is the zero; nothing is left to compare.
+    return [(name, scores(y, predicted)) for name, (y, predicted) in joined.items() if y.size]
 
 
 def doubts(source: str, model: ThermalModel, record: SampledRecord) -> list[Remark]:

@@ -72,6 +72,8 @@ class SimulationResult(Shown, Mapping[str, Vector]):
             parts.append(Table(title=title, head=["", *SCORE_HEAD], rows=rows))
         elif self.scores is not None:
             parts.append(Table(head=["", *SCORE_HEAD], rows=[["measured − predicted", *self.scores.cells()]]))
+        elif "y_free_um" in self.table:
+            parts.append("No errors: after the first measured Y, which is the zero, none was measured and taken.")
         return [*parts, *warnings_of(self.remarks, "Remarks")]
 
     def summary(self) -> str:

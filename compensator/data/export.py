@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 
 from compensator.atomic_write import atomic_write
-from compensator.data.files import of_one_feature, shows_deformation
+from compensator.data.files import measured_probes
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
 from compensator.recording.reading import machines_in, messages
@@ -65,7 +65,7 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
         for message in messages(recording, ("sample", "estimate", "offset", "probe"), prefix=machine):
             machines.setdefault(message.machine, recording)
             if isinstance(message, Probe):
-                probes += [message] if shows_deformation(message) else []
+                probes.append(message)
                 continue
             if isinstance(message, Sample):
                 periods_s[message.seq] = message.period_s
@@ -95,7 +95,7 @@ def _add_probes(
     """Add `y_um` to the rows in whose time a probe was measured; a probe outside of all samples is left out."""
     if not probes or any(row.get("y_um") is not None for row in rows.values()):
         return
-    probes, remarks = of_one_feature(name, probes)
+    probes, remarks = measured_probes(name, [probes])
     for remark in remarks:
         log.warning("%s", remark.marked)
     ends = sorted((rows[seq]["_ns"], seq) for seq in periods_s)

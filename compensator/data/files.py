@@ -159,7 +159,7 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
     }
     remarks: tuple[Remark, ...] = ()
     if np.isnan(columns.get("y_um", np.array([np.nan]))).all():
-        probes, remarks = of_one_feature(str(paths[0]), [probe for _, some in parts for probe in some])
+        probes, remarks = measured_probes(str(paths[0]), [some for _, some in parts])
         if probes:
             blank = np.full(len(probes), np.nan)
             columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
@@ -171,7 +171,18 @@ def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Ta
     return Table(name=str(paths[0]), t_s=t_s, columns=columns, rows=range(2, t_s.size + 2)), remarks
 
 
-def of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tuple[Remark, ...]]:
+def measured_probes(name: str, recordings: Sequence[Sequence[Probe]]) -> tuple[list[Probe], tuple[Remark, ...]]:
+    """Return the probes of recordings that are a measured Y, those of the feature that has most."""
+    shown, untold = _showing_deformation(name, recordings)
+    probes, several = _of_one_feature(name, shown)
+    return probes, (*untold, *several)
+
+
+#: Why a probe is refused, too, if the control applied nothing.
+_APPLIED_NOTHING = (ProbeCode.MISMATCH, ProbeCode.DURING_HOLD)
+
+
+def _of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tuple[Remark, ...]]:
     """Return the probes of the feature that has most: each feature has a zero of its own."""
     counts = Counter(probe.feature for probe in probes)
     if len(counts) < 2:
@@ -181,12 +192,28 @@ def of_one_feature(name: str, probes: Sequence[Probe]) -> tuple[list[Probe], tup
     return [probe for probe in probes if probe.feature == feature], (Remark(DataRemark.FEATURES_LEFT_OUT, words),)
 
 
-def shows_deformation(probe: Probe) -> bool:
-    """Whether a probe is a measured Y: it was taken, or refused only because the control applied nothing."""
-    if probe.deformation_um is None:
-        return False
-    applied_nothing = probe.code in (ProbeCode.MISMATCH, ProbeCode.DURING_HOLD) and probe.offset_applied_um == 0.0
-    return probe.taken or applied_nothing
+def _showing_deformation(name: str, recordings: Sequence[Sequence[Probe]]) -> tuple[list[Probe], tuple[Remark, ...]]:
+    """Return the probes of recordings that are a measured Y: taken, or refused only because nothing was applied.
+
+    That nothing was applied is believed of a calibration: where others show that an offset was, what a refused probe
+    shows is unknown.
+    """
+    shown: list[Probe] = []
+    untold = 0
+    for probes in recordings:
+        is_calibration = not any(probe.offset_applied_um for probe in probes)
+        for probe in probes:
+            if probe.deformation_um is None:
+                continue
+            applied_nothing = probe.code in _APPLIED_NOTHING and probe.offset_applied_um == 0.0
+            if probe.taken or (applied_nothing and is_calibration):
+                shown.append(probe)
+            else:
+                untold += applied_nothing
+    if not untold:
+        return shown, ()
+    words = f"{name}: {untold} refused probe(s) with offset_applied_um = 0 left out: others show that one was applied."
+    return shown, (Remark(DataRemark.PROBES_LEFT_OUT, words),)
 
 
 def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
@@ -196,7 +223,7 @@ def _read_recording(path: Path) -> tuple[Table, list[Probe]]:
     probes: list[Probe] = []
     for message in messages(path, ("sample", "probe")):
         if isinstance(message, Probe):
-            probes += [message] if shows_deformation(message) else []
+            probes.append(message)
             continue
         times.append(message.time_utc_ns)
         samples.append(

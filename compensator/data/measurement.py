@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_
 from compensator.data.gridding import to_grid
 from compensator.data.record import SampledData, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
+from compensator.data.screening import check_y_std
 from compensator.data.table import Table
 from compensator.errors import DataError, UsageError
 
@@ -277,8 +277,7 @@ def runs_in(
     UsageError
         If the standard deviation is none.
     """
-    if y_std_um is not None and not 0.0 < y_std_um < math.inf:
-        raise UsageError(f"--y-std {y_std_um:g}: expected the standard deviation of one measured Y, above 0 µm")
+    check_y_std(y_std_um)
     gridded = [(measured, measured.at_period(period_s)) for measured in data]
     runs: list[Run] = []
     remarks: list[Remark] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -77,6 +78,10 @@ class Run:
         at, covered = np.flatnonzero(mask), np.zeros(mask.size, dtype=bool)
         covered[at[0] : at[-1] + 1] = True
         return covered
+
+    def without_y(self, mask: Mask) -> Run:
+        """Return the run without some values of Y."""
+        return dataclasses.replace(self, y_um=np.where(mask, np.nan, self.y_um))
 
     @property
     def t_q_degc(self) -> Vector:

@@ -8,7 +8,7 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.data.runs import Run, is_noise, noise_std
-from compensator.errors import DataError
+from compensator.errors import DataError, UsageError
 
 #: Shortest data for a fit, min.
 SHORTEST_MIN = 120.0
@@ -94,10 +94,34 @@ def require_y_noise(name: str, runs: Sequence[Run]) -> None:
     for run in runs:
         count = counts[id(run)]
         if count and run.y_std_um is None and run.has_sparse_y and (few or count >= FEW_VALUES):
-            raise DataError(
-                f"{name}: y_um has {count} value(s) in {run.t_s.size} samples, so its noise does not show; expected "
-                "--y-std UM (y_std_um in Python), the standard deviation of one measured value, such as 1.5"
-            )
+            raise DataError(y_noise_needed(name, count, run.t_s.size))
+
+
+def y_noise_needed(name: str, count: int, of: int) -> str:
+    """Return the question for the noise of a deformation of so many values, whose noise does not show."""
+    return (
+        f"{name}: y_um has {count} value(s) in {of} samples, so its noise does not show; expected "
+        "--y-std UM (y_std_um in Python), the standard deviation of one measured value, such as 1.5"
+    )
+
+
+def check_y_std(y_std_um: float | None) -> None:
+    """Refuse a standard deviation of one measured Y that is none, µm.
+
+    Raises
+    ------
+    UsageError
+        If it is given and no number above 0.
+    """
+    if y_std_um is None:
+        return
+    is_number = isinstance(y_std_um, (int, float, np.number)) and not isinstance(y_std_um, bool)
+    if not is_number or not 0.0 < y_std_um < np.inf:
+        shown = f"{y_std_um:g}" if is_number else repr(y_std_um)
+        raise UsageError(
+            f"--y-std {shown} (y_std_um in Python): expected the standard deviation of one measured Y, a number above "
+            "0 µm"
+        )
 
 
 def screen_temperatures(name: str, runs: Sequence[Run], *, quiet_air: bool = False) -> None:

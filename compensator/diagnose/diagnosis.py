@@ -16,11 +16,14 @@ from compensator.arrays import Indices, Vector
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import advice_of, label
+from compensator.diagnose.chips import without_chips
 from compensator.diagnose.deciding import Deciding, PlannedTest
+from compensator.diagnose.event_time import with_time_errors, words_of
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, with_paths
 from compensator.diagnose.fit import Term, standard_errors
 from compensator.diagnose.hiding import hiding
+from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.outcome import (
     FOLDS,
     HELD_OUT,
@@ -50,6 +53,8 @@ from compensator.progress import ExecutorMap, Progress, unreported
 FAR_OFF = 0.1
 #: Effects are not deployed where held-out blocks are predicted worse with them by more than this factor.
 CONTRADICTS = 1.25
+#: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
+LOWERS = 0.97
 #: How the errors are measured where nothing was known of the paths.
 WITH_PATHS = "; before: the paths of the first model alone, also refitted to the others"
 
@@ -75,23 +80,29 @@ def diagnose(
     DataError
         If there is too little data.
     """
-    evidence = evidence_of(model, runs)
-    if model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um:
-        evidence = evidence.with_free_paths()
+    evidence = _evidence(model, runs)
     progress(0, len(list(evidence.blocks(FOLDS))) + 1)
-    found = findings_of(evidence)
+    found, left_out = findings_of(evidence), list[Remark]()
+    if evidence.noise.freedom:
+        found, left_out = without_chips(found, partial(_evidence, model))
+        evidence = found.search.evidence
     deciding = Deciding(Trials(evidence))
     effects = _effects(found, deciding)
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects]
     held_out = _held_out(found, places, progress, executor_map)
+    few = bool(evidence.noise.freedom)
     beside = found.remainder is not None and found.explains and not evidence.free_paths
     if beside and rms_of(held_out.whole) > rms_of(held_out.named):
         # What explains nothing has to show that it helps.
         found = dataclasses.replace(found, remainder=None)
         held_out = dataclasses.replace(held_out, whole=held_out.named)
+    if few and found.remainder is not None and not _lowers(held_out):
+        # Few values: chance lowers the error of no remainder by much.
+        found = dataclasses.replace(found, remainder=None, explains=True)
+        effects = tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
+        held_out = dataclasses.replace(held_out, whole=held_out.named)
     # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
-    few = bool(evidence.noise.freedom)
     contradicted = not (few or evidence.free_paths) and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
     extended, remarks = (model, ()) if contradicted else _extended(model, found, effects, held_out)
     remainder = None
@@ -127,6 +138,7 @@ def diagnose(
         held_out_after=held_out.whole,
         tried=_ranked(found),
         warnings=(
+            *left_out,
             *remarks,
             *warnings_of(effects, held_out.nothing, held_out.whole, deployed=extended is not model, few=few),
         ),
@@ -136,6 +148,14 @@ def diagnose(
         advice=advice,
         could_hide=could_hide,
     )
+
+
+def _evidence(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
+    """Return the evidence of runs, with free paths where the model is far off."""
+    evidence = evidence_of(model, runs)
+    if model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um:
+        return evidence.with_free_paths()
+    return evidence
 
 
 def _between_undecided(found: Findings, deciding: Deciding) -> list[PlannedTest]:
@@ -231,16 +251,23 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
     after, searched = rms_without(found.responses), search.rms(selection.fit)
     effects = []
     errors = standard_errors(selection.fit)
+    few = bool(evidence.noise.freedom)
+    if few:
+        errors = with_time_errors(selection.fit, errors)
     for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
         signal = found.responses[i]
 
         def test(rival: Candidate, first: Term = term) -> PlannedTest | None:
             return deciding.best(selection.fit, rival.fit, (label(first), label(rival.term)))
 
+        effect = described(term, std, signal, evidence)
+        if few:
+            words = effect.explanation + words_of(std, search.points.period_min)
+            effect = dataclasses.replace(effect, explanation=words)
         effects.append(
             FoundEffect(
                 term=term,
-                effect=described(term, std, signal, evidence),
+                effect=effect,
                 rms_before_um=rms_without([*found.responses[:i], *found.responses[i + 1 :]]),
                 rms_after_um=after,
                 signal=signal,
@@ -311,6 +338,11 @@ def _ceiling(held_out: _HeldOut) -> Ceiling | None:
     )
 
 
+def _lowers(held_out: _HeldOut) -> bool:
+    """Whether the remainder lowers the error on held-out data enough to deploy it from few values."""
+    return rms_of(held_out.whole) < LOWERS * min(rms_of(held_out.named), rms_of(held_out.nothing))
+
+
 def _ranked(found: Findings) -> tuple[tuple[str, float], ...]:
     best: dict[str, float] = {}
     for candidate in found.selection.rivals[0] if found.selection.rivals else ():
@@ -331,5 +363,9 @@ def _verdict(found: Findings, held_out: _HeldOut, extended: ThermalModel) -> Ver
         return "adequate" if is_noise and not evidence.free_paths else "unexplained"
     if not any(observed):
         return "unexplained"
-    holds = bool(evidence.noise.freedom) or rms_of(held_out.whole) <= rms_of(held_out.nothing)
+    holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)
+    if evidence.noise.freedom:
+        # What few values were fitted by is judged by those that it was not fitted to.
+        level = VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count)
+        holds = holds and rms_of(held_out.whole) ** 2 <= level
     return "explained" if is_noise and holds and all(observed) and found.explains else "partly_explained"

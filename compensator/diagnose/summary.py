@@ -43,6 +43,8 @@ _DOES_NOT_HOLD = (
     "The model lacks an effect; the best explanation found increases the error on held-out data, so the model was "
     "left unchanged."
 )
+#: The same of few values, which do not decide what is deployed.
+_NOT_FORETOLD = "The model lacks an effect; the best explanation found does not predict held-out values."
 #: The verdict if the effects found explain clearly less than the channels can, whatever a remainder corrects.
 _FALLS_SHORT = "Some of the missing effects were found; the channels show more than these explain."
 
@@ -145,6 +147,8 @@ def verdict(found: Mapping[str, Any]) -> str:
         words = _UNDECIDED.format(names=" or ".join(names)) if names else _CANNOT_SHOW
     if ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
+    elif ModelWarning.NOT_CONFIRMED in found["warning_codes"] and "could_hide" in found:
+        words = _NOT_FORETOLD
     elif found["verdict"] == "explained" and falls_short(found):
         words = _FALLS_SHORT
     before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
@@ -174,18 +178,21 @@ def hiding_lines(found: Mapping[str, Any]) -> list[str]:
     hides = found.get("could_hide")
     if not hides or (found["verdict"] == "unexplained" and not _cannot_show(found)):
         return []
-    first, *others = [f"{_HIDDEN[one['kind']].format(**one)} of {one['size_um']:.1f} µm" for one in hides["what"]]
+    first, *others = [
+        f"{_HIDDEN[one['kind']].format(**one)} of {one['size_um']:.1f} µm peak to peak" for one in hides["what"]
+    ]
     beside = " beside the effects found" if found["effects"] else ""
+    limit = f"{hides['matters_um']:.1f} µm, a tenth of Y's movement"
     lines = [
-        f"With {hides['values']} values, one each {hides['every_min']:g} min, {first} (peak to peak over the record) "
-        f"could act{beside} without being seen."
+        f"With {hides['values']} values, one each {hides['every_min']:g} min, {first} could act{beside} without being "
+        f"seen (limit for an adequate model: {limit})."
     ]
     if others:
         lines.append(f"Or {', '.join(others)}. What comes and goes between two values does not show at all.")
     if hides["too_much"]:
         lines.append(
-            f"That is more than {hides['matters_um']:.1f} µm, a tenth of Y's movement: about {hides['values_needed']} "
-            "values like these are needed, or as many with less noise."
+            f"That is more than the limit: about {hides['values_needed']} values like these are needed, or as many "
+            "with less noise."
         )
     return lines
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import Mask, Vector
-from compensator.codes import DataRemark, Remark
+from compensator.codes import Remark
+from compensator.data.chips import CHIP_DEVIATIONS, isolated, left_out, without
 from compensator.data.runs import Run, noise_of, noise_std, walk_std
 from compensator.data.screening import screen
 from compensator.errors import DataError
@@ -30,8 +31,6 @@ LEAST_AT_WALK_K = 0.1
 ZERO_S = 3600.0
 #: Where Y is measured now and then, at least so many values make the zero.
 ZERO_VALUES = 5
-#: There, a value so many deviations away from the fit is a chip on the feature.
-CHIP_DEVIATIONS = 5.0
 #: How far the range of validity exceeds the data: share of its range, and at least, K.
 BEYOND_SHARE, BEYOND_K = 0.33, 2.0
 
@@ -223,8 +222,8 @@ def calibrate(
     deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
     chips = _chips(runs, deformation)
     if any(chip.any() for chip in chips):
-        used = [mask & ~chip for mask, chip in zip(used, chips, strict=True)]
-        remarks = (*remarks, _left_out(data, chips))
+        remarks = (*remarks, left_out(runs, chips))
+        runs, used = without(runs, chips), [mask & ~chip for mask, chip in zip(used, chips, strict=True)]
         deformation = fit_deformation(runs, used, drives, settings, period_s=period_s, etve=etve, progress=progress)
     chosen = next(c for c in deformation.candidates if c.chosen)
     noise = noise_of(runs)
@@ -246,6 +245,8 @@ def calibrate(
         held_out_rms_um=own_um if sparse else chosen.rms,
         provenance=dict(provenance or {}),
     )
+    runs, checked, missed = _without_isolated(model, deformation, runs, used, [*later, *validation])
+    remarks = (*remarks, *missed)
     fixed = (temperature.remark,) if temperature and temperature.remark else ()
     return Calibration(
         model=model,
@@ -255,7 +256,7 @@ def calibrate(
         drives=tuple(drives),
         temperature=temperature,
         deformation=deformation,
-        parts=tuple(_parts(model, deformation, runs, used, [*later, *validation])),
+        parts=tuple(_parts(model, deformation, runs, used, checked)),
         folds_rms_um=chosen.rms,
         noise=noise,
         remarks=(*remarks, *fixed, *deformation.remarks),
@@ -273,11 +274,6 @@ def _chips(runs: Sequence[Run], deformation: DeformationFit) -> list[Mask]:
     noise = (*(run.y_noise_um for run in runs), float(np.median(np.abs(left))) / 0.6745)
     limit = CHIP_DEVIATIONS * max(noise)
     return [np.asarray(np.abs(residual) > limit) for residual in residuals]
-
-
-def _left_out(data: str, chips: Sequence[Mask]) -> Remark:
-    count = sum(int(chip.sum()) for chip in chips)
-    return Remark(DataRemark.WILD_READINGS, f"{data}: y_um: {count} value(s) far from all others left out.")
 
 
 def _own_error_um(deformation: DeformationFit, rms_um: float, noise_um: float) -> float:
@@ -385,6 +381,29 @@ def _parts(
         predicted += float(np.mean((run.y_um - predicted)[_zero_of(run)]))
         parts.append(_part(run, predicted, np.isfinite(run.y_um), "held out", model.period_s))
     return parts
+
+
+def _without_isolated(
+    model: ThermalModel,
+    deformation: DeformationFit,
+    runs: Sequence[Run],
+    used: Sequence[Mask],
+    checked: Sequence[Run],
+) -> tuple[list[Run], list[Run], tuple[Remark, ...]]:
+    """Return fitted and other runs without the chips among sparse values that took no part in the fit."""
+    nothing = [np.zeros(run.t_s.size, dtype=bool) for run in checked]
+    held_out = [(run, deformation.main.free_decay(i, run.t_s.size), used[i]) for i, run in enumerate(runs)]
+    held_out += [(run, np.zeros(run.t_s.size), mask) for run, mask in zip(checked, nothing, strict=True)]
+    chips = []
+    for run, decay, mask in held_out:
+        chip = np.zeros(run.t_s.size, dtype=bool)
+        if run.has_sparse_y and (np.isfinite(run.y_um) & ~mask).any():
+            chip = isolated(run.y_um - predict(model, run) - decay, run.y_noise_um) & ~mask
+        chips.append(chip)
+    every = [run for run, _, _ in held_out]
+    remarks = (left_out(every, chips),) if any(chip.any() for chip in chips) else ()
+    every = without(every, chips)
+    return every[: len(runs)], every[len(runs) :], remarks
 
 
 def _zero_of(run: Run) -> Mask:

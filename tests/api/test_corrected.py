@@ -172,7 +172,7 @@ def test_the_deviation_is_asked_for_where_y_cannot_show_it(machine, tmp_path):
     table, *_ = machine
     path = write(tmp_path / "run.csv", table)
     code, _, errors = run("simulate", path, "--model", "quill", "--correct", "--out", tmp_path / "out.csv")
-    assert code == 2 and errors.count("\n") == 1 and "--y-std" in errors and "24 of 1440" in errors
+    assert code == 2 and errors.count("\n") == 1 and "--y-std" in errors and "24 value(s) in 1440 samples" in errors
     for wrong in ("0", "-1", "nan", "inf"):
         words = ["--model", "quill", "--correct", f"--y-std={wrong}", "--out", tmp_path / "out.csv"]
         code, _, errors = run("simulate", path, *words)
@@ -193,3 +193,14 @@ def test_without_y_there_is_nothing_to_correct_by(machine):
     inputs = {name: values for name, values in table.items() if name != "y_um"}
     with pytest.raises(tc.CompensatorError, match="no column y_um"):
         tc.simulate("quill", inputs, correct=True, y_std_um=1.5)
+
+
+def test_a_single_measured_value_is_the_zero_and_judges_nothing(machine):
+    table, *_ = machine
+    first = np.flatnonzero(np.isfinite(table["y_um"]))[0]
+    one = table | {"y_um": np.where(np.arange(table["t_s"].size) == first, table["y_um"], np.nan)}
+    found = tc.simulate("quill", one, correct=True, y_std_um=STD_UM)
+    assert found.scores is None and found.beside == {}
+    assert "nan" not in found.summary()
+    assert "No errors: after the first measured Y" in found.summary()
+    assert set(found.to_dict()) == {"samples", "records"}

@@ -103,3 +103,17 @@ async def test_a_measured_y_is_exported_as_it_was(tmp_path: Path) -> None:
     tc.export(recordings(machine.recordings, MACHINE), out)
     with out.open() as file:
         assert all(row["y_um"] for row in csv.DictReader(file))
+
+
+async def test_a_mismatch_among_probes_with_an_offset_is_no_measured_y(tmp_path: Path) -> None:
+    """A probe that states 0 while the offset acts shows what is left, not the deformation."""
+    machine = ProbedMachine(tmp_path, noise_um=0.0)
+    machine.each_hour(400)
+    machine.at_sample[200] = lambda: machine.probe(offset_applied_um=0.0)
+    await machine.run(420)
+    assert machine.codes().count("probe_mismatch") == 1
+    found = read(machine)
+    assert np.isfinite(found.table.columns["y_um"]).sum() == machine.codes().count("taken")
+    (remark,) = found.remarks
+    assert remark.code == "probes_left_out"
+    assert "1 refused probe(s) with offset_applied_um = 0" in remark

@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 
 import compensator as tc
+from compensator.diagnose import diagnosis
+from compensator.diagnose.background import Background
 from compensator.diagnose.evidence import evidence_of
+from compensator.diagnose.findings import findings_of
 from compensator.diagnose.hiding import hiding
 from compensator.diagnose.likelihood import Likelihood, Points, Rest, Whitening
 from compensator.diagnose.search import Search
 from compensator.errors import DataError
 from compensator.model.model_file import load_model
+from compensator.report.diagnosis import tone_of
 from tests.diagnose.scenarios import draw, lag, record
 from tests.identify.quill_runs import runs_from
 
@@ -25,6 +29,14 @@ def probed(kind, seed, *, hours=48.0, every=60, std_um=STD_UM, size_um=4.0):
     y, at = np.full(true.size, np.nan), np.arange(every, true.size, every)
     y[at] = true[at] + np.random.default_rng([seed, 5]).normal(0.0, std_um, at.size)
     return {"t_s": np.arange(true.size) * 60.0} | columns | {"y_um": y}
+
+
+def chipped(columns, chips):
+    """The same with some values off: number of the value, µm."""
+    at, y = np.flatnonzero(np.isfinite(columns["y_um"])), columns["y_um"].copy()
+    for value, um in chips.items():
+        y[at[value]] += um
+    return columns | {"y_um": y}, [60 * int(at[value]) for value in chips]
 
 
 def runs(columns, std_um=STD_UM):
@@ -177,3 +189,97 @@ def test_a_model_from_probes_grants_no_error_of_the_size_of_their_noise():
     evidence = evidence_of(model, runs(probed("none", 1)))
     assert evidence.noise.own_error_um == pytest.approx(0.3)
     assert Points(evidence).own_um < 0.5
+
+
+@pytest.mark.parametrize("chips", [{30: 20.0}, {8: -20.0, 30: 20.0}])
+def test_a_chip_spoils_no_all_clear_and_is_named(quiet, chips):
+    columns, times = chipped(probed("none", 1), chips)
+    why = tc.diagnose("quill", columns, y_std_um=STD_UM)
+    found = why.to_dict()
+    assert (found["verdict"], found["effects"]) == ("adequate", [])
+    assert found["could_hide"]["values"] == 47 - len(chips)
+    assert found["could_hide"]["matters_um"] == pytest.approx(quiet.to_dict()["could_hide"]["matters_um"], rel=0.05)
+    assert found["warning_codes"] == ["y_left_out"]
+    words = f"{len(chips)} of 47 measured y_um do not fit the others"
+    assert words in found["warnings"][0]
+    assert f"at t_s = {', '.join(map(str, times))} from the start" in found["warnings"][0]
+    assert why.diagnosis.before.peak_to_peak_um < 10.0
+
+
+@pytest.mark.parametrize("value", [0, 20, 46])
+def test_a_chip_does_not_change_what_is_named(gain, value):
+    columns, _ = chipped(probed("gain DTF", 1), {value: 20.0})
+    why = tc.diagnose("quill", columns, y_std_um=STD_UM)
+    assert [effect.place for effect in why.effects] == [effect.place for effect in gain.effects]
+    assert why.effects[0].named["change"] == pytest.approx(gain.effects[0].named["change"], abs=0.02)
+    # The unknown initial state takes a chip of the first value.
+    assert value == 0 or "y_left_out" in why.to_dict()["warning_codes"]
+
+
+@pytest.mark.parametrize(
+    "chips",
+    [
+        {45: 20.0, 46: 20.0},
+        {20: 20.0, 21: 21.0},
+        {12: 15.0, 13: 15.0, 14: 15.0},
+        {3 * k: 20.0 for k in range(1, 9)},
+    ],
+    ids=["step at the end", "two in a row", "acts for 3 h", "more than a tenth"],
+)
+def test_what_several_values_show_is_no_chip(chips):
+    columns, _ = chipped(probed("none", 1), chips)
+    found = tc.diagnose("quill", columns, y_std_um=STD_UM).to_dict()
+    assert "y_left_out" not in found["warning_codes"]
+    assert found["verdict"] != "adequate"
+
+
+def test_a_clean_record_and_a_step_lose_no_value(quiet, gain):
+    step = tc.diagnose("quill", probed("step", 1, size_um=8.0), y_std_um=STD_UM)
+    assert [effect.kind for effect in step.effects] == ["step"]
+    for why in (quiet, gain, step):
+        assert "y_left_out" not in why.to_dict()["warning_codes"]
+
+
+def test_nothing_is_explained_where_held_out_values_contradict():
+    """A source that switches each 90 min, seen once an hour: no effect with a name foretells it."""
+    columns = probed("none", 1)
+    columns["y_um"] = columns["y_um"] + 8.0 * (columns["t_s"] % 10800.0 < 5400.0)
+    why = tc.diagnose("quill", columns, y_std_um=STD_UM)
+    found = why.to_dict()
+    assert found["after"]["rms_um"] > found["before"]["rms_um"]
+    assert found["verdict"] in ("partly_explained", "unexplained")
+    assert tone_of(found) != "good"
+    assert "were found" not in why.summary().partition("\n")[0]
+
+
+def test_a_step_is_known_no_better_than_the_time_between_two_values():
+    why = tc.diagnose("quill", probed("step", 1, size_um=8.0), y_std_um=STD_UM)
+    (effect,) = why.effects
+    assert 60.0 / 12.0**0.5 <= effect.std["at_min"] < 60.0
+    assert f"± {effect.std['at_min']:.0f} min: values lie 60 min apart" in effect.explanation
+
+
+def test_a_remainder_that_helps_nothing_is_not_deployed(monkeypatch):
+    def replaced(evidence, **given):
+        """All channels in place of the gain: as good, and no better."""
+        found = findings_of(evidence, **given)
+        points, rest = found.search.points, found.selection.before.rest
+        everything = Background(evidence).fitted(points, np.zeros(points.used.size), rest)
+        return dataclasses.replace(found, remainder=everything, explains=False)
+
+    monkeypatch.setattr(diagnosis, "findings_of", replaced)
+    why = tc.diagnose("quill", probed("gain DTF", 1), y_std_um=STD_UM)
+    found = why.to_dict()
+    assert found["remainder"] is None
+    assert found["after"]["rms_um"] < found["before"]["rms_um"]
+    assert [effect.kind for effect in why.model.effects] == ["gain"]
+    assert "remainder is deployed" not in why.summary()
+
+
+def test_what_could_hide_is_said_with_its_limit(quiet):
+    sentence = quiet.summary().partition("\n")[0]
+    limit = quiet.to_dict()["could_hide"]["matters_um"]
+    assert f"limit for an adequate model: {limit:.1f} µm, a tenth of Y's movement" in sentence
+    (hidden,) = [part for part in quiet.contents() if getattr(part, "title", "") == "What could hide"]
+    sizes = [one["size_um"] for one in quiet.to_dict()["could_hide"]["what"]]
+    assert all(f"{size:.1f} µm peak to peak" in " ".join(hidden.lines) for size in sizes)

@@ -5,7 +5,7 @@ import pytest
 
 import compensator as tc
 from compensator.data.runs import is_sparse, noise_of
-from compensator.errors import DataError, UsageError
+from compensator.errors import CompensatorError, DataError, UsageError
 from compensator.identify.calibration import predict
 from tests.diagnose.scenarios import record, signals
 from tests.identify.quill_runs import fit_pct, runs_from
@@ -51,10 +51,28 @@ def test_the_noise_of_probes_is_asked_for_in_one_line():
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("std_um", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("std_um", [0.0, -1.0, float("nan"), float("inf"), "x", True])
 def test_a_standard_deviation_that_is_none_is_refused(std_um):
-    with pytest.raises(UsageError, match="--y-std"):
-        tc.identify(probed(), y_std_um=std_um)
+    for verb in (
+        lambda: tc.identify(probed(), y_std_um=std_um),
+        lambda: tc.diagnose("quill", probed(), y_std_um=std_um),
+        lambda: tc.simulate("quill", probed(), correct=True, y_std_um=std_um),
+    ):
+        with pytest.raises(UsageError, match=r"--y-std .* \(y_std_um in Python\)"):
+            verb()
+
+
+def test_the_noise_is_asked_for_in_the_same_words():
+    words = set()
+    for verb in (
+        lambda: tc.identify(probed()),
+        lambda: tc.diagnose("quill", probed()),
+        lambda: tc.simulate("quill", probed(), correct=True),
+    ):
+        with pytest.raises(CompensatorError) as refused:
+            verb()
+        words.add(str(refused.value))
+    assert len(words) == 1
 
 
 def test_a_stated_noise_is_used_as_stated_where_neighbours_show_one():
@@ -132,15 +150,46 @@ def test_sparse_validation_is_zeroed_by_several_values(found):
     assert part.model.rms_um < 2.2
 
 
-def test_chips_are_left_out_and_said_so(found):
+@pytest.fixture(scope="module")
+def chipped():
     columns = probed()
     at = np.flatnonzero(np.isfinite(columns["y_um"]))[5::40]
     columns["y_um"][at] += 20.0
-    chipped = tc.identify(columns, y_std_um=STD_UM, order=(3, 3, 2))
-    assert f"y_um: {at.size} value(s) far from all others left out" in " ".join(chipped.to_dict()["remarks"])
-    gain, clean = (one.calibration.deformation.main.gain(0)[0] for one in (chipped, found))
+    return tc.identify(columns, y_std_um=STD_UM, order=(3, 3, 2)), at
+
+
+def test_chips_are_left_out_and_named(found, chipped):
+    result, at = chipped
+    (remark,) = [one for one in result.calibration.remarks if one.code == "y_left_out"]
+    assert f"{at.size} of 216 measured y_um do not fit the others" in remark
+    assert "at t_s = " + ", ".join(str(60 * row) for row in at) in remark
+    assert "loose contacts" not in remark
+    gain, clean = (one.calibration.deformation.main.gain(0)[0] for one in (result, found))
     assert gain == pytest.approx(clean, abs=0.02)
-    assert "far from all others" not in " ".join(found.to_dict()["remarks"])
+    assert "do not fit" not in " ".join(found.to_dict()["remarks"])
+
+
+def test_chips_are_no_held_out_data(chipped):
+    result, at = chipped
+    (part,) = result.calibration.parts
+    assert (part.role, part.y_um.size) == ("fitted", 216 - at.size)
+    assert part.model.peak_to_peak_um < 12.0
+    assert "On held-out blocks of time" in result.summary()
+    assert result.calibration.noise["y_um"] == STD_UM
+
+
+@pytest.mark.parametrize("how", ["validate", "fit_until_h"])
+def test_a_chip_in_held_out_data_is_no_error_of_the_model(how):
+    columns, checked = probed(), probed(8, every=60, hours=24.0)
+    data = checked if how == "validate" else columns
+    row = np.flatnonzero(np.isfinite(data["y_um"]))[-9]
+    data["y_um"][row] += 20.0
+    given = {"validate": checked} if how == "validate" else {"fit_until_h": 24.0}
+    result = tc.identify(columns, y_std_um=STD_UM, order=(3, 3, 2), **given)
+    part = next(p for p in result.calibration.parts if p.role == "held out")
+    assert part.model.rms_um < 2.5
+    assert 60.0 * row not in part.t_s
+    assert f"at t_s = {60 * row} from the start." in " ".join(result.to_dict()["remarks"])
 
 
 def test_the_command_takes_the_standard_deviation(tmp_path, capsys):

@@ -1,0 +1,113 @@
+"""Values of Y measured now and then that do not fit: a chip on the feature, another feature.
+
+A single value is left out if all others, with the best explanation found without it, make it improbable by the noise
+that is stated and the rest that is learned. What several values show, one after another, is no chip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from compensator.arrays import Indices, Mask, Matrix, Vector
+from compensator.codes import Remark
+from compensator.data.chips import left_out, without
+from compensator.data.runs import Run
+from compensator.diagnose.evidence import LEAST_VALUES, Evidence
+from compensator.diagnose.findings import Findings, findings_of
+from compensator.diagnose.fit import Fit, fit_terms
+from compensator.diagnose.likelihood import Likelihood, Points, Rest, dense
+
+#: A value so many deviations away from what the others predict is suspected; one so many away is left out.
+SUSPECTED, IMPROBABLE = 3.0, 4.5
+#: Most values that are left out, as a share of all: more of them are something that acts.
+MOST_SHARE = 0.1
+#: A value that is left out may be anything: so many times the spread of the deformation.
+ANYTHING = 100.0
+
+
+def without_chips(
+    found: Findings, evidence_without: Callable[[Sequence[Run]], Evidence]
+) -> tuple[Findings, list[Remark]]:
+    """Search again without the values that do not fit, and return what that finds with a remark on them.
+
+    Parameters
+    ----------
+    found : Findings
+        What was found with every value.
+    evidence_without : callable
+        Returns the evidence of runs.
+    """
+    evidence = found.search.evidence
+    points, at = found.search.points, np.flatnonzero(evidence.used)
+    most = min(max(1, int(MOST_SHARE * at.size)), at.size - LEAST_VALUES)
+    for fit in (found.selection.fit, found.selection.before):
+        suspects = _suspects(fit, most)
+        while suspects:
+            runs = without(evidence.runs, _by_run(evidence, at[suspects]))
+            again = findings_of(evidence_without(runs))
+            chips = _improbable(points, again.selection.fit, suspects)
+            if chips == suspects:
+                return again, [left_out(evidence.runs, _by_run(evidence, at[chips]))]
+            suspects = chips
+    return found, []
+
+
+def _suspects(fit: Fit, most: int) -> list[int]:
+    """Return the values that lie far from what all others predict, the worst first; none if there are too many."""
+    points, found = fit.likelihood.points, list[int]()
+    rest = fit.rest
+    while True:
+        columns = np.column_stack([fit.columns, _spikes(points, found)])
+        away = _deviations(points, rest, columns, fit.fixed)[0]
+        away[found] = 0.0
+        worst = int(np.argmax(np.abs(away)))
+        if abs(away[worst]) < SUSPECTED:
+            return sorted(found)
+        if len(found) == most:
+            return []
+        found.append(worst)
+        rest = points.settled(np.column_stack([columns, _spikes(points, [worst])]), fit.fixed, rest)
+
+
+def _improbable(points: Points, fit: Fit, suspects: list[int]) -> list[int]:
+    """Return which of some values are improbable by a fit without them, and agree with no suspect beside them."""
+    whole = fit_terms(Likelihood(points, fit.rest), fit.starts(), evaluations=1)
+    away, missed = np.zeros(len(suspects)), np.zeros(len(suspects))
+    for k, one in enumerate(suspects):
+        others = _spikes(points, [other for other in suspects if other != one])
+        deviations, innovations = _deviations(points, fit.rest, np.column_stack([whole.columns, others]), whole.fixed)
+        away[k], missed[k] = deviations[one], innovations[one]
+    agree = IMPROBABLE * np.sqrt(2.0) * points.evidence.probe_um
+    kept = []
+    for k, one in enumerate(suspects):
+        beside = [j for j, other in enumerate(suspects) if abs(other - one) == 1]
+        if abs(away[k]) > IMPROBABLE and not any(abs(missed[j] - missed[k]) < agree for j in beside):
+            kept.append(one)
+    return kept
+
+
+def _deviations(points: Points, rest: Rest, columns: Matrix, fixed: Vector) -> tuple[Vector, Vector]:
+    """Return how far each value is from what all others predict: in standard deviations, and in µm."""
+    likelihood = Likelihood(points, rest)
+    table = dense(likelihood)
+    precision = table.T @ table
+    turned = precision @ columns
+    inner = np.eye(columns.shape[1]) + columns.T @ turned
+    precision = precision - turned @ np.linalg.solve(inner, turned.T)
+    by_others, known = precision @ (points.residual - fixed), np.maximum(np.diag(precision), 1e-12)
+    return by_others / np.sqrt(known), by_others / known
+
+
+def _spikes(points: Points, values: Sequence[int]) -> Matrix:
+    """Return a column for each of some values that lets it be anything."""
+    table = np.zeros((points.used.size, len(values)))
+    table[list(values), range(len(values))] = ANYTHING * points.spread_um
+    return table
+
+
+def _by_run(evidence: Evidence, at: Indices) -> list[Mask]:
+    """Return a mask for each run of some samples of all runs, one after another."""
+    chips = np.isin(np.arange(evidence.used.size), at)
+    return np.split(chips, np.cumsum([run.t_s.size for run in evidence.runs])[:-1])
