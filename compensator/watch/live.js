@@ -247,7 +247,7 @@ function pictures(machine, history, end) {
   const frame = {from, end, width, t: history.t_s};
   const line = (name, y, band) => ({name, y, band});
   const count = Math.max(0, ...history.effects.map((one) => one.length));
-  const several = count > 3
+  const several = count > (machine.probe ? 2 : 3)
     ? [line("effects together", history.effects.map((one) => one.length ? one.reduce((a, b) => a + (b ?? NaN), 0) : null))]
     : Array.from({length: count}, (_, i) => line(effects[i] ?? `effect ${i + 1}`, history.effects.map((one) => one[i] ?? null)));
   const probes = machine.probe ? [line("probes", history.y_pred_um.map((y, i) => [y, history.y_base_um[i], history.y_dtf_um[i], history.y_tdtf_um[i], ...history.effects[i]].every(known)

@@ -200,6 +200,18 @@ def test_simulate_scores_the_published_model_on_itself(tmp_path: Path, capsys: p
     assert float(columns["heat_w"][250]) == pytest.approx(90.0, abs=0.5)
 
 
+def test_simulate_takes_several_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tables, outs = [tmp_path / "one.csv", tmp_path / "two.csv"], []
+    for path in tables:
+        write_run(path)
+    for i, given in enumerate(([tables[0]], tables)):
+        outs.append(tmp_path / f"out-{i}.csv")
+        assert main(["simulate", *map(str, given), "--model", "quill", "--out", str(outs[i])]) == 0
+    one, both = (out.read_text().splitlines() for out in outs)
+    assert both == one + one[1:]  # each run begins at rest
+    assert main(["simulate", *map(str, tables), "--model", "quill", "--out", str(tables[1])]) == 2
+
+
 def test_simulate_takes_roles_and_reports_gaps_and_disorder(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:

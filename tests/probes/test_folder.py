@@ -144,7 +144,7 @@ def test_old_lines_are_counted_and_not_sent(tmp_path: Path) -> None:
     bench.minute = 60.0
     bench.write(HEADER + "".join(line(minute) for minute in range(50)))
     assert bench.minutes == [45, 46, 47, 48, 49]
-    assert len(bench.reports) == 1 and "45 line(s) older than 900 s" in bench.reports[0]
+    assert len(bench.reports) == 1 and "45 line(s) older than 15 min" in bench.reports[0]
 
 
 def test_what_was_not_answered_yet_is_sent_again_after_a_restart_only(tmp_path: Path) -> None:

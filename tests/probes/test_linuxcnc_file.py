@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -150,3 +151,11 @@ def test_no_content_ends_the_reading(tmp_path: Path) -> None:
     bench.file.poll()
     bench.write(line(50.001))
     assert len(bench.probes) == 1
+
+
+def test_the_shipped_cycle_does_not_start_the_spindle_with_the_probe_in_it() -> None:
+    """M72 restores the spindle that M70 has saved, so it is stopped before."""
+    shipped = Path(__file__).resolve().parents[2] / "deploy/linuxcnc/thermal_probe.ngc"
+    blocks = re.sub(r"\([^)]*\)", "", shipped.read_text(encoding="utf-8")).split()
+    assert blocks.index("M5") < blocks.index("M70") < blocks.index("M72")
+    assert not {"M3", "M4"} & set(blocks)
