@@ -7,7 +7,7 @@ that is stated and the rest that is learned. What several values show, one after
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -42,19 +42,45 @@ def without_chips(
     evidence_without : callable
         Returns the evidence of runs.
     """
+    evidence, points = found.search.evidence, found.search.points
+    at = np.flatnonzero(evidence.used)
+    most = min(max(1, int(MOST_SHARE * at.size)), at.size - LEAST_VALUES)
+    better: Findings | None = found
+    while better is not None:
+        found, chips = better, np.flatnonzero(~_is_used(better, at)).tolist()
+        better = _without_more(found, evidence_without, most - len(chips))
+    if not chips:
+        return found, []
+    missed = _improbable(points, found.selection.fit, chips)[1]
+    return found, [left_out(evidence.runs, _by_run(evidence, at[chips]), _alike(missed, _agree_um(points)))]
+
+
+def _is_used(found: Findings, at: Indices) -> Mask:
+    """Return which of some samples take part in what was found."""
+    return np.asarray(found.search.evidence.used[at])
+
+
+def _without_more(found: Findings, evidence_without: Callable[[Sequence[Run]], Evidence], most: int) -> Findings | None:
+    """Return what is found without some values that do not fit; None if there are none, or too many."""
     evidence = found.search.evidence
     points, at = found.search.points, np.flatnonzero(evidence.used)
-    most = min(max(1, int(MOST_SHARE * at.size)), at.size - LEAST_VALUES)
-    for fit in (found.selection.fit, found.selection.before):
+    for fit in _explanations(found):
         suspects = _suspects(fit, most)
         while suspects:
-            runs = without(evidence.runs, _by_run(evidence, at[suspects]))
-            again = findings_of(evidence_without(runs))
-            chips, missed = _improbable(points, again.selection.fit, suspects)
+            again = findings_of(evidence_without(without(evidence.runs, _by_run(evidence, at[suspects]))))
+            chips, _ = _improbable(points, again.selection.fit, suspects)
             if chips == suspects:
-                return again, [left_out(evidence.runs, _by_run(evidence, at[chips]), _alike(missed, _agree_um(points)))]
+                return again
             suspects = chips
-    return found, []
+    return None
+
+
+def _explanations(found: Findings) -> Iterator[Fit]:
+    """Yield explanations that chips may have spoilt: a source without a channel takes chips for its times."""
+    if any(not term.hypothesis.effect.observed for term in found.selection.fit.terms):
+        yield found.search.run(unobserved=False).fit
+    yield found.selection.fit
+    yield found.selection.before
 
 
 def _suspects(fit: Fit, most: int) -> list[int]:
