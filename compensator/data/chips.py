@@ -23,7 +23,7 @@ def without(runs: Sequence[Run], chips: Sequence[Mask]) -> list[Run]:
     return [run.without_y(chip) if chip.any() else run for run, chip in zip(runs, chips, strict=True)]
 
 
-def left_out(runs: Sequence[Run], chips: Sequence[Mask]) -> Remark:
+def left_out(runs: Sequence[Run], chips: Sequence[Mask], more: str = "") -> Remark:
     """Return the remark on values that do not fit: how many of how many, and when.
 
     Parameters
@@ -32,14 +32,16 @@ def left_out(runs: Sequence[Run], chips: Sequence[Mask]) -> Remark:
         With every measured value.
     chips : sequence of numpy.ndarray of bool
         The values of each run that do not fit.
+    more : str
+        Another sentence on them.
     """
     name = ", ".join(dict.fromkeys(run.name for run, chip in zip(runs, chips, strict=True) if chip.any()))
     t_s: Vector = np.concatenate([run.t_s[chip] for run, chip in zip(runs, chips, strict=True)])
     of = sum(int(np.isfinite(run.y_um).sum()) for run in runs)
     where = ", ".join(f"{value:.0f}" for value in t_s[:_SHOWN].tolist())
-    more = f" and {t_s.size - _SHOWN} more" if t_s.size > _SHOWN else ""
+    others = f" and {t_s.size - _SHOWN} more" if t_s.size > _SHOWN else ""
     words = f"{name}: {t_s.size} of {of} measured y_um do not fit the others and were left out"
-    return Remark(DataRemark.Y_LEFT_OUT, f"{words}, at t_s = {where}{more} from the start.")
+    return Remark(DataRemark.Y_LEFT_OUT, f"{words}, at t_s = {where}{others} from the start.{more}")
 
 
 def isolated(residual: Vector, noise_um: float) -> Mask:

@@ -6,7 +6,8 @@ that is stated and the rest that is learned. What several values show, one after
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from compensator.diagnose.likelihood import Likelihood, Points, Rest, dense
 
 #: A value so many deviations away from what the others predict is suspected; one so many away is left out.
 SUSPECTED, IMPROBABLE = 3.0, 4.5
+#: So many that are as far off as each other may be something that acts for less than the time between two values.
+ALIKE = 3
 #: Most values that are left out, as a share of all: more of them are something that acts.
 MOST_SHARE = 0.1
 #: A value that is left out may be anything: so many times the spread of the deformation.
@@ -39,19 +42,45 @@ def without_chips(
     evidence_without : callable
         Returns the evidence of runs.
     """
+    evidence, points = found.search.evidence, found.search.points
+    at = np.flatnonzero(evidence.used)
+    most = min(max(1, int(MOST_SHARE * at.size)), at.size - LEAST_VALUES)
+    better: Findings | None = found
+    while better is not None:
+        found, chips = better, np.flatnonzero(~_is_used(better, at)).tolist()
+        better = _without_more(found, evidence_without, most - len(chips))
+    if not chips:
+        return found, []
+    missed = _improbable(points, found.selection.fit, chips)[1]
+    return found, [left_out(evidence.runs, _by_run(evidence, at[chips]), _alike(missed, _agree_um(points)))]
+
+
+def _is_used(found: Findings, at: Indices) -> Mask:
+    """Return which of some samples take part in what was found."""
+    return np.asarray(found.search.evidence.used[at])
+
+
+def _without_more(found: Findings, evidence_without: Callable[[Sequence[Run]], Evidence], most: int) -> Findings | None:
+    """Return what is found without some values that do not fit; None if there are none, or too many."""
     evidence = found.search.evidence
     points, at = found.search.points, np.flatnonzero(evidence.used)
-    most = min(max(1, int(MOST_SHARE * at.size)), at.size - LEAST_VALUES)
-    for fit in (found.selection.fit, found.selection.before):
+    for fit in _explanations(found):
         suspects = _suspects(fit, most)
         while suspects:
-            runs = without(evidence.runs, _by_run(evidence, at[suspects]))
-            again = findings_of(evidence_without(runs))
-            chips = _improbable(points, again.selection.fit, suspects)
+            again = findings_of(evidence_without(without(evidence.runs, _by_run(evidence, at[suspects]))))
+            chips, _ = _improbable(points, again.selection.fit, suspects)
             if chips == suspects:
-                return again, [left_out(evidence.runs, _by_run(evidence, at[chips]))]
+                return again
             suspects = chips
-    return found, []
+    return None
+
+
+def _explanations(found: Findings) -> Iterator[Fit]:
+    """Yield explanations that chips may have spoilt: a source without a channel takes chips for its times."""
+    if any(not term.hypothesis.effect.observed for term in found.selection.fit.terms):
+        yield found.search.run(unobserved=False).fit
+    yield found.selection.fit
+    yield found.selection.before
 
 
 def _suspects(fit: Fit, most: int) -> list[int]:
@@ -71,21 +100,39 @@ def _suspects(fit: Fit, most: int) -> list[int]:
         rest = points.settled(np.column_stack([columns, _spikes(points, [worst])]), fit.fixed, rest)
 
 
-def _improbable(points: Points, fit: Fit, suspects: list[int]) -> list[int]:
-    """Return which of some values are improbable by a fit without them, and agree with no suspect beside them."""
+def _improbable(points: Points, fit: Fit, suspects: list[int]) -> tuple[list[int], Vector]:
+    """Return which of some values are improbable by a fit without them, and how far all of them are off, µm.
+
+    Those that agree with a suspect beside them are not.
+    """
     whole = fit_terms(Likelihood(points, fit.rest), fit.starts(), evaluations=1)
     away, missed = np.zeros(len(suspects)), np.zeros(len(suspects))
     for k, one in enumerate(suspects):
         others = _spikes(points, [other for other in suspects if other != one])
         deviations, innovations = _deviations(points, fit.rest, np.column_stack([whole.columns, others]), whole.fixed)
         away[k], missed[k] = deviations[one], innovations[one]
-    agree = IMPROBABLE * np.sqrt(2.0) * points.evidence.probe_um
+    agree = _agree_um(points)
     kept = []
     for k, one in enumerate(suspects):
         beside = [j for j, other in enumerate(suspects) if abs(other - one) == 1]
         if abs(away[k]) > IMPROBABLE and not any(abs(missed[j] - missed[k]) < agree for j in beside):
             kept.append(one)
-    return kept
+    return kept, missed
+
+
+def _agree_um(points: Points) -> float:
+    """Return how far two values may be apart that show the same, µm."""
+    return IMPROBABLE * math.sqrt(2.0) * points.evidence.probe_um
+
+
+def _alike(missed: Vector, agree_um: float) -> str:
+    """Return a sentence where several values that do not fit are equally far off."""
+    if missed.size < ALIKE or np.ptp(missed) > agree_um:
+        return ""
+    return (
+        f" All are off by about {np.mean(missed):+.0f} µm: what acts for less than the time between two values looks "
+        "like this, too."
+    )
 
 
 def _deviations(points: Points, rest: Rest, columns: Matrix, fixed: Vector) -> tuple[Vector, Vector]:

@@ -283,3 +283,10 @@ def test_what_could_hide_is_said_with_its_limit(quiet):
     (hidden,) = [part for part in quiet.contents() if getattr(part, "title", "") == "What could hide"]
     sizes = [one["size_um"] for one in quiet.to_dict()["could_hide"]["what"]]
     assert all(f"{size:.1f} µm peak to peak" in " ".join(hidden.lines) for size in sizes)
+
+
+@pytest.mark.parametrize(("sign", "said"), [(1.0, True), (-1.0, False)])
+def test_values_that_are_equally_far_off_may_be_something_that_acts(sign, said):
+    columns, _ = chipped(probed("none", 1), {8: 20.0, 20: sign * 20.0, 33: 20.0})
+    (remark,) = [w for w in tc.diagnose("quill", columns, y_std_um=STD_UM).to_dict()["warnings"] if "3 of 47" in w]
+    assert ("All are off by about +" in remark) == said
