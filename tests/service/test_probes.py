@@ -267,9 +267,36 @@ async def test_a_zero_takes_the_correction_away_and_keeps_the_gains(tmp_path: Pa
     machine.daemon._compensation.zero("warm")
     machine.daemon._compensation.process(machine.outcomes[-1].sample)
     after = decode_state(machine.daemon._compensation.state()).probing
-    assert after is not None and not after.correction["active"] and not after.features and len(after.samples) == 1
+    assert after is not None and after.correction["active"] and not after.features and len(after.samples) == 1
+    assert machine.daemon._compensation.wanted.why == ProbeCode.FIRST
     assert np.array_equal(np.array(after.correction["bank"]["states"])[:, 1], gain)
     assert sum(after.correction["bank"]["weights"]) == pytest.approx(1.0)
+
+
+async def test_after_a_warm_zero_the_gains_go_on_to_act(tmp_path: Path) -> None:
+    machine = ProbedMachine(tmp_path)
+    machine.each_hour(700)
+    machine.at_sample[710] = lambda: machine.command("zero", b'{"mode":"warm"}')
+    await machine.run(900)
+    assert machine.codes()[-1] == "taken"
+    zero = 720  # The offset has moved to the zero by then.
+    left, moved = machine.left_um()[zero:], np.ptp(machine.offsets()[zero:])
+    assert moved > 15.0 and np.ptp(left) < 0.04 * moved
+    assert all(2.0 < number(outcome.offset.y_offset_std_um) < 4.0 for outcome in machine.outcomes[zero:])
+    assert nothing_jumped(machine)
+
+
+async def test_a_doubtful_probe_asks_for_another_one(tmp_path: Path) -> None:
+    machine = ProbedMachine(tmp_path, gain=1.0, noise_um=0.0)
+    machine.at_sample[200] = lambda: machine.probe(20.0)
+    machine.at_sample[210] = machine.probe
+    await machine.run(206)
+    assert machine.codes() == ["taken"] and wanted_because(machine) == ProbeCode.DOUBTED
+    wrong, std = abs(machine.left_um()[-1]), number(machine.outcomes[-1].offset.y_offset_std_um)
+    assert wrong < 2.0 * std
+    await machine.run(14)
+    assert wanted_because(machine) != ProbeCode.DOUBTED
+    assert abs(machine.left_um()[-1]) < 1.5 and nothing_jumped(machine)
 
 
 async def test_a_probe_during_a_hold_and_one_from_before_it(tmp_path: Path) -> None:
