@@ -211,6 +211,20 @@ async def test_a_probe_counts_once(tmp_path: Path) -> None:
     assert nothing_jumped(machine)
 
 
+async def test_two_features_of_one_time_are_two_probes(tmp_path: Path) -> None:
+    machine = ProbedMachine(tmp_path)
+
+    def both() -> None:
+        one = machine.measured()
+        machine.send(one)
+        machine.send(one | {"feature": "bore-2", "measured_um": one["measured_um"] + 3.0})
+        machine.send(one | {"feature": "bore-2", "measured_um": one["measured_um"] + 4.0})
+
+    machine.at_sample[60] = both
+    await machine.run(63)
+    assert machine.codes() == ["taken", "taken", ProbeCode.DUPLICATE] and nothing_jumped(machine)
+
+
 async def test_a_chip_is_refused_and_another_probe_is_asked_for(tmp_path: Path) -> None:
     machine, clean = ProbedMachine(tmp_path / "a"), ProbedMachine(tmp_path / "b")
     for one in (machine, clean):
