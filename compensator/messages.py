@@ -259,7 +259,8 @@ class Probe(Message, frozen=True, kw_only=True):
     seq : int
         Number of the sample with which it was decided; the record is before that `/sample`.
     time_utc_ns, axis, measured_um, std_um, offset_applied_um, feature, tool, stopped_s
-        As received, see `ProbeRequest`; null or empty where the payload could not be read, with the time of arrival.
+        As received, see `ProbeRequest`; null or empty where the payload could not be read, with the time of arrival,
+        and where there was no room for it (`probe_too_many`).
     received_utc_ns : int
         When it arrived, ns since 1970 UTC.
     by, by_proof : str
@@ -298,7 +299,7 @@ class Probe(Message, frozen=True, kw_only=True):
 
     @property
     def is_read(self) -> bool:
-        """Whether the payload was a probe."""
+        """Whether the payload was a probe that was decided."""
         return self.measured_um is not None
 
 
