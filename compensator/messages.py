@@ -212,7 +212,15 @@ class Status(Message, frozen=True, kw_only=True):
     wanted_tolerance_um: float | UnsetType | None = UNSET
 
 
-_Label = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
+# No control characters, line ends or marks of the direction; `$` would accept a line end after the last character, and
+# `\Z` is not known to readers of the schema.
+_Label = Annotated[
+    str,
+    Meta(
+        max_length=64,
+        pattern=r"^[^\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]*(?![\s\S])",
+    ),
+]
 
 
 class ProbeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

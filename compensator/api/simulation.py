@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 #: Measured Y without any noise, as of a simulated sensor, is taken to have this standard deviation, µm.
 _LEAST_STD_UM = 0.01
+#: Largest standard deviation of a measured value that can be meant, µm.
+_LARGEST_STD_UM = 1e6
 #: Number of rows that a remark lists.
 _SHOWN = 3
 
@@ -70,8 +72,11 @@ def simulate(
         If model or data cannot be read, or Y is measured too sparsely to show its noise and `y_std_um` is missing.
     """
     what = model_of(model)
-    if y_std_um is not None and not 0.0 < y_std_um < math.inf:
-        raise UsageError(f"--y-std {y_std_um:g}: expected the standard deviation of one measured Y, above 0 µm")
+    if y_std_um is not None and not 0.0 < y_std_um <= _LARGEST_STD_UM:
+        raise UsageError(
+            f"--y-std {y_std_um:g}: expected the standard deviation of one measured Y, above 0 and at most "
+            f"{_LARGEST_STD_UM:g} µm"
+        )
     measured = measurements(data, "data", columns, needed=True)
     remarks: list[Remark] = []
     parts: list[dict[str, Vector]] = []

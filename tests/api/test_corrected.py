@@ -193,3 +193,11 @@ def test_without_y_there_is_nothing_to_correct_by(machine):
     inputs = {name: values for name, values in table.items() if name != "y_um"}
     with pytest.raises(tc.CompensatorError, match="no column y_um"):
         tc.simulate("quill", inputs, correct=True, y_std_um=1.5)
+
+
+@pytest.mark.parametrize("y_std_um", [0.0, -1.0, 1e155, float("inf"), float("nan")])
+def test_a_deviation_that_cannot_be_meant_is_refused_in_one_line(machine, y_std_um):
+    table, *_ = machine
+    with pytest.raises(tc.CompensatorError, match=r"--y-std .* at most") as refused:
+        tc.simulate("quill", table, correct=True, y_std_um=y_std_um)
+    assert "\n" not in str(refused.value)

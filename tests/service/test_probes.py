@@ -155,6 +155,10 @@ WRONG: list[dict[str, Any]] = [
     {"offset_applied_um": [1]},
     {"feature": "x" * 65},
     {"feature": "a\nb"},
+    {"feature": "sphere-1\n"},
+    {"feature": "a\u2028b"},
+    {"feature": "a\u202eb"},
+    {"tool": "\u0085"},
     {"feature": 7},
     {"stopped_s": -1.0},
     {"axis": None},
@@ -176,6 +180,7 @@ def test_the_probe_of_the_contract_is_read() -> None:
  "offset_applied_um": -12.3, "feature": "sphere-1", "tool": "probe", "stopped_s": 20.0}"""
     assert read_probe(text).measured_um == 3.2
     assert read_probe(json.dumps(USUAL).encode()).std_um is None
+    assert read_probe(json.dumps(USUAL | {"feature": "Bohrung Ø12, 左"}).encode()).feature == "Bohrung Ø12, 左"
 
 
 async def test_payloads_that_are_none_are_recorded_and_change_nothing(tmp_path: Path) -> None:
