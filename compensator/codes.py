@@ -294,6 +294,11 @@ class ProbeCode(Code):
         "No probe has been taken since the zero, so nothing shows how far the model is off.",
         "Probe once before the next tight feature.",
     )
+    DOUBTED = (
+        "probe_doubted",
+        "A probe that was taken may have been wrong: until another one decides it, part of it acts.",
+        "Clean the feature and probe again.",
+    )
     DEVIATION = (
         "probe_deviation",
         "The standard deviation exceeds the tolerance, probe.tolerance_um.",

@@ -212,7 +212,15 @@ class Status(Message, frozen=True, kw_only=True):
     wanted_tolerance_um: float | UnsetType | None = UNSET
 
 
-_Label = Annotated[str, Meta(max_length=64, pattern=r"^[^\x00-\x1f\x7f]*$")]
+# No control characters, line ends or marks of the direction; `$` would accept a line end after the last character, and
+# `\Z` is not known to readers of the schema.
+_Label = Annotated[
+    str,
+    Meta(
+        max_length=64,
+        pattern=r"^[^\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]*(?![\s\S])",
+    ),
+]
 
 
 class ProbeRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -259,7 +267,8 @@ class Probe(Message, frozen=True, kw_only=True):
     seq : int
         Number of the sample with which it was decided; the record is before that `/sample`.
     time_utc_ns, axis, measured_um, std_um, offset_applied_um, feature, tool, stopped_s
-        As received, see `ProbeRequest`; null or empty where the payload could not be read, with the time of arrival.
+        As received, see `ProbeRequest`; null or empty where the payload could not be read, with the time of arrival,
+        and where there was no room for it (`probe_too_many`).
     received_utc_ns : int
         When it arrived, ns since 1970 UTC.
     by, by_proof : str
@@ -298,7 +307,7 @@ class Probe(Message, frozen=True, kw_only=True):
 
     @property
     def is_read(self) -> bool:
-        """Whether the payload was a probe."""
+        """Whether the payload was a probe that was decided."""
         return self.measured_um is not None
 
 

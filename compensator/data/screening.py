@@ -30,6 +30,8 @@ KELVIN = (250.0, 420.0)
 POSSIBLE_DEGC = (-273.15, 1500.0)
 #: Shortest constant stretch of a dead sensor that is noisy otherwise, samples.
 DEAD_SAMPLES = 60
+#: Largest standard deviation of one measured Y, µm.
+LARGEST_STD_UM = 1e6
 #: Outside the stretch: share of steps at which its noise reverses, and share of steps of zero.
 LIVELY_TURNS, LIVELY_STILL = 0.08, 0.05
 #: Correlation of T_Q − AT with the heat below which the two are exchanged.
@@ -111,16 +113,16 @@ def check_y_std(y_std_um: float | None) -> None:
     Raises
     ------
     UsageError
-        If it is given and no number above 0.
+        If it is given and no number above 0, or so large that it says nothing.
     """
     if y_std_um is None:
         return
     is_number = isinstance(y_std_um, (int, float, np.number)) and not isinstance(y_std_um, bool)
-    if not is_number or not 0.0 < y_std_um < np.inf:
+    if not is_number or not 0.0 < y_std_um <= LARGEST_STD_UM:
         shown = f"{y_std_um:g}" if is_number else repr(y_std_um)
         raise UsageError(
             f"--y-std {shown} (y_std_um in Python): expected the standard deviation of one measured Y, a number above "
-            "0 µm"
+            f"0 and at most {LARGEST_STD_UM:g} µm"
         )
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -74,6 +74,24 @@ class Expected:
     innovation: Vector
     variance: Vector
     column: Matrix
+
+
+class Mixture(NamedTuple):
+    """What a bank knows as a whole.
+
+    Parameters
+    ----------
+    mean : list of float
+        Mean of each state.
+    covariance : list of list of float
+        Lower triangle of their covariance.
+    growth : list of float
+        Growth of the variance of each state, 1/min.
+    """
+
+    mean: list[float]
+    covariance: list[list[float]]
+    growth: list[float]
 
 
 class FilterBank:
@@ -160,12 +178,27 @@ class FilterBank:
 
     def correct(self, expected: Expected) -> None:
         """Correct every filter by a value, and the weights."""
+        self._correct_states(expected)
+        self.weights = self.weigh(expected).weights
+        self.mean_weights = list(self.weights)
+
+    def correct_by_wrong(self, expected: Expected) -> None:
+        """Correct as by a value that is known to be wrong: it was expected with `WRONG_UM` in its deviation."""
+        self._correct_states(expected)
+        each = zip(self.weights, expected.innovation.tolist(), expected.variance.tolist(), strict=True)
+        found = [weight * _density(innovation, variance) for weight, innovation, variance in each]
+        total = 0.0
+        for weight in found:
+            total += weight
+        if total > 0.0:  # Else it was so far off that no density is left.
+            self.weights = [weight / total for weight in found]
+        self.mean_weights = list(self.weights)
+
+    def _correct_states(self, expected: Expected) -> None:
         gain = expected.column / expected.variance[:, None]
         self.x = self.x + gain * expected.innovation[:, None]
         self.P = self.P - gain[:, :, None] * expected.column[:, None, :]
         self.P = 0.5 * (self.P + self.P.transpose(0, 2, 1))
-        self.weights = self.weigh(expected).weights
-        self.mean_weights = list(self.weights)
 
     def weights_of_walks(self) -> list[float]:
         """Return the weights with each walk's as it is, and every level as probable as before the first value."""
@@ -224,18 +257,49 @@ class FilterBank:
             self.P[:, zero, zero] += ZERO_STD_UM**2
         self.weights = _spread(self.weights, 1.0)
 
-    def mixture(self, n: int) -> tuple[list[float], list[list[float]], list[float]]:
-        """Return mean, lower triangle of the covariance, and growth of the variances a minute, of `n` states."""
+    def mixture(self, n: int, *, zeroed: bool = False) -> Mixture:
+        """Return what is known of the first `n` states.
+
+        Parameters
+        ----------
+        n : int
+            How many.
+        zeroed : bool
+            Whether no value has come since the zero: the offset is that of the machine then, which was zeroed, and
+            not the level of the values, which may be any.
+        """
+        mean_weights, weights = self.mean_weights, self.weights
+        if zeroed:
+            mean_weights, weights = _of_zeroed(mean_weights), _of_zeroed(weights)
         x, p, walks = self.x.tolist(), self.P.tolist(), self.walks.tolist()
-        means = [_mean(self.mean_weights, [row[i] for row in x]) for i in range(n)]
+        means = [_mean(mean_weights, [row[i] for row in x]) for i in range(n)]
         covariance = [
             [
-                _mean(self.weights, [p[k][i][j] + (x[k][i] - means[i]) * (x[k][j] - means[j]) for k in range(SIZE)])
+                _mean(weights, [p[k][i][j] + (x[k][i] - means[i]) * (x[k][j] - means[j]) for k in range(SIZE)])
                 for j in range(i + 1)
             ]
             for i in range(n)
         ]
-        return means, covariance, [_mean(self.weights, [row[i] for row in walks]) for i in range(n)]
+        return Mixture(means, covariance, [_mean(weights, [row[i] for row in walks]) for i in range(n)])
+
+
+def mixed(parts: Sequence[Mixture], probabilities: Sequence[float]) -> Mixture:
+    """Return several as one; its covariance includes how far their means lie apart."""
+    if len(parts) == 1:
+        return parts[0]
+    states = range(len(parts[0].mean))
+    mean = [_mean(probabilities, [part.mean[i] for part in parts]) for i in states]
+    covariance = [
+        [
+            _mean(
+                probabilities,
+                [part.covariance[i][j] + (part.mean[i] - mean[i]) * (part.mean[j] - mean[j]) for part in parts],
+            )
+            for j in range(i + 1)
+        ]
+        for i in states
+    ]
+    return Mixture(mean, covariance, [_mean(probabilities, [part.growth[i] for part in parts]) for i in states])
 
 
 def _mean(weights: Sequence[float], values: Sequence[float]) -> float:
@@ -243,6 +307,14 @@ def _mean(weights: Sequence[float], values: Sequence[float]) -> float:
     for weight, value in zip(weights, values, strict=True):
         total += weight * value
     return total
+
+
+def _of_zeroed(weights: Sequence[float]) -> list[float]:
+    """Return weights of the filters that knew the level, with those of the others added to them."""
+    found = [0.0] * SIZE
+    for k, weight in enumerate(weights):
+        found[k % len(WALKS_UM)] += weight
+    return found
 
 
 def _spread(weights: Sequence[float], share: float) -> list[float]:

@@ -8,20 +8,21 @@ The offset and the gains walk. The first feature's zero is in the offset; a furt
 first probe, so that it teaches only changes and makes no jump.
 
 A probe that is more probably wrong than right, by its innovation, is refused; so many refused ones that agree are
-believed. The most doubtful of those that were taken stays on probation: a second bank goes on without it, and takes
-over once the later probes make that more probable.
+believed. The most doubtful of those that were taken stays on probation: a second bank takes it for a wrong one, and
+takes over once the later probes make that more probable. Until then the correction is the mean of both, weighted by
+their probabilities, and its deviation includes how far they lie apart.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from compensator.model.filter_bank import SIZE, Expected, FilterBank, Weighing, transformed
+from compensator.model.filter_bank import SIZE, WRONG_UM, Expected, FilterBank, Mixture, Weighing, mixed, transformed
 
 #: Standard deviation of a relative gain before the first probe: of the DTF, of all others.
 DTF_GAIN_STD, GAIN_STD = 0.12, 0.2
@@ -99,12 +100,25 @@ class ProbeCorrection:
         self._probes = 0
         self._minutes = 0.0
         self._waiting = 0.0
-        stds = [DTF_GAIN_STD if name == "DTF" else GAIN_STD for name in self.names]
-        self._bank = FilterBank(stds, [GAIN_WALK * std for std in stds])
-        # The bank without the last probe that was taken, and the probability that this probe was wrong.
+        self._bank = self._new_bank()
+        # The bank that takes a probe for a wrong one, and the probability that it was.
         self._without: FilterBank | None = None
         self._doubt = 0.0
         self._mix()
+
+    def _new_bank(self) -> FilterBank:
+        stds = [DTF_GAIN_STD if name == "DTF" else GAIN_STD for name in self.names]
+        return FilterBank(stds, [GAIN_WALK * std for std in stds])
+
+    @property
+    def is_probed(self) -> bool:
+        """Whether a probe was taken since the zero."""
+        return self._probes > 0
+
+    @property
+    def doubt(self) -> float:
+        """Probability that the probe on probation, which the correction is partly made of, was wrong."""
+        return self._doubt if self._without is not None else 0.0
 
     # ------------------------------------------------------------------ each sample
 
@@ -186,8 +200,9 @@ class ProbeCorrection:
         self._advance()
         h = self._row(contributions_um, feature)
         deviation = y_um - predicted_um
-        innovation, variance = self._bank.innovation(self._bank.expected(h, deviation, std_um))
+        innovation, variance = self._innovation(h, deviation, std_um)
         probe = _Probe(self._minutes, deviation, innovation, std_um, tuple(contributions_um), feature)
+        doubt = self._doubt
         self._reconsider(probe)
         reason = None
         weighing = self._weigh(self._bank, probe)
@@ -199,8 +214,9 @@ class ProbeCorrection:
         elif weighing.right < 0.5:
             for bank in self._banks():
                 bank.weights = self._weigh(bank, probe).weights
+            self._doubt = doubt  # A refused probe moves nothing.
             self._refused = [*self._refused[1 - REFUSED_KEPT :], probe]
-            if not self.active:  # The first feature is the first of which a probe is taken.
+            if not self.is_probed:  # The first feature is the first of which a probe is taken.
                 self._features.clear()
             self._mix()
             return ProbeVerdict(False, OUTLIER, innovation, math.sqrt(variance))
@@ -236,8 +252,14 @@ class ProbeCorrection:
     def _weigh(self, bank: FilterBank, probe: _Probe) -> Weighing:
         return bank.weigh(self._expected(bank, probe))
 
+    def _innovation(self, h: Sequence[float], deviation_um: float, std_um: float) -> tuple[float, float]:
+        """Return the innovation of both banks together, µm, and its variance, µm²."""
+        found = [bank.innovation(bank.expected(h, deviation_um, std_um)) for bank in self._banks()]
+        both = mixed([Mixture([mean], [[variance]], [0.0]) for mean, variance in found], self._probabilities())
+        return both.mean[0], both.covariance[0][0]
+
     def _reconsider(self, probe: _Probe) -> None:
-        """Let the bank without the probe on probation take over where this one makes that more probable."""
+        """Let the bank that takes the probe on probation for a wrong one take over where this one makes it probable."""
         if self._without is None:
             return
         undone = self._weigh(self._without, probe)
@@ -253,6 +275,9 @@ class ProbeCorrection:
         """Correct by a probe; it goes on probation where it is more doubtful than the one that is."""
         if self._without is None or self._doubt < doubt:
             self._without, self._doubt = self._bank.copy(), doubt
+            self._without.correct_by_wrong(
+                self._expected(self._without, replace(probe, std_um=math.hypot(probe.std_um, WRONG_UM)))
+            )
         else:
             self._without.correct(self._expected(self._without, probe))
         self._bank.correct(self._expected(self._bank, probe))
@@ -262,8 +287,13 @@ class ProbeCorrection:
         self._mix()
 
     def _mix(self) -> None:
-        """Keep mean, covariance and growth of the whole bank, so that a sample costs little."""
-        self._mean, self._covariance, self._growth = self._bank.mixture(1 + len(self.names))
+        """Keep mean, covariance and growth of both banks together, so that a sample costs little."""
+        states = 1 + len(self.names)
+        both = mixed([bank.mixture(states, zeroed=not self.is_probed) for bank in self._banks()], self._probabilities())
+        self._mean, self._covariance, self._growth = both
+
+    def _probabilities(self) -> list[float]:
+        return [1.0] if self._without is None else [1.0 - self._doubt, self._doubt]
 
     # ------------------------------------------------------------------ probes that do not fit
 
@@ -342,14 +372,33 @@ class ProbeCorrection:
         found._mix()
         return found
 
-    def at_zero(self) -> ProbeCorrection:
-        """Return the correction after a zero: the gains and walks stay, the offset and the zeros start anew."""
-        found, gains = ProbeCorrection(self.names), slice(1, 1 + len(self.names))
-        before = self._bank.copy()
-        before.advance(self._waiting)
-        found._bank.x[:, gains] = before.x[:, gains]
-        found._bank.P[:, gains, gains] = before.P[:, gains, gains]
-        found._bank.weights = before.weights_of_walks()
+    def at_zero(self, contributions_um: Sequence[float]) -> ProbeCorrection:
+        """Return the correction after a zero: the gains and walks stay, the offset and the zeros start anew.
+
+        The gains go on to act on what the shares grow by from now on, so that the correction is 0 now. Until the next
+        probe its deviation is that of a machine whose level is known; the level of the probes may be any.
+
+        Parameters
+        ----------
+        contributions_um : sequence of float
+            Shares of the paths and effects at the zero, as they are counted after it, µm.
+        """
+        self._expect(contributions_um)
+        found, states = ProbeCorrection(self.names), 1 + len(self.names)
+        found.active, found._doubt = self.active, self._doubt
+        since = np.eye(states)
+        since[0, 1:] = [-share for share in contributions_um]
+
+        def zeroed(before: FilterBank) -> FilterBank:
+            bank, gains = found._new_bank(), slice(1, states)
+            bank.x[:, gains], bank.P[:, gains, gains] = before.x[:, gains], before.P[:, gains, gains]
+            if self.active:
+                bank.x, bank.P = transformed(since, bank.x, bank.P)
+            bank.weights = before.weights_of_walks()
+            bank.mean_weights = list(bank.weights)
+            return bank
+
+        found._bank, found._without = self._each_bank(zeroed)
         found._mix()
         return found
 
@@ -381,11 +430,32 @@ class ProbeCorrection:
         if not self.active:
             return found
         found.active, found._probes, found._minutes = True, self._probes, self._minutes
-        found._features = list(self._features)
-        before = self._bank.copy()
-        before.advance(self._waiting)
-        bank, old, new = found._bank, 1 + len(self.names), 1 + len(found.names)
-        zeros = len(self._features) - 1
+        found._features, found._doubt = list(self._features), self._doubt
+        found._bank, found._without = self._each_bank(
+            lambda before: found._taking_over(before, contributions_um, new_contributions_um, change_um)
+        )
+        found._mix()
+        return found
+
+    def _each_bank(self, changed: Callable[[FilterBank], FilterBank]) -> tuple[FilterBank, FilterBank | None]:
+        """Return both banks, as they are now, changed."""
+        found = []
+        for bank in self._banks():
+            now = bank.copy()
+            now.advance(self._waiting)
+            found.append(changed(now))
+        return found[0], found[1] if len(found) > 1 else None
+
+    def _taking_over(
+        self,
+        before: FilterBank,
+        contributions_um: Sequence[float],
+        new_contributions_um: Sequence[float],
+        change_um: float,
+    ) -> FilterBank:
+        """Return a bank with these names for one of another model."""
+        bank, old, new = self._new_bank(), 1 + len(contributions_um), 1 + len(self.names)
+        zeros = len(self._features) - 1 if self._features else 0
         # The old model's states, reduced to the correction as it is now and the zeros.
         reduced = np.zeros((1 + zeros, old + zeros))
         reduced[0, :old] = [1.0, *contributions_um]
@@ -402,5 +472,4 @@ class ProbeCorrection:
         offset[0, 1:new] = [-share for share in new_contributions_um]
         bank.x, bank.P = transformed(offset, bank.x, bank.P)
         bank.weights, bank.mean_weights = list(before.weights), list(before.mean_weights)
-        found._mix()
-        return found
+        return bank

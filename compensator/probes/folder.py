@@ -20,6 +20,8 @@ from compensator.probes.table import BadLine, NoFeature, Row, columns, row
 
 #: Longest file, bytes; 100 000 lines.
 LONGEST = 10_000_000
+#: So many lines and files are read before the other sources have their turn.
+READ_AT_ONCE = 200
 
 
 class _Signature(NamedTuple):
@@ -56,27 +58,44 @@ class Handled:
             kept = json.loads(path.read_text(encoding="utf-8"))["handled"] if path.exists() else {}
             if not all(isinstance(part, str) for pair in kept.items() for part in pair):
                 raise TypeError("expected texts")
-        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            for identity in kept:
+                _time_utc_ns(identity)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise ConfigError(f"{path}: {error}; expected the state of folders; delete it to begin anew") from error
         self._lines.update(kept)
+        self._changed = False
 
     def values(self, identity: str) -> str | None:
         """Return the values with which a line was handled; None if it was not."""
         return self._lines.get(identity)
 
-    def add(self, line: Row, now_utc_ns: int) -> None:
-        """Note that a line was handled, on disk when this returns.
+    def add(self, line: Row) -> None:
+        """Note that a line was handled; `write` keeps it."""
+        self._lines[line.identity] = line.values
+        self._changed = True
+
+    def write(self, now_utc_ns: int) -> None:
+        """Keep on disk what was added; a line that a crash loses is sent again, and the service refuses it as known.
 
         Raises
         ------
         OSError
             If the file cannot be written.
         """
-        self._lines[line.identity] = line.values
+        if not self._changed:
+            return
         oldest = now_utc_ns - self._keep_ns
-        self._lines = {key: value for key, value in self._lines.items() if int(key.partition(" ")[0]) >= oldest}
+        self._lines = {key: value for key, value in self._lines.items() if _time_utc_ns(key) >= oldest}
         with atomic_write(self._path) as file:
             json.dump({"handled": self._lines}, file)
+        self._changed = False
+
+
+def _time_utc_ns(identity: str) -> int:
+    text = identity.partition(" ")[0]
+    if not (text.isascii() and text.isdigit() and len(text) <= 19):
+        raise ValueError(f"{identity[:40]!r}, expected a time and a feature")
+    return int(text)
 
 
 class WatchedFolder:
@@ -94,6 +113,8 @@ class WatchedFolder:
         Returns the offset that the control had at a time, µm, or None; for lines without it.
     send_within_s : float
         A line older than this is not sent, s.
+    has_room : callable, optional
+        Returns whether another probe can be submitted now; lines wait in their file until then.
     report : callable
         Called with a line for each line that is not sent.
     utc_ns : callable, optional
@@ -109,6 +130,7 @@ class WatchedFolder:
         report: Report,
         *,
         send_within_s: float,
+        has_room: Callable[[], bool] = lambda: True,
         utc_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._settings = settings
@@ -117,7 +139,10 @@ class WatchedFolder:
         self._applied_at = applied_at
         self._report = report
         self._send_within_ns = round(send_within_s * 1e9)
+        self._has_room = has_room
         self._utc_ns = utc_ns
+        self._to_read: dict[Path, None] = {}
+        self._reading: Iterator[None] = iter(())
         self._seen: dict[Path, _Signature] = {}
         self._read: dict[Path, _Signature] = {}
         self._pending: dict[str, str] = {}
@@ -126,18 +151,53 @@ class WatchedFolder:
     async def run(self, stop: asyncio.Event) -> None:
         """Look until `stop` is set."""
         while not stop.is_set():
-            self.poll()
+            going_on = self.poll()
+            while going_on and not stop.is_set():
+                await asyncio.sleep(0)
+                going_on = self.read_on()
             await pause(stop, self._settings.poll_s)
 
-    def poll(self) -> None:
-        """Look once; a file is read when it is the same as at the call before, so that no write is under way."""
+    def poll(self) -> bool:
+        """Look once; a file is read when it is the same as at the call before, so that no write is under way.
+
+        Returns
+        -------
+        bool
+            Whether there is more to read at once, by `read_on`.
+        """
+        self.keep()
         found = dict(self._files())
         for path, signature in found.items():
             if self._read.get(path) != signature and self._seen.get(path) == signature:
                 self._read[path] = signature
-                self._read_file(path)
+                self._to_read[path] = None
         self._seen = found
         self._read = {path: signature for path, signature in self._read.items() if path in found}
+        going_on = self.read_on()
+        self.keep()
+        return going_on
+
+    def read_on(self) -> bool:
+        """Read at most `READ_AT_ONCE` lines and files, as far as there is room; return whether to go on at once."""
+        for _ in range(READ_AT_ONCE):
+            if not self._has_room():
+                return False
+            try:
+                next(self._reading)
+            except StopIteration:
+                if not self._to_read:
+                    return False
+                path = next(iter(self._to_read))
+                del self._to_read[path]
+                self._reading = self._read_file(path)
+        return True
+
+    def keep(self) -> None:
+        """Keep on disk which lines were handled."""
+        try:
+            self._handled.write(self._utc_ns())
+        except (OSError, UsageError) as error:
+            self._trouble(Path(self._settings.path), error)
 
     def _files(self) -> Iterator[tuple[Path, _Signature]]:
         folder = Path(self._settings.path)
@@ -156,7 +216,8 @@ class WatchedFolder:
             if path.is_file():
                 yield path, _Signature(status.st_ino, status.st_size, status.st_mtime_ns)
 
-    def _read_file(self, path: Path) -> None:
+    def _read_file(self, path: Path) -> Iterator[None]:
+        """Handle the lines of a file, one with each step."""
         try:
             if path.stat().st_size > LONGEST:
                 raise OSError(27, f"longer than {LONGEST} bytes")
@@ -176,7 +237,10 @@ class WatchedFolder:
         except BadLine as bad:
             self._refuse(path, ProbeSourceRemark.ROW_BROKEN, lines[0], str(bad))
             return
-        old = sum(self._handle(path, names, line) for line in lines[1:])
+        old = 0
+        for line in lines[1:]:
+            old += self._handle(path, names, line)
+            yield
         if old:
             why = f"{old} line(s) older than {duration(self._send_within_ns / 1e9)}"
             self._refuse(path, ProbeSourceRemark.PROBE_NOT_SENT, "", why)
@@ -187,7 +251,7 @@ class WatchedFolder:
             return False
         try:
             line = row(names, text)
-        except BadLine as bad:
+        except (BadLine, ValueError, ArithmeticError) as bad:  # No content of a file may end the program.
             code = ProbeSourceRemark.NO_FEATURE if isinstance(bad, NoFeature) else ProbeSourceRemark.ROW_BROKEN
             self._refuse(path, code, text, str(bad))
             return False
@@ -220,12 +284,8 @@ class WatchedFolder:
         )
 
     def _done(self, line: Row) -> None:
-        """Keep a line as handled; until this is on disk, a restart sends it again, and the service refuses it twice."""
-        try:
-            self._handled.add(line, self._utc_ns())
-        except (OSError, UsageError) as error:
-            self._trouble(Path(self._settings.path), error)
-            return
+        """Note a line as handled; the next look keeps it."""
+        self._handled.add(line)
         self._pending.pop(line.identity, None)
 
     def _trouble(self, path: Path, error: OSError | UsageError) -> None:

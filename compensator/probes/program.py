@@ -64,13 +64,22 @@ async def serve(
         sender.submit(probe, source, done)
 
     runs: list[Coroutine[Any, Any, None]] = []
+    watching: list[WatchedFolder] = []
     if settings.folders:
         handled = Handled(Path(service.state_file), service.send_within_s + _MARGIN_S)
         within_s = service.send_within_s
         for folder in settings.folders:
             watched = WatchedFolder(
-                folder, handled, submit_line, applied, report, send_within_s=within_s, utc_ns=utc_ns
+                folder,
+                handled,
+                submit_line,
+                applied,
+                report,
+                send_within_s=within_s,
+                has_room=sender.has_room,
+                utc_ns=utc_ns,
             )
+            watching.append(watched)
             runs.append(watched.run(stop))
     runs.append(sender.run(stop))
     for dprnt in settings.dprnt:
@@ -82,3 +91,5 @@ async def serve(
     async with asyncio.TaskGroup() as group:
         for run in runs:
             group.create_task(run)
+    for watched in watching:  # What the sender sent last.
+        watched.keep()

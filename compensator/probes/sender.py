@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 from compensator.clock import duration
-from compensator.codes import ProbeSourceRemark, Remark
+from compensator.codes import ProbeCode, ProbeSourceRemark, Remark
 from compensator.probes.probe import NotSent, Probe, ProbeSink
 
 log = logging.getLogger("compensator")
@@ -82,6 +82,10 @@ class Sender:
         self._waiting.append(_Waiting(probe, source, done))
         self._changed.set()
 
+    def has_room(self) -> bool:
+        """Return whether a source that can wait may submit; half of the places is for those that cannot."""
+        return len(self._waiting) < WAITING // 2
+
     async def run(self, stop: asyncio.Event) -> None:
         """Send until `stop` is set; reports what is then still waiting."""
         while not stop.is_set():
@@ -107,6 +111,12 @@ class Sender:
             if str(error) != self._trouble:
                 self._trouble = str(error)
                 self._report(f"{first.source}: {error}; retrying")
+            return False
+        if reply.code == ProbeCode.TOO_MANY:
+            # More than the service uses with one sample: the next sample makes room.
+            if reply.text != self._trouble:
+                self._trouble = reply.text
+                self._report(f"{first.source}: {reply.text} [{reply.code}]; retrying")
             return False
         self._trouble = ""
         if self._waiting and self._waiting[0] is first:  # else it was given up meanwhile

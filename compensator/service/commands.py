@@ -17,7 +17,7 @@ from compensator.messages import Probe
 from compensator.service.compensation import Compensation
 from compensator.service.event_log import EventLog
 from compensator.service.probing import ReceivedProbe, read_probe
-from compensator.service.probing.received import ProbeRefused, unread_probe
+from compensator.service.probing.received import ProbeRefused, unused_probe
 from compensator.service.publisher import COMMANDS, Reply, Sender, refusal
 from compensator.service.replay import execute
 from compensator.service.transfer.adoption import LONGEST_MODEL, Adoption, ModelRequest
@@ -26,8 +26,10 @@ from compensator.service.transfer.adoption import LONGEST_MODEL, Adoption, Model
 LONGEST_COMMAND = 10_000
 #: Largest number of commands that wait for the next sample.
 WAITING_COMMANDS = 100
-#: Largest number of probes that wait for the next sample.
+#: Largest number of probes that wait for the next sample to be compared with the prediction.
 WAITING_PROBES = 20
+#: Largest number of probes refused at once that are recorded with the next sample; of the others their number is.
+REFUSED_PROBES = 20
 #: Largest number of refused commands noted between two samples; a flood must not displace other events.
 NOTED_REFUSALS = 10
 
@@ -67,9 +69,12 @@ class Commands:
         self._running = running
         self._machine = machine
         self._unproven = unproven
-        #: Probes that wait for the next sample, and records of payloads that are none.
+        #: Probes for the next sample in the order of their arrival, those of them that passed the checks, records of
+        #: what cannot be decided with it, and how many more were refused.
         self._probes: list[ReceivedProbe] = []
-        self._unread: list[Probe] = []
+        self._admitted: list[ReceivedProbe] = []
+        self._unused: list[Probe] = []
+        self._more = 0
         self._waiting: asyncio.Queue[tuple[str, dict[str, Any], Sender]] = asyncio.Queue(maxsize=WAITING_COMMANDS)
         self._refused = 0
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -115,10 +120,13 @@ class Commands:
             execute(compensation, name, arguments)
 
     def drain_probes(self) -> tuple[list[ReceivedProbe], list[Probe]]:
-        """Return the probes that arrived since the last call, and records of payloads that are none."""
-        probes, unread = self._probes, self._unread
-        self._probes, self._unread = [], []
-        return probes, unread
+        """Return the probes that arrived since the last call, and records of those that are not decided."""
+        probes, unused = self._probes, self._unused
+        if self._more:
+            text = f"probe: {self._more} more were refused"
+            unused.append(unused_probe(self._machine, self._clock.utc_ns(), ProbeCode.TOO_MANY, text))
+        self._probes, self._admitted, self._unused, self._more = [], [], [], 0
+        return probes, unused
 
     def _receive_probe(self, payload: bytes, sender: Sender, now_ns: int, reply: Future[dict[str, Any]]) -> None:
         """Check a probe at once; it is compared with the prediction at the next sample. In the loop only."""
@@ -134,21 +142,44 @@ class Commands:
         try:
             if probing is None:
                 raise ProbeRefused(ProbeCode.NOT_CONFIGURED, "probe: the configuration has no table [probe]")
-            if len(self._probes) >= WAITING_PROBES:
-                raise ProbeRefused(ProbeCode.TOO_MANY, f"probe: {WAITING_PROBES} wait for the next sample already")
             request = read_probe(payload)
         except ProbeRefused as refused:
-            if refused.code == ProbeCode.MALFORMED and len(self._unread) < NOTED_REFUSALS:
-                self._unread.append(unread_probe(self._machine, now_ns, str(refused), *by))
-            self._note_refusal(CommandName.PROBE, str(refused), sender)
+            self._refuse_unused(refused, now_ns, sender)
             raise
-        waiting = list(self._probes)
         received = ReceivedProbe(request=request, received_utc_ns=now_ns, by=by[0], by_proof=by[1])
+        try:
+            if self._loop is None:
+                raise ProbeRefused(ProbeCode.TIME_UNKNOWN, "probe: the service is ending")
+            probing.check(received, self._admitted)
+        except ProbeRefused:
+            # The next sample refuses it again, and records it so.
+            if len(self._probes) - len(self._admitted) < REFUSED_PROBES:
+                self._probes.append(received)
+            else:
+                self._more += 1
+            raise
+        if len(self._admitted) >= WAITING_PROBES:
+            full = ProbeRefused(
+                ProbeCode.TOO_MANY,
+                f"probe of {request.measured_um:.2f} µm at {request.feature!r}: "
+                f"{WAITING_PROBES} wait for the next sample already",
+            )
+            self._refuse_unused(full, request.time_utc_ns, sender)
+            raise full
         self._probes.append(received)
-        if self._loop is None:
-            raise ProbeRefused(ProbeCode.TIME_UNKNOWN, "probe: the service is ending")
-        probing.check(received, waiting)
+        self._admitted.append(received)
         return "received; compared with the prediction at the next sample; see thermal/event or watch"
+
+    def _refuse_unused(self, refused: ProbeRefused, time_ns: int, sender: Sender) -> None:
+        """Record a probe that the next sample cannot decide."""
+        self._note_refusal(CommandName.PROBE, str(refused), sender)
+        if refused.code == ProbeCode.NOT_CONFIGURED:
+            return
+        if len(self._unused) < NOTED_REFUSALS:
+            by = (sender.name, sender.proof)
+            self._unused.append(unused_probe(self._machine, time_ns, refused.code, str(refused), *by))
+        else:
+            self._more += 1
 
     def _check_sender(self, name: str, payload: bytes, sender: Sender) -> None:
         """Refuse a command that is too long, or whose sender may be anyone."""

@@ -391,7 +391,8 @@ class Compensation:
         zero.y_ref, zero.wanted = values.y, False
         self.plausibility.reset(at_rest=not warm)
         if self.probing is not None:
-            self.probing.set_zero(time_ns)
+            at_zero = self._memory.estimate
+            self.probing.set_zero(time_ns, at_zero.contributions_um if at_zero is not None else None)
         # Version 0.1.0 recorded this text without data: an audit of its recordings compares it.
         text = (
             f"zero on a {'warm machine' if warm else 'machine at rest'}: T_Q {values.t_q:.3f} °C, AT {values.at:.3f} °C"

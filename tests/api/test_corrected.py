@@ -204,3 +204,11 @@ def test_a_single_measured_value_is_the_zero_and_judges_nothing(machine):
     assert "nan" not in found.summary()
     assert "No errors: after the first measured Y" in found.summary()
     assert set(found.to_dict()) == {"samples", "records"}
+
+
+@pytest.mark.parametrize("y_std_um", [0.0, -1.0, 1e155, float("inf"), float("nan")])
+def test_a_deviation_that_cannot_be_meant_is_refused_in_one_line(machine, y_std_um):
+    table, *_ = machine
+    with pytest.raises(tc.CompensatorError, match=r"--y-std") as refused:
+        tc.simulate("quill", table, correct=True, y_std_um=y_std_um)
+    assert "\n" not in str(refused.value)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compensator.errors import ConfigError
-from compensator.probes.folder import Handled, WatchedFolder
+from compensator.probes.folder import READ_AT_ONCE, Handled, WatchedFolder
 from compensator.probes.probe import Probe
 from compensator.probes.sender import Outcome
 from compensator.probes.settings import Folder
@@ -154,6 +154,7 @@ def test_what_was_not_answered_yet_is_sent_again_after_a_restart_only(tmp_path: 
     bench.write(HEADER + line(0) + line(1))
     assert bench.minutes == [0, 1]
     bench.waiting[0]("sent")
+    bench.look()
     bench.restart()
     bench.look()
     assert bench.minutes == [0, 1, 1]
@@ -191,7 +192,7 @@ def test_folders_and_files_that_are_not_there(tmp_path: Path) -> None:
 
 def test_a_state_that_cannot_be_read_stops_the_start(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    for text in ("{", "[]", '{"handled": 3}', '{"handled": {"a": 1}}'):
+    for text in ("{", "[]", '{"handled": 3}', '{"handled": {"a": 1}}', '{"handled": {"x": "y"}}', "[" * 100000):
         bench.state.write_text(text)
         with pytest.raises(ConfigError, match=r"state\.json"):
             bench.restart()
@@ -248,6 +249,7 @@ GOOD = "2026-03-02T10:00:00Z,y,3.2,-12.3,1.5,sphere-1,probe,20"
         ("10:00:00Z", "10:00:00", "no zone"),
         ("10:00:00Z", "25:00:00Z", "time_utc"),
         ("2026", "1926", "after 1970"),
+        ("2026-03-02T10:00:00Z", "0001-01-01T00:00:00+23:59", "after 1970"),
         ("2026-03-02T10:00:00Z", "", "time_utc"),
     ],
 )
@@ -264,6 +266,43 @@ def test_a_file_without_a_header_row_is_told_apart_from_a_wrong_column() -> None
         columns(HEADER.replace("measured_um", "measured_mm"))
     with pytest.raises(NoFeature):
         row(NAMES, GOOD.replace("sphere-1", ""))
+
+
+@pytest.mark.parametrize("digits", ["0" * 19 + "1" + "9" * 4400, "0" + "1763680000000000000" + "99999", "9" * 19, "0"])
+def test_a_time_of_too_many_digits_is_refused_in_one_line(tmp_path: Path, digits: str) -> None:
+    bench = Bench(tmp_path)
+    bench.write(f"time_utc_ns,measured_um,offset_applied_um,feature\n{digits},1,0,a\n{T0_NS},1,0,a\n")
+    assert bench.minutes == [0] and len(bench.reports) == 1
+    assert "[row_broken]" in bench.reports[0] and len(bench.reports[0]) < 500 and "\n" not in bench.reports[0]
+
+
+def test_a_long_file_is_read_as_there_is_room_and_the_state_written_once_a_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writes: list[int] = []
+    write = Handled.write
+
+    def counted(handled: Handled, now_utc_ns: int) -> None:
+        writes.append(handled._changed)
+        write(handled, now_utc_ns)
+
+    monkeypatch.setattr(Handled, "write", counted)
+    bench = Bench(tmp_path)
+    room = [100]
+    monkeypatch.setattr(bench.watched, "_has_room", lambda: len(bench.probes) < room[0])
+    (bench.folder / "a.csv").write_text(HEADER + "".join(line(k / 1000.0) for k in range(0, 120000, 60)))
+    bench.look()
+    assert len(bench.probes) == 100 and sum(writes) == 1
+    room[0] = 10**6
+    before = len(bench.probes)
+    assert bench.watched.poll() and len(bench.probes) - before <= READ_AT_ONCE
+    while bench.watched.read_on():
+        pass
+    assert len(bench.probes) == 2000 and len(set(bench.minutes)) == 2000 and not bench.reports
+    bench.watched.keep()
+    bench.restart()
+    bench.look()
+    assert len(bench.probes) == 2000
 
 
 @settings(max_examples=100, deadline=None)

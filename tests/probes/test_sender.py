@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from compensator.probes.probe import Probe
+from compensator.probes.probe import Probe, Reply
 from compensator.probes.sender import WAITING, Outcome, Sender
 from tests.probes.helpers import Sink, until
 
@@ -97,3 +97,31 @@ def test_a_flood_pushes_the_oldest_out() -> None:
     for at_s in range(WAITING + 3):
         bench.submit(at_s)
     assert bench.outcomes == [(0, "given up"), (1, "given up"), (2, "given up")]
+
+
+async def test_what_the_service_has_no_room_for_is_sent_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    send, full = bench.sink.send, [3]
+
+    def crowded(probe: Probe) -> Reply:
+        full[0] -= 1
+        return (
+            Reply(False, "probe: 20 wait for the next sample already", "probe_too_many")
+            if full[0] >= 0
+            else send(probe)
+        )
+
+    monkeypatch.setattr(bench.sink, "send", crowded)
+    bench.submit(1000)
+    bench.submit(1001)
+    await until(lambda: len(bench.outcomes) == 2, "both")
+    assert bench.outcomes == [(1000, "sent"), (1001, "sent")]
+    assert sum("probe_too_many" in report for report in bench.reports) == 1
+
+
+def test_half_of_the_places_is_for_sources_that_cannot_wait() -> None:
+    bench = Bench()
+    while bench.sender.has_room():
+        bench.submit(1000)
+    for at_s in range(WAITING // 2):
+        bench.submit(at_s)
+    assert not bench.outcomes

@@ -112,9 +112,10 @@ def _check_offset(probe: ReceivedProbe, state: ProbingState, settings: ProbeSett
 
 def _is_same(probe: ReceivedProbe, known: KnownProbe) -> bool:
     request = probe.request
+    if request.feature != known.feature:  # Two features of one cycle may have one time.
+        return False
     apart_ns = abs(request.time_utc_ns - known.time_ns)
-    values = (request.measured_um, request.offset_applied_um, request.feature)
-    equal = values == (known.measured_um, known.offset_applied_um, known.feature)
+    equal = (request.measured_um, request.offset_applied_um) == (known.measured_um, known.offset_applied_um)
     return apart_ns == 0 or (equal and apart_ns < SAME_S * NS)
 
 

@@ -157,9 +157,17 @@ class Probing:
             refused=before.refused,
         )
 
-    def set_zero(self, time_ns: int) -> None:
-        """Forget what belongs to the previous zero; what the probes have shown about the gains stays."""
-        self._correction = self._correction.at_zero()
+    def set_zero(self, time_ns: int, contributions_um: Sequence[float] | None) -> None:
+        """Forget what belongs to the previous zero; what the probes have shown about the gains stays.
+
+        Parameters
+        ----------
+        time_ns : int
+            Time of the zero, ns since 1970 UTC.
+        contributions_um : sequence of float, optional
+            Share of each path and effect at the zero; None if they are counted from it.
+        """
+        self._correction = self._correction.at_zero(contributions_um or [0.0] * len(self._names))
         self._state = ProbingState(correction={}, known=self._state.known, zero_ns=time_ns)
 
     def pass_time(self, contributions_um: Sequence[float], minutes: float) -> None:

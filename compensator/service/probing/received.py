@@ -47,7 +47,7 @@ class ReceivedProbe:
 
     @classmethod
     def of(cls, recorded: Probe, *, is_checked: bool = False) -> ReceivedProbe | None:
-        """Return a recorded probe as it arrived; None for a payload that could not be read."""
+        """Return a recorded probe as it arrived; None for one that was not decided."""
         if not recorded.is_read:
             return None
         request = ProbeRequest(
@@ -131,8 +131,13 @@ def recorded_probe(machine: str, seq: int, probe: ReceivedProbe, verdict: Verdic
     )
 
 
-def unread_probe(machine: str, probe_utc_ns: int, text: str, by: str, by_proof: str) -> Probe:
-    """Return the message for a payload that could not be read; its number is set when it is written."""
+def unused_probe(
+    machine: str, probe_utc_ns: int, code: ProbeCode, text: str, by: str = "", by_proof: str = "none"
+) -> Probe:
+    """Return the message for a payload that could not be read, or for which there was no room.
+
+    It has no measured value, so that a replay does not decide it; its number is set when it is written.
+    """
     return Probe(
         schema=SCHEMA,
         machine=machine,
@@ -149,7 +154,7 @@ def unread_probe(machine: str, probe_utc_ns: int, text: str, by: str, by_proof: 
         by=by,
         by_proof=by_proof,
         taken=False,
-        code=ProbeCode.MALFORMED,
+        code=code,
         text=text,
         deformation_um=None,
         predicted_um=None,

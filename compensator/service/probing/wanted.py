@@ -13,6 +13,9 @@ from compensator.service.probing.state import ProbingState
 #: How far ahead the next probe is foreseen, min, and the step of the forecast.
 _AHEAD_MIN, _FORECAST_MIN = 1440.0, 60.0
 
+#: From this probability on that a probe which was taken was wrong, another one is wanted.
+_DOUBTED = 0.1
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
@@ -39,7 +42,7 @@ def wanted_after(
     y_std_um : float
         Standard deviation of the prediction, µm.
     tolerance_um : float, optional
-        The tolerance, µm; without it only the first probe and the one after a refused one are wanted.
+        The tolerance, µm; without it only the first probe and the one after a refused or doubtful one are wanted.
     """
     samples = state.samples
     if not samples or math.isnan(samples[-1].offset_um) or samples[-1].is_held:
@@ -48,8 +51,10 @@ def wanted_after(
     why: str = ""
     if state.refused:
         why = state.refused
-    elif not correction.active:
+    elif not correction.is_probed:
         why = ProbeCode.FIRST
+    elif correction.doubt > _DOUBTED:
+        why = ProbeCode.DOUBTED
     elif tolerance_um is not None and y_std_um > tolerance_um:
         why = ProbeCode.DEVIATION
     by_ns = samples[-1].time_ns if why else _exceeded_ns(state, correction, y_std_um, tolerance_um)
