@@ -145,6 +145,16 @@ class ProbeCorrection:
             total += gain * share
         return total
 
+    def doubted_um(self, contributions_um: Sequence[float]) -> float:
+        """Return the part of `std_um` that the doubt of the probe on probation adds, µm; 0 where none is."""
+        if len(self._means) == 1:
+            return 0.0
+        right, wrong = self._means
+        apart = right[0] - wrong[0]
+        for one, other, share in zip(right[1:], wrong[1:], contributions_um, strict=True):
+            apart += (one - other) * share
+        return math.sqrt(self._doubt * (1.0 - self._doubt)) * abs(apart)
+
     def std_um(self, contributions_um: Sequence[float]) -> float:
         """Return the standard deviation of the corrected deformation, µm: what the probes leave unknown.
 
@@ -289,8 +299,9 @@ class ProbeCorrection:
     def _mix(self) -> None:
         """Keep mean, covariance and growth of both banks together, so that a sample costs little."""
         states = 1 + len(self.names)
-        both = mixed([bank.mixture(states, zeroed=not self.is_probed) for bank in self._banks()], self._probabilities())
-        self._mean, self._covariance, self._growth = both
+        found = [bank.mixture(states, zeroed=not self.is_probed) for bank in self._banks()]
+        self._means = [each.mean for each in found]
+        self._mean, self._covariance, self._growth = mixed(found, self._probabilities())
 
     def _probabilities(self) -> list[float]:
         return [1.0] if self._without is None else [1.0 - self._doubt, self._doubt]

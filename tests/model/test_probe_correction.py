@@ -209,6 +209,7 @@ def test_a_doubtful_probe_acts_in_part_and_its_doubt_is_in_the_deviation(wrong_u
     variance = (1.0 - doubt) * right.std_um(now) ** 2 + doubt * wrong.std_um(now) ** 2
     assert found.correction_um(now) == pytest.approx(right.correction_um(now) - doubt * apart)
     assert found.std_um(now) == pytest.approx(math.sqrt(variance + doubt * (1.0 - doubt) * apart**2))
+    assert found.doubted_um(now) == pytest.approx(math.sqrt(doubt * (1.0 - doubt)) * abs(apart))
     assert doubt < 0.1 or found.correction_um(now) < 2.2 * found.std_um(now)
 
 

@@ -25,13 +25,15 @@ from compensator.demo.machine import configuration
 from compensator.errors import ServiceError
 from compensator.messages import ProbeRequest, number
 from compensator.model.model_file import parse_model
+from compensator.model.probe_correction import ProbeCorrection
 from compensator.recording.container import Container
 from compensator.recording.reading import recordings
 from compensator.service.command_client import send_probe
 from compensator.service.compensation import Compensation
 from compensator.service.probing.past import offsets_at, predicted_at, published_at
 from compensator.service.probing.received import ProbeRefused, read_probe
-from compensator.service.probing.state import PastSample
+from compensator.service.probing.state import PastSample, ProbingState
+from compensator.service.probing.wanted import wanted_after
 from compensator.service.publisher import Publisher
 from compensator.service.state import decode_state
 from tests.audit.made import CONFIG, other_model
@@ -346,6 +348,21 @@ async def test_a_doubtful_probe_asks_for_another_one(tmp_path: Path) -> None:
     await machine.run(14)
     assert wanted_because(machine) != ProbeCode.DOUBTED
     assert abs(machine.left_um()[-1]) < 1.5 and nothing_jumped(machine)
+
+
+def test_a_doubt_that_says_nothing_any_more_asks_for_nothing() -> None:
+    """Both hypotheses agree after some probes; their probabilities stay as they were."""
+    correction, rng, shares = ProbeCorrection(["DTF", "TDTF"]), np.random.default_rng(1), (20.0, 2.0)
+    doubts, asked = 0, 0
+    for k in range(60):
+        correction.step(shares, 60.0)
+        wrong_um = 5.5 if k == 20 else 0.0
+        correction.update(22.0 + wrong_um + rng.normal(0.0, 1.5), 1.5, 22.0, shares)
+        doubts += correction.doubt > 0.1
+        last = PastSample(0, 22.0, 0.0, shares, 0.0, 0.0, 0.0, False)
+        state = ProbingState(correction={}, samples=[last])
+        asked += wanted_after(state, correction, 1.0, None).why == ProbeCode.DOUBTED
+    assert doubts > 10 and asked < 5, (doubts, asked)
 
 
 async def test_a_probe_during_a_hold_and_one_from_before_it(tmp_path: Path) -> None:

@@ -53,12 +53,21 @@ def wanted_after(
         why = state.refused
     elif not correction.is_probed:
         why = ProbeCode.FIRST
-    elif correction.doubt > _DOUBTED:
+    elif _is_doubted(correction, samples[-1].contributions_um):
         why = ProbeCode.DOUBTED
     elif tolerance_um is not None and y_std_um > tolerance_um:
         why = ProbeCode.DEVIATION
     by_ns = samples[-1].time_ns if why else _exceeded_ns(state, correction, y_std_um, tolerance_um)
     return Wanted(is_wanted=bool(why), by_ns=by_ns, why=why, std_um=y_std_um, tolerance_um=tolerance_um)
+
+
+def _is_doubted(correction: ProbeCorrection, contributions_um: tuple[float, ...]) -> bool:
+    """Return whether the doubt of a probe that was taken is most of what is not known now.
+
+    A doubt that later probes cannot decide, because both hypotheses say the same by now, asks for none.
+    """
+    doubted_um = correction.doubted_um(contributions_um)
+    return correction.doubt > _DOUBTED and 2.0 * doubted_um**2 > correction.std_um(contributions_um) ** 2
 
 
 def _exceeded_ns(
