@@ -297,6 +297,8 @@ def test_over_weeks_the_folder_stays_below_the_limit(tmp_path: Path) -> None:
             removed += len(data["removed"])
             service.note("recording", text, data)
     service.stop()
+    # The file that ends now may be the one that passes the limit.
+    removed += sum(len(data["removed"]) for _, data in service.recorder.remarks())
     assert max(sizes) <= keep_mb * 1e6 and max(sizes[:4]) < 0.7 * max(sizes[10:])
     left = recordings(tmp_path, MACHINE)
     assert removed == 21 - len(left) and len(left) > 5
