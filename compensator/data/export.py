@@ -57,15 +57,16 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     """
     paths = [Path(recordings)] if isinstance(recordings, (str, os.PathLike)) else [Path(path) for path in recordings]
     rows: dict[int, dict[str, Any]] = {}
-    probes: list[Probe] = []
+    probes: list[list[Probe]] = []
     periods_s: dict[int, float] = {}
     machines: dict[str, Path] = {}
     for recording in paths:
         before = len(rows)
+        probes.append([])
         for message in messages(recording, ("sample", "estimate", "offset", "probe"), prefix=machine):
             machines.setdefault(message.machine, recording)
             if isinstance(message, Probe):
-                probes.append(message)
+                probes[-1].append(message)
                 continue
             if isinstance(message, Sample):
                 periods_s[message.seq] = message.period_s
@@ -90,12 +91,12 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
 
 
 def _add_probes(
-    name: str, rows: dict[int, dict[str, Any]], probes: Sequence[Probe], periods_s: dict[int, float]
+    name: str, rows: dict[int, dict[str, Any]], recorded: Sequence[Sequence[Probe]], periods_s: dict[int, float]
 ) -> None:
     """Add `y_um` to the rows in whose time a probe was measured; a probe outside of all samples is left out."""
-    if not probes or any(row.get("y_um") is not None for row in rows.values()):
+    if not any(recorded) or any(row.get("y_um") is not None for row in rows.values()):
         return
-    probes, remarks = measured_probes(name, [probes])
+    probes, remarks = measured_probes(name, recorded)
     for remark in remarks:
         log.warning("%s", remark.marked)
     ends = sorted((rows[seq]["_ns"], seq) for seq in periods_s)

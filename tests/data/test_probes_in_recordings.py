@@ -117,3 +117,22 @@ async def test_a_mismatch_among_probes_with_an_offset_is_no_measured_y(tmp_path:
     (remark,) = found.remarks
     assert remark.code == "probes_left_out"
     assert "1 refused probe(s) with offset_applied_um = 0" in remark
+
+
+async def test_each_recording_says_by_itself_whether_the_control_applied_nothing(tmp_path: Path) -> None:
+    """A calibration and a shift after it, exported together: the same values as DATA of both has."""
+    config = PROBED.replace(b"measured_max_um = 60.0", b"measured_max_um = 200.0")
+    machine = ProbedMachine(tmp_path, noise_um=0.0, config=config)
+    for sample in range(60, 150, 30):
+        machine.at_sample[sample] = lambda: machine.probe(measured_um=machine.truth_um(), offset_applied_um=0.0)
+    await machine.run(160)
+    machine.each_hour(310, first=220, every=30)
+    await machine.run(160)
+    files = recordings(machine.recordings, MACHINE)
+    assert len(files) == 2 and {"probe_mismatch", "taken"} <= set(machine.codes())
+    read_y = read(machine).table.columns["y_um"]
+    assert np.isfinite(read_y).sum() == len(machine.recorded())
+    tc.export(files, tmp_path / "both.csv")
+    with (tmp_path / "both.csv").open() as file:
+        exported = [float(row["y_um"]) for row in csv.DictReader(file) if row["y_um"]]
+    assert exported == pytest.approx(read_y[np.isfinite(read_y)])
