@@ -187,9 +187,7 @@ class FilterBank:
         self._correct_states(expected)
         each = zip(self.weights, expected.innovation.tolist(), expected.variance.tolist(), strict=True)
         found = [weight * _density(innovation, variance) for weight, innovation, variance in each]
-        total = 0.0
-        for weight in found:
-            total += weight
+        total = _total(found)
         if total > 0.0:  # Else it was so far off that no density is left.
             self.weights = [weight / total for weight in found]
         self.mean_weights = list(self.weights)
@@ -204,10 +202,7 @@ class FilterBank:
         """Return the weights with each walk's as it is, and every level as probable as before the first value."""
         found = []
         for walk in range(len(WALKS_UM)):
-            total = 0.0
-            for start in _GROUPS:
-                total += self.weights[start + walk]
-            found.append(total / len(LEVELS_UM))
+            found.append(_total([self.weights[start + walk] for start in _GROUPS]) / len(LEVELS_UM))
         return found * len(LEVELS_UM)
 
     def copy(self) -> FilterBank:
@@ -309,6 +304,14 @@ def _mean(weights: Sequence[float], values: Sequence[float]) -> float:
     return total
 
 
+def _total(values: Sequence[float]) -> float:
+    """Return a sum in the order of the values: newer Pythons compensate `sum`, which gives other bits."""
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
 def _of_zeroed(weights: Sequence[float]) -> list[float]:
     """Return weights of the filters that knew the level, with those of the others added to them."""
     found = [0.0] * SIZE
@@ -322,9 +325,7 @@ def _spread(weights: Sequence[float], share: float) -> list[float]:
     found = []
     for start in _GROUPS:
         group = weights[start : start + len(WALKS_UM)]
-        total = 0.0
-        for weight in group:
-            total += weight
+        total = _total(group)
         found += [(1.0 - share) * w + share * total * own for w, own in zip(group, WALK_WEIGHTS, strict=True)]
     return found
 

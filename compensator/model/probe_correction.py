@@ -172,6 +172,15 @@ class ProbeCorrection:
             variance += h[i] * (2.0 * part + h[i] * (row[i] + self._waiting * self._growth[i]))
         return math.sqrt(max(variance, 0.0))
 
+    def growth_um2_per_min(self, contributions_um: Sequence[float]) -> float:
+        """Return by how much the square of `std_um` grows in a minute without probes, as the states walk, µm²."""
+        if not self.active:
+            return 0.0
+        total = 0.0
+        for growth, share in zip(self._growth, (1.0, *contributions_um), strict=True):
+            total += growth * share * share
+        return total
+
     # ------------------------------------------------------------------ each probe
 
     def update(

@@ -13,7 +13,7 @@ from compensator.probes.folder import Handled, WatchedFolder
 from compensator.probes.linuxcnc import ProbeFile
 from compensator.probes.printed import PrintedProbes
 from compensator.probes.probe import Probe, ProbeSink
-from compensator.probes.sender import Outcome, Report, Sender
+from compensator.probes.sender import Report, Sender
 from compensator.probes.settings import ProbeSettings
 from compensator.probes.stream import Stream
 from compensator.receiver.applied_record import applied_at
@@ -60,9 +60,6 @@ async def serve(
     def submitting(source: str) -> Callable[[Probe], None]:
         return lambda probe: sender.submit(probe, source)
 
-    def submit_line(probe: Probe, source: str, done: Callable[[Outcome], None]) -> None:
-        sender.submit(probe, source, done)
-
     runs: list[Coroutine[Any, Any, None]] = []
     watching: list[WatchedFolder] = []
     if settings.folders:
@@ -72,7 +69,7 @@ async def serve(
             watched = WatchedFolder(
                 folder,
                 handled,
-                submit_line,
+                sender.submit,
                 applied,
                 report,
                 send_within_s=within_s,

@@ -121,10 +121,10 @@ class Sender:
         self._trouble = ""
         if self._waiting and self._waiting[0] is first:  # else it was given up meanwhile
             self._waiting.popleft()
-        outcome = "sent" if reply.ok else "refused"
+        outcome: Outcome = "sent" if reply.ok else "refused"
         code = f" [{reply.code}]" if reply.code else ""
         self._report(f"{first.source}: {outcome}: {first.probe.text}: {reply.text}{code}")
-        first.done("sent" if reply.ok else "refused")
+        first.done(outcome)
         return True
 
     def _give_up(self, waiting: _Waiting, why: str) -> None:

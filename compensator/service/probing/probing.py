@@ -38,8 +38,8 @@ _KNOWN = 100
 #: Refusals after which no other probe is wanted: the same value is known already, or none can be used.
 _NOT_ASKED = (ProbeCode.DUPLICATE, ProbeCode.TOO_MANY_FEATURES, ProbeCode.AXIS)
 _WORDS = {"": "taken", ProbeCode.OUTLIER: "refused", ProbeCode.BELIEVED: "taken against earlier ones"}
-#: From this standard deviation on nothing was known about the value, µm.
-_UNKNOWN_UM = 200.0
+#: From this standard deviation on nothing was known about the value: it is the first of its feature, µm.
+UNKNOWN_UM = 200.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -289,7 +289,7 @@ class Probing:
             self._state.features = [*self._state.features, request.feature]
         self._state.refused = "" if found.taken else ProbeCode.OUTLIER
         std_um = found.innovation_std_um
-        known = f"±{std_um:.2f} µm" if std_um < _UNKNOWN_UM else "anything: the first of this feature"
+        known = f"±{std_um:.2f} µm" if std_um < UNKNOWN_UM else "anything: the first of this feature"
         text = (
             f"probe {_WORDS[found.reason or '']}: deformation {deformation_um:.2f} µm, "
             f"{found.innovation_um:+.2f} µm from the prediction (expected {known})"

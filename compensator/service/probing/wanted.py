@@ -10,8 +10,8 @@ from compensator.codes import ProbeCode
 from compensator.model.probe_correction import ProbeCorrection
 from compensator.service.probing.state import ProbingState
 
-#: How far ahead the next probe is foreseen, min, and the step of the forecast.
-_AHEAD_MIN, _FORECAST_MIN = 1440.0, 60.0
+#: How far ahead the next probe is foreseen, min.
+_AHEAD_MIN = 1440.0
 
 #: From this probability on that a probe which was taken was wrong, another one is wanted.
 _DOUBTED = 0.1
@@ -77,11 +77,7 @@ def _exceeded_ns(
     if tolerance_um is None:
         return None
     last = state.samples[-1]
-    ahead = ProbeCorrection.from_dict(correction.to_dict())
-    now_um2 = ahead.std_um(last.contributions_um) ** 2
-    ahead.step(last.contributions_um, _FORECAST_MIN)
-    # The variance grows in proportion to the time, as the states walk.
-    growth = (ahead.std_um(last.contributions_um) ** 2 - now_um2) / _FORECAST_MIN
+    growth = correction.growth_um2_per_min(last.contributions_um)
     if growth <= 0.0:
         return None
     minutes = max(tolerance_um**2 - y_std_um**2, 0.0) / growth

@@ -28,6 +28,7 @@ from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
 from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
+from compensator.service.probing import UNKNOWN_UM
 from compensator.service.replay import RecordedStep, steps_of
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import RecordedRun, Window, window_of
@@ -43,8 +44,6 @@ WORSE_PART = 0.05
 FEWEST = 8
 #: Length of a block, min, and the part of it that must be measured.
 BLOCK_MIN, _MEASURED = 30.0, 0.5
-#: A probe whose deviation is not expected to be smaller than this is the first of its feature, µm.
-_UNKNOWN_UM = 200.0
 _UNUSABLE = (Reason.COLD_START, Reason.T_Q_MISSING, Reason.AT_MISSING, Reason.T_Q_AT_EXCHANGED)
 
 
@@ -214,7 +213,7 @@ def _compare(
         (number(own.innovation_um), number(other.innovation_um))
         for own, other in zip(present.probes, candidate.probes, strict=True)
         if (own.taken or other.taken)
-        and max(number(own.innovation_std_um), number(other.innovation_std_um)) < _UNKNOWN_UM
+        and max(number(own.innovation_std_um), number(other.innovation_std_um)) < UNKNOWN_UM
     ]
     is_measured = math.isfinite(sum(residuals))
     if _sensor_suspected(step):
