@@ -89,7 +89,7 @@ def _suspects(fit: Fit, most: int) -> list[int]:
     rest = fit.rest
     while True:
         columns = np.column_stack([fit.columns, _spikes(points, found)])
-        away = _deviations(points, rest, columns, fit.fixed)[0]
+        away = _deviations(points, _precision(points, rest), columns, fit.fixed)[0]
         away[found] = 0.0
         worst = int(np.argmax(np.abs(away)))
         if abs(away[worst]) < SUSPECTED:
@@ -106,10 +106,10 @@ def _improbable(points: Points, fit: Fit, suspects: list[int]) -> tuple[list[int
     Those that agree with a suspect beside them are not.
     """
     whole = fit_terms(Likelihood(points, fit.rest), fit.starts(), evaluations=1)
-    away, missed = np.zeros(len(suspects)), np.zeros(len(suspects))
+    away, missed, precision = np.zeros(len(suspects)), np.zeros(len(suspects)), _precision(points, fit.rest)
     for k, one in enumerate(suspects):
         others = _spikes(points, [other for other in suspects if other != one])
-        deviations, innovations = _deviations(points, fit.rest, np.column_stack([whole.columns, others]), whole.fixed)
+        deviations, innovations = _deviations(points, precision, np.column_stack([whole.columns, others]), whole.fixed)
         away[k], missed[k] = deviations[one], innovations[one]
     agree = _agree_um(points)
     kept = []
@@ -135,11 +135,14 @@ def _alike(missed: Vector, agree_um: float) -> str:
     )
 
 
-def _deviations(points: Points, rest: Rest, columns: Matrix, fixed: Vector) -> tuple[Vector, Vector]:
+def _precision(points: Points, rest: Rest) -> Matrix:
+    """Return the inverse of the values' covariance without effects."""
+    table = dense(Likelihood(points, rest))
+    return np.asarray(table.T @ table)
+
+
+def _deviations(points: Points, precision: Matrix, columns: Matrix, fixed: Vector) -> tuple[Vector, Vector]:
     """Return how far each value is from what all others predict: in standard deviations, and in µm."""
-    likelihood = Likelihood(points, rest)
-    table = dense(likelihood)
-    precision = table.T @ table
     turned = precision @ columns
     inner = np.eye(columns.shape[1]) + columns.T @ turned
     precision = precision - turned @ np.linalg.solve(inner, turned.T)

@@ -103,7 +103,7 @@ class Deciding:
         self._joint: dict[tuple[int, float], _Joint] = {}
         #: Time between two probes of a test, min: as in the record, or less where that does not decide. 0: always.
         self._every_min: tuple[float, ...] = (0.0,)
-        if trials.evidence.noise.freedom:
+        if trials.evidence.is_sparse:
             every = Points(trials.evidence).period_min
             self._every_min = (every, PROBED_MIN) if every > PROBED_MIN else (every,)
 

@@ -83,7 +83,7 @@ def diagnose(
     evidence = _evidence(model, runs)
     progress(0, len(list(evidence.blocks(FOLDS))) + 1)
     found, left_out = findings_of(evidence), list[Remark]()
-    if evidence.noise.freedom:
+    if evidence.is_sparse:
         found, left_out = without_chips(found, partial(_evidence, model))
         evidence = found.search.evidence
     deciding = Deciding(Trials(evidence))
@@ -91,7 +91,7 @@ def diagnose(
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects]
     held_out = _held_out(found, places, progress, executor_map)
-    few = bool(evidence.noise.freedom)
+    few = evidence.is_sparse
     beside = found.remainder is not None and found.explains and not evidence.free_paths
     if beside and rms_of(held_out.whole) > rms_of(held_out.named):
         # What explains nothing has to show that it helps.
@@ -251,7 +251,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
     after, searched = rms_without(found.responses), search.rms(selection.fit)
     effects = []
     errors = standard_errors(selection.fit)
-    few = bool(evidence.noise.freedom)
+    few = evidence.is_sparse
     if few:
         errors = with_time_errors(selection.fit, errors)
     for i, (term, std, rivals) in enumerate(zip(found.terms, errors, selection.rivals, strict=True)):
@@ -298,7 +298,7 @@ def _extended(
     kept_out = [effect.signal[evidence.used] for effect in effects if not effect.effect.deployable]
     left = found.rest_um**2 + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
     extended = dataclasses.replace(base, effects=(*model.effects, *deployed), sha256="")
-    if not kept_out and not evidence.noise.freedom:
+    if not kept_out and not evidence.is_sparse:
         # Half what the fit expects, half what held-out blocks show: the one is too small, the other has few blocks.
         shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
         left = 0.5 * (left + shown)
@@ -322,7 +322,7 @@ def _refitted(old: ThermalModel, new: ThermalModel) -> str:
 def _how(evidence: Evidence) -> str:
     """Return how the errors are measured."""
     count = len(list(evidence.blocks(FOLDS)))
-    words = HELD_OUT_VALUES if evidence.noise.freedom else HELD_OUT
+    words = HELD_OUT_VALUES if evidence.is_sparse else HELD_OUT
     if evidence.holds_out_recordings:
         words = HELD_OUT_RECORDINGS.format(count=count)
     return words + WITH_PATHS * evidence.free_paths
@@ -364,7 +364,7 @@ def _verdict(found: Findings, held_out: _HeldOut, extended: ThermalModel) -> Ver
     if not any(observed):
         return "unexplained"
     holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)
-    if evidence.noise.freedom:
+    if evidence.is_sparse:
         # What few values were fitted by is judged by those that it was not fitted to.
         level = VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count)
         holds = holds and rms_of(held_out.whole) ** 2 <= level

@@ -97,7 +97,7 @@ class Evidence:
     @property
     def is_sparse(self) -> bool:
         """Whether every run has Y measured now and then only, as by a touch probe."""
-        return all(run.has_sparse_y for run in self.runs)
+        return self.noise.freedom > 0
 
     @property
     def sparse(self) -> tuple[bool, ...]:
@@ -139,7 +139,7 @@ class Evidence:
             yield from self._recordings(count)
             return
         at = np.flatnonzero(self.used)
-        if self.noise.freedom:
+        if self.is_sparse:
             for first in range(count):
                 yield np.isin(np.arange(self.used.size), at[first::count])
             return
@@ -168,7 +168,7 @@ class Evidence:
         """Return the evidence without some of its samples."""
         used = self.used & ~mask
         basis = _basis(self.nuisances, used)
-        freedom = _freedom(used, basis) if self.noise.freedom else 0
+        freedom = _freedom(used, basis) if self.is_sparse else 0
         return dataclasses.replace(
             self,
             residual=np.where(used, self.residual, 0.0),

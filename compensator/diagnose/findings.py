@@ -11,7 +11,6 @@ from compensator.arrays import Vector
 from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term
-from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.search import MARGIN, Search, Selection
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.regression import AMBIENT, DRIVE, Regression
@@ -151,9 +150,8 @@ def _remainder(
 
 def _log_evidence(fit: Fit) -> float:
     """Return the logarithm of the probability of the data with a fit's effects as they are."""
-    likelihood = Likelihood(fit.likelihood.points, fit.rest)
-    left = likelihood.left_by(fit.added)
-    return likelihood.log_prior - 0.5 * (float(left @ left) + likelihood.log_det)
+    left = fit.likelihood.left_by(fit.added)
+    return fit.likelihood.log_prior - 0.5 * (float(left @ left) + fit.likelihood.log_det)
 
 
 def with_paths(model: ThermalModel, found: Regression) -> tuple[ThermalModel, Regression | None]:

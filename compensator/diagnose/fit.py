@@ -96,6 +96,15 @@ class Fit:
         """Return the columns of the amplitudes, and the data without what has none, as a likelihood projects them."""
         return likelihood.projected(self.columns), likelihood.left_by(self.fixed)
 
+    def solved(self, likelihood: Likelihood) -> tuple[Matrix, Matrix, Vector]:
+        """Return the projected columns of the amplitudes, what solves data for them, and what all effects leave.
+
+        The amplitudes stay free: they are projected out as far as their prior lets them.
+        """
+        kept, target = self.projected(likelihood)
+        inner = np.asarray(np.linalg.solve(np.eye(kept.shape[1]) + kept.T @ kept, kept.T), dtype=np.float64)
+        return kept, inner, target - kept @ (inner @ target)
+
     def starts(self, without: int | None = None) -> list[Start]:
         """Return where another fit begins, with all terms or all but one."""
         return [term.start for i, term in enumerate(self.terms) if i != without]

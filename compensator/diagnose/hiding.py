@@ -95,8 +95,7 @@ def hiding(selection: Selection, cost: float) -> Hiding:
     """
     fit = selection.fit
     likelihood, points = fit.likelihood, fit.likelihood.points
-    kept = likelihood.projected(fit.columns)
-    inner = np.linalg.solve(np.eye(kept.shape[1]) + kept.T @ kept, kept.T)
+    kept, inner, _ = fit.solved(likelihood)
     found, named = [], {(kind, where) for kind, where, _ in fit.places}
     for kind, path, course in _courses(points.evidence):
         if (kind, path) in named:

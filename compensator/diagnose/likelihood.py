@@ -126,7 +126,9 @@ class Points:
         self.own_um = (
             self.spread_um
             if evidence.free_paths
-            else max(noise.own_error_um, (EXACT_OWN if self.is_exact or noise.freedom else 1.0) * evidence.probe_um)
+            else max(
+                noise.own_error_um, (EXACT_OWN if self.is_exact or evidence.is_sparse else 1.0) * evidence.probe_um
+            )
         )
         point_noise = evidence.probe_um / math.sqrt(stride)
         if not self.is_exact:
@@ -227,7 +229,7 @@ class Points:
         ends = np.cumsum([self.zeros.shape[1], self.starts_of_modes.shape[1], self.fast.shape[1]]).tolist()
         sized = [slice(ends[0], ends[1]), slice(ends[1], ends[2])]
         # The noise of values measured now and then is stated.
-        searched = np.arange(0 if self.is_exact and not self.evidence.noise.freedom else 1, 5)
+        searched = np.arange(0 if self.is_exact and not self.evidence.is_sparse else 1, 5)
         at = np.clip(_logs(start), self._typical - FURTHEST, self._typical + FURTHEST)
 
         def solved(logs: Vector) -> RandomColumns:

@@ -63,10 +63,7 @@ class Scan:
     def _gains(self, likelihood: Likelihood, fit: Fit) -> Matrix:
         """Return what each grid point adds to the logarithm of the evidence, amplitudes integrated out."""
         white = np.asarray(dense(likelihood).astype(np.float32) @ self._columns, dtype=np.float64)
-        kept, target = fit.projected(likelihood)
-        # The amplitudes of the fit stay free: their columns are projected out, as far as their prior lets them.
-        inner = np.linalg.solve(np.eye(kept.shape[1]) + kept.T @ kept, kept.T)
-        target = target - kept @ (inner @ target)
+        kept, inner, target = fit.solved(likelihood)
         cross, back = kept.T @ white, inner @ white
         products = white.T @ target
         squares = np.einsum("ij,ij->j", white, white) - np.einsum("ij,ij->j", cross, back)

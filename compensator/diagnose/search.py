@@ -113,7 +113,7 @@ class Search:
         unobserved = unobserved and not self.evidence.free_paths
         rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
         before = fit_terms(Likelihood(self.points, rest), [])
-        self._something_acts = bool(self.evidence.noise.freedom) and not self._leaves_noise(before)
+        self._something_acts = self.evidence.is_sparse and not self._leaves_noise(before)
         grown, undecided = self._grown(before, unobserved=unobserved)
         best = self._pruned(grown)
         if grown.terms and not best.terms:
@@ -210,7 +210,7 @@ class Search:
 
     def _undecided(self, candidates: Sequence[Fit], best: Fit) -> tuple[Fit, ...]:
         """Return the effects that may act, best first, where few values do not decide it."""
-        if not self.evidence.noise.freedom:
+        if not self.evidence.is_sparse:
             return ()
         least = -math.inf if self._something_acts else best.log_evidence + DOUBT
         return tuple(sorted((f for f in candidates if f.log_evidence > least), key=self.score, reverse=True))
@@ -288,7 +288,7 @@ class Search:
         noise = self.evidence.noise
         return (
             noise.own_error_um > 0.0
-            and not noise.freedom
+            and not self.evidence.is_sparse
             and noise.is_expected(self.rms(fit) ** 2 * self.evidence.count)
         )
 

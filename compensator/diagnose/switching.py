@@ -69,14 +69,13 @@ class _Pursuit:
         likelihood = Likelihood(points, rest)
         self._evidence, self._averaged = points.evidence, points.averaged
         self._projection = dense(likelihood)
-        kept, target = fit.projected(likelihood)
-        self._residual = target - kept @ np.linalg.solve(np.eye(kept.shape[1]) + kept.T @ kept, kept.T @ target)
+        _, _, self._residual = fit.solved(likelihood)
         #: What a switching more costs: its time may be any, and its size.
         self._cost = math.log(points.count) + 2.0
         context = points.evidence.context
         self._period = context.period_min
         # Between two values measured now and then a lag does not show.
-        self._at_once = max(AT_ONCE * self._period, points.period_min if points.evidence.noise.freedom else 0.0)
+        self._at_once = max(AT_ONCE * self._period, points.period_min if points.evidence.is_sparse else 0.0)
         self._tau = context.tau()
         self._longest = max(context.minutes * LONGEST_SHARE, 2.0 * self._tau.low)
         self._grid: list[Time] = [
