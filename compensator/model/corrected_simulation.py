@@ -9,7 +9,7 @@ import numpy as np
 
 from compensator.arrays import Indices, Mask, Vector
 from compensator.data.record import SampledRecord
-from compensator.model.probe_correction import BELIEVED, ProbeCorrection
+from compensator.model.correction import BELIEVED, ProbeCorrection
 from compensator.model.simulation import COLUMNS as FREE_COLUMNS
 from compensator.model.simulation import columns_of, engine_at_start
 from compensator.model.thermal_model import ThermalModel

@@ -12,9 +12,9 @@ import pytest
 import compensator as tc
 from compensator.cli import main
 from compensator.codes import DataRemark
+from compensator.model.correction import ProbeCorrection
 from compensator.model.effects.gain import Gain
 from compensator.model.engine import Engine
-from compensator.model.probe_correction import ProbeCorrection
 from tests.diagnose.scenarios import record
 
 HOURS, STD_UM = 24.0, 1.5

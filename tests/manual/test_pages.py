@@ -35,7 +35,7 @@ SHOWN = {"summary.SHOWN", "advice_words.SAID", "ceiling._NAMED"}
 def constant(room: str, holder: str, name: str) -> Any:
     if holder == "Settings":
         return getattr(Settings(), name)
-    for place in (room, f"{room}.effects", "data", "recording", ""):
+    for place in (room, f"{room}.effects", f"{room}.correction", "data", "recording", ""):
         try:
             return getattr(importlib.import_module(".".join(filter(None, ("compensator", place, holder)))), name)
         except ModuleNotFoundError:

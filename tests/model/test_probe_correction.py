@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from compensator.model.probe_correction import BELIEVED, OUTLIER, ProbeCorrection
+from compensator.model.correction import BELIEVED, OUTLIER, ProbeCorrection
 
 NAMES = ["DTF", "TDTF", "1 input coolant_degc"]
 REST = [0.0, 0.0, 0.0]

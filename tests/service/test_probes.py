@@ -24,8 +24,8 @@ from compensator.config import Zenoh
 from compensator.demo.machine import configuration
 from compensator.errors import ServiceError
 from compensator.messages import ProbeRequest, number
+from compensator.model.correction import ProbeCorrection
 from compensator.model.model_file import parse_model
-from compensator.model.probe_correction import ProbeCorrection
 from compensator.recording.container import Container
 from compensator.recording.reading import recordings
 from compensator.service.command_client import send_probe

@@ -22,7 +22,7 @@ from compensator.config import Probe as ProbeSettings
 from compensator.errors import DataError
 from compensator.events import EventKind, Note, ProbeData
 from compensator.messages import Probe
-from compensator.model.probe_correction import ProbeCorrection
+from compensator.model.correction import ProbeCorrection
 from compensator.service.probing.checks import check_probe
 from compensator.service.probing.past import predicted_at
 from compensator.service.probing.received import ProbeRefused, ReceivedProbe, Verdict, recorded_probe

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from compensator.clock import NS
 from compensator.codes import ProbeCode
-from compensator.model.probe_correction import ProbeCorrection
+from compensator.model.correction import ProbeCorrection
 from compensator.service.probing.state import ProbingState
 
 #: How far ahead the next probe is foreseen, min.

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from compensator.arrays import Matrix, Vector
+from compensator.model.correction.mixture import Mixture, summed, weighted
 
 #: Walks of the offset, µm/√min, and how probable each is before the first value.
 WALKS_UM = (0.02, 0.05, 0.12, 0.28, 0.67, 1.6)
@@ -39,16 +40,36 @@ SIZE = len(WALKS_UM) * len(LEVELS_UM)
 
 
 @dataclass(frozen=True, slots=True)
+class Observation:
+    """A measured value.
+
+    Parameters
+    ----------
+    h : list of float, length n
+        How much of each state it contains.
+    value_um, std_um : float
+        The value beyond the free run, and its standard deviation, µm.
+    age_min : float
+        How long ago it was measured, when the offset had not walked as far yet, min.
+    """
+
+    h: list[float]
+    value_um: float
+    std_um: float
+    age_min: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Weighing:
-    """What a value says of the filters.
+    """How probable a value is, and how probable it makes each filter.
 
     Parameters
     ----------
     right : float
         Probability that the value is right.
     density : float
-        How well the bank foretold it, but for a factor that is common to all banks.
-    weights : list of float
+        Probability density of the value before it was measured, but for a factor that is common to all banks.
+    weights : list of float, length SIZE
         Weights of the filters after it.
     """
 
@@ -58,49 +79,46 @@ class Weighing:
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
-    """What each filter expected of a value.
+class _Innovations:
+    """The innovation of each filter.
 
     Parameters
     ----------
-    innovation : numpy.ndarray, shape (SIZE,)
-        The value less what was expected, µm.
+    value : numpy.ndarray, shape (SIZE,)
+        The measured value less the expected one, µm.
     variance : numpy.ndarray, shape (SIZE,)
         Its variance, µm².
-    column : numpy.ndarray, shape (SIZE, n)
-        Covariance of the states with it.
+    covariance : numpy.ndarray, shape (SIZE, n)
+        Covariance of the states with it, P h.
     """
 
-    innovation: Vector
+    value: Vector
     variance: Vector
-    column: Matrix
+    covariance: Matrix
+
+    def each(self) -> list[tuple[float, float]]:
+        """Return value and variance of each filter."""
+        return list(zip(self.value.tolist(), self.variance.tolist(), strict=True))
 
 
-class Mixture(NamedTuple):
-    """What a bank knows as a whole.
-
-    Parameters
-    ----------
-    mean : list of float
-        Mean of each state.
-    covariance : list of list of float
-        Lower triangle of their covariance.
-    growth : list of float
-        Growth of the variance of each state, 1/min.
-    """
-
-    mean: list[float]
-    covariance: list[list[float]]
-    growth: list[float]
-
-
-class FilterBank:
+class KalmanBank:
     """Kalman filters with the states offset, gains, zeros.
 
     Parameters
     ----------
     gain_stds, gain_walks : sequence of float
         Standard deviation of each relative gain before the first value, and its walk, 1/√min.
+
+    Attributes
+    ----------
+    x : numpy.ndarray, shape (SIZE, n)
+        States of each filter: offset, µm; gains, 1; zeros, µm.
+    P : numpy.ndarray, shape (SIZE, n, n)
+        Their covariance.
+    walks : numpy.ndarray, shape (SIZE, n)
+        Growth of their variance, 1/min.
+    weights, mean_weights : list of float, length SIZE
+        Probability of each filter, and the same for the mean, which a refused value must not move.
     """
 
     def __init__(self, gain_stds: Sequence[float], gain_walks: Sequence[float]) -> None:
@@ -112,7 +130,6 @@ class FilterBank:
         self.walks = np.tile(np.array([0.0, *gain_walks]) ** 2, (SIZE, 1))
         self.walks[:, 0] = np.tile(WALKS_UM, len(LEVELS_UM)) ** 2
         self.weights = [weight / len(LEVELS_UM) for _ in LEVELS_UM for weight in WALK_WEIGHTS]
-        # Those of the mean, which a refused value must not move.
         self.mean_weights = list(self.weights)
 
     def add_zero(self) -> None:
@@ -128,44 +145,68 @@ class FilterBank:
         states = np.arange(self.x.shape[1])
         self.P[:, states, states] += minutes * self.walks
 
-    def expected(self, h: Sequence[float], value_um: float, std_um: float, age_min: float = 0.0) -> Expected:
-        """Compare a value with what was expected of it.
+    # ------------------------------------------------------------------ a value
 
-        Parameters
-        ----------
-        h : sequence of float, length n
-            What of each state it shows.
-        value_um, std_um : float
-            The value and its standard deviation, µm.
-        age_min : float
-            How long ago it was measured, when the offset had not walked as far yet, min.
-        """
-        innovation = np.full(SIZE, value_um)
-        column = np.zeros_like(self.x)
-        for i, weight in enumerate(h):
-            innovation = innovation - weight * self.x[:, i]
-            column = column + weight * self.P[:, :, i]
-        variance = std_um**2 + age_min * self.walks[:, 0]
-        for i, weight in enumerate(h):
-            variance = variance + weight * column[:, i]
-        return Expected(innovation, variance, column)
-
-    def innovation(self, expected: Expected) -> tuple[float, float]:
+    def innovation(self, observation: Observation) -> tuple[float, float]:
         """Return the innovation of the whole bank, µm, and its variance, µm²."""
-        each = expected.innovation.tolist()
-        mean = _mean(self.mean_weights, each)
-        own = zip(each, expected.variance.tolist(), strict=True)
-        return mean, _mean(self.weights, [variance + (value - mean) ** 2 for value, variance in own])
+        each = self._innovations(observation).each()
+        mean = weighted(self.mean_weights, [value for value, _ in each])
+        return mean, weighted(self.weights, [variance + (value - mean) ** 2 for value, variance in each])
 
-    def weigh(self, expected: Expected) -> Weighing:
+    def weigh(self, observation: Observation) -> Weighing:
         """Judge the filters by a value, and the value by the filters.
 
         A wrong value is further off by about `WRONG_UM`. Where it is more probably wrong, the walks that allow it
         gain weight all the same: what moved may be the machine.
         """
+        return self._weigh(self._innovations(observation))
+
+    def correct(self, observation: Observation) -> None:
+        """Correct every filter by a value, and the weights."""
+        innovations = self._innovations(observation)
+        self._correct_states(innovations)
+        self.weights = self._weigh(innovations).weights
+        self.mean_weights = list(self.weights)
+
+    def correct_by_wrong(self, observation: Observation) -> None:
+        """Correct as by a value that is known to be wrong: with `WRONG_UM` in its standard deviation."""
+        innovations = self._innovations(replace(observation, std_um=math.hypot(observation.std_um, WRONG_UM)))
+        self._correct_states(innovations)
+        found = [weight * _density(*each) for weight, each in zip(self.weights, innovations.each(), strict=True)]
+        total = summed(found)
+        if total > 0.0:  # Else it was so far off that no density is left.
+            self.weights = [weight / total for weight in found]
+        self.mean_weights = list(self.weights)
+
+    def widen(self, jump_um: float, zero: int | None = None) -> None:
+        """Admit that the offset may have moved, and that its walk is not known any more.
+
+        Parameters
+        ----------
+        jump_um : float
+            How far, µm.
+        zero : int, optional
+            The state of a zero that is unknown again.
+        """
+        self.P[:, 0, 0] += jump_um**2
+        if zero is not None:
+            self.P[:, zero, zero] += ZERO_STD_UM**2
+        self.weights = _spread(self.weights, 1.0)
+
+    def _innovations(self, observation: Observation) -> _Innovations:
+        value = np.full(SIZE, observation.value_um)
+        covariance = np.zeros_like(self.x)
+        for i, weight in enumerate(observation.h):
+            value = value - weight * self.x[:, i]
+            covariance = covariance + weight * self.P[:, :, i]
+        variance = observation.std_um**2 + observation.age_min * self.walks[:, 0]
+        for i, weight in enumerate(observation.h):
+            variance = variance + weight * covariance[:, i]
+        return _Innovations(value, variance, covariance)
+
+    def _weigh(self, innovations: _Innovations) -> Weighing:
         right, wrong, found = 0.0, 0.0, []
-        each = zip(self.weights, expected.innovation.tolist(), expected.variance.tolist(), strict=True)
-        for weight, innovation, variance in each:
+        for weight, (innovation, variance) in zip(self.weights, innovations.each(), strict=True):
             as_right = (1.0 - WRONG_SHARE) * _density(innovation, variance)
             as_wrong = WRONG_SHARE * _density(innovation, variance + WRONG_UM**2)
             right += weight * as_right
@@ -176,38 +217,51 @@ class FilterBank:
             return Weighing(0.0, 0.0, list(self.weights))
         return Weighing(right / total, total, _spread([value / total for value in found], FORGETTING))
 
-    def correct(self, expected: Expected) -> None:
-        """Correct every filter by a value, and the weights."""
-        self._correct_states(expected)
-        self.weights = self.weigh(expected).weights
-        self.mean_weights = list(self.weights)
-
-    def correct_by_wrong(self, expected: Expected) -> None:
-        """Correct as by a value that is known to be wrong: it was expected with `WRONG_UM` in its deviation."""
-        self._correct_states(expected)
-        each = zip(self.weights, expected.innovation.tolist(), expected.variance.tolist(), strict=True)
-        found = [weight * _density(innovation, variance) for weight, innovation, variance in each]
-        total = _total(found)
-        if total > 0.0:  # Else it was so far off that no density is left.
-            self.weights = [weight / total for weight in found]
-        self.mean_weights = list(self.weights)
-
-    def _correct_states(self, expected: Expected) -> None:
-        gain = expected.column / expected.variance[:, None]
-        self.x = self.x + gain * expected.innovation[:, None]
-        self.P = self.P - gain[:, :, None] * expected.column[:, None, :]
+    def _correct_states(self, innovations: _Innovations) -> None:
+        gain = innovations.covariance / innovations.variance[:, None]
+        self.x = self.x + gain * innovations.value[:, None]
+        self.P = self.P - gain[:, :, None] * innovations.covariance[:, None, :]
         self.P = 0.5 * (self.P + self.P.transpose(0, 2, 1))
+
+    # ------------------------------------------------------------------ what is known
+
+    def mixture(self, n: int, *, zeroed: bool = False) -> Mixture:
+        """Return what is known of the first `n` states.
+
+        Parameters
+        ----------
+        n : int
+            How many.
+        zeroed : bool
+            Whether no value has come since the zero: the offset is that of the machine then, which was zeroed, and
+            not the level of the values, which may be any.
+        """
+        mean_weights, weights = self.mean_weights, self.weights
+        if zeroed:
+            mean_weights, weights = _of_zeroed(mean_weights), _of_zeroed(weights)
+        x, p, walks = self.x.tolist(), self.P.tolist(), self.walks.tolist()
+        means = [weighted(mean_weights, [row[i] for row in x]) for i in range(n)]
+        covariance = [
+            [
+                weighted(weights, [p[k][i][j] + (x[k][i] - means[i]) * (x[k][j] - means[j]) for k in range(SIZE)])
+                for j in range(i + 1)
+            ]
+            for i in range(n)
+        ]
+        return Mixture(means, covariance, [weighted(weights, [row[i] for row in walks]) for i in range(n)])
 
     def weights_of_walks(self) -> list[float]:
         """Return the weights with each walk's as it is, and every level as probable as before the first value."""
         found = []
         for walk in range(len(WALKS_UM)):
-            found.append(_total([self.weights[start + walk] for start in _GROUPS]) / len(LEVELS_UM))
+            found.append(summed([self.weights[start + walk] for start in _GROUPS]) / len(LEVELS_UM))
         return found * len(LEVELS_UM)
 
-    def copy(self) -> FilterBank:
+    # ------------------------------------------------------------------ state
+
+    def copy(self) -> KalmanBank:
         """Return a bank in the same state."""
-        found = FilterBank((), ())
+        found = KalmanBank((), ())
         found.x, found.P, found.walks = self.x.copy(), self.P.copy(), self.walks.copy()
         found.weights, found.mean_weights = list(self.weights), list(self.mean_weights)
         return found
@@ -237,80 +291,6 @@ class FilterBank:
             raise ValueError("a number is missing or not finite")
         self.x, self.P, self.weights, self.mean_weights = x, p, weights, mean_weights
 
-    def widen(self, jump_um: float, zero: int | None = None) -> None:
-        """Admit that the offset may have moved by this much, µm, and that its walk is not known any more.
-
-        Parameters
-        ----------
-        jump_um : float
-            How much, µm.
-        zero : int, optional
-            The state of a zero that is unknown again.
-        """
-        self.P[:, 0, 0] += jump_um**2
-        if zero is not None:
-            self.P[:, zero, zero] += ZERO_STD_UM**2
-        self.weights = _spread(self.weights, 1.0)
-
-    def mixture(self, n: int, *, zeroed: bool = False) -> Mixture:
-        """Return what is known of the first `n` states.
-
-        Parameters
-        ----------
-        n : int
-            How many.
-        zeroed : bool
-            Whether no value has come since the zero: the offset is that of the machine then, which was zeroed, and
-            not the level of the values, which may be any.
-        """
-        mean_weights, weights = self.mean_weights, self.weights
-        if zeroed:
-            mean_weights, weights = _of_zeroed(mean_weights), _of_zeroed(weights)
-        x, p, walks = self.x.tolist(), self.P.tolist(), self.walks.tolist()
-        means = [_mean(mean_weights, [row[i] for row in x]) for i in range(n)]
-        covariance = [
-            [
-                _mean(weights, [p[k][i][j] + (x[k][i] - means[i]) * (x[k][j] - means[j]) for k in range(SIZE)])
-                for j in range(i + 1)
-            ]
-            for i in range(n)
-        ]
-        return Mixture(means, covariance, [_mean(weights, [row[i] for row in walks]) for i in range(n)])
-
-
-def mixed(parts: Sequence[Mixture], probabilities: Sequence[float]) -> Mixture:
-    """Return several as one; its covariance includes how far their means lie apart."""
-    if len(parts) == 1:
-        return parts[0]
-    states = range(len(parts[0].mean))
-    mean = [_mean(probabilities, [part.mean[i] for part in parts]) for i in states]
-    covariance = [
-        [
-            _mean(
-                probabilities,
-                [part.covariance[i][j] + (part.mean[i] - mean[i]) * (part.mean[j] - mean[j]) for part in parts],
-            )
-            for j in range(i + 1)
-        ]
-        for i in states
-    ]
-    return Mixture(mean, covariance, [_mean(probabilities, [part.growth[i] for part in parts]) for i in states])
-
-
-def _mean(weights: Sequence[float], values: Sequence[float]) -> float:
-    total = 0.0
-    for weight, value in zip(weights, values, strict=True):
-        total += weight * value
-    return total
-
-
-def _total(values: Sequence[float]) -> float:
-    """Return a sum in the order of the values: newer Pythons compensate `sum`, which gives other bits."""
-    total = 0.0
-    for value in values:
-        total += value
-    return total
-
 
 def _of_zeroed(weights: Sequence[float]) -> list[float]:
     """Return weights of the filters that knew the level, with those of the others added to them."""
@@ -325,7 +305,7 @@ def _spread(weights: Sequence[float], share: float) -> list[float]:
     found = []
     for start in _GROUPS:
         group = weights[start : start + len(WALKS_UM)]
-        total = _total(group)
+        total = summed(group)
         found += [(1.0 - share) * w + share * total * own for w, own in zip(group, WALK_WEIGHTS, strict=True)]
     return found
 
@@ -336,15 +316,3 @@ def _density(innovation: float, variance: float) -> float:
     squared = tail * tail
     fourth = squared * squared
     return 1.0 / (math.sqrt(variance) * fourth * fourth)
-
-
-def transformed(matrix: Matrix, x: Matrix, p: Matrix) -> tuple[Matrix, Matrix]:
-    """Return T x and T P T' for each filter, summed in a fixed order."""
-
-    def times(right: Matrix) -> Matrix:
-        total = np.zeros((right.shape[0], matrix.shape[0], *right.shape[2:]))
-        for j in range(matrix.shape[1]):
-            total = total + np.multiply.outer(matrix[:, j], right[:, j]).swapaxes(0, 1)
-        return total
-
-    return times(x), times(times(p).transpose(0, 2, 1))
