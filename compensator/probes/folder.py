@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from compensator.atomic_write import atomic_write
 from compensator.clock import duration
-from compensator.codes import ProbeSourceRemark, Remark
-from compensator.errors import ConfigError, UsageError
+from compensator.codes import ProbeSourceRemark
+from compensator.errors import UsageError
+from compensator.probes.handled import Handled
 from compensator.probes.probe import Probe
-from compensator.probes.sender import Outcome, Report, pause
+from compensator.probes.reports import Report, lost, not_sent
+from compensator.probes.sender import Outcome, pause
 from compensator.probes.settings import Folder, convention
 from compensator.probes.table import BadLine, NoFeature, Row, columns, row
 
@@ -30,72 +30,6 @@ class _Signature(NamedTuple):
     inode: int
     size: int
     mtime_ns: int
-
-
-class Handled:
-    """Which lines were handled, kept over a restart.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        State file.
-    keep_s : float
-        Lines older than this are forgotten, s.
-
-    Raises
-    ------
-    ConfigError
-        If the file is there and cannot be read: lines might be sent twice.
-    """
-
-    def __init__(self, path: Path, keep_s: float) -> None:
-        self._path = path
-        self._keep_ns = round(keep_s * 1e9)
-        self._lines: dict[str, str] = {}
-        if not path.parent.is_dir():
-            raise ConfigError(f"{path}: no such folder for the state of folders")
-        try:
-            kept = json.loads(path.read_text(encoding="utf-8"))["handled"] if path.exists() else {}
-            if not all(isinstance(part, str) for pair in kept.items() for part in pair):
-                raise TypeError("expected texts")
-            for identity in kept:
-                _time_utc_ns(identity)
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            raise ConfigError(f"{path}: {error}; expected the state of folders; delete it to begin anew") from error
-        self._lines.update(kept)
-        self._changed = False
-
-    def values(self, identity: str) -> str | None:
-        """Return the values with which a line was handled; None if it was not."""
-        return self._lines.get(identity)
-
-    def add(self, line: Row) -> None:
-        """Note that a line was handled; `write` keeps it."""
-        self._lines[line.identity] = line.values
-        self._changed = True
-
-    def write(self, now_utc_ns: int) -> None:
-        """Keep on disk what was added; a line that a crash loses is sent again, and the service refuses it as known.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
-        if not self._changed:
-            return
-        oldest = now_utc_ns - self._keep_ns
-        self._lines = {key: value for key, value in self._lines.items() if _time_utc_ns(key) >= oldest}
-        with atomic_write(self._path) as file:
-            json.dump({"handled": self._lines}, file)
-        self._changed = False
-
-
-def _time_utc_ns(identity: str) -> int:
-    text = identity.partition(" ")[0]
-    if not (text.isascii() and text.isdigit() and len(text) <= 19):
-        raise ValueError(f"{identity[:40]!r}, expected a time and a feature")
-    return int(text)
 
 
 class WatchedFolder:
@@ -289,12 +223,10 @@ class WatchedFolder:
         self._pending.pop(line.identity, None)
 
     def _trouble(self, path: Path, error: OSError | UsageError) -> None:
-        why = getattr(error, "strerror", None) or error
-        self._once(path, Remark(ProbeSourceRemark.SOURCE_LOST, f"{path}: {why}.").marked)
+        self._once(path, lost(path, getattr(error, "strerror", None) or error))
 
     def _refuse(self, path: Path, code: ProbeSourceRemark, text: str, why: str) -> None:
-        shown = f"{text.strip()[:120]!r}: " if text else ""
-        self._once(path, Remark(code, f"{path}: not sent: {shown}{why}.").marked)
+        self._once(path, not_sent(code, path, text.strip() or None, why))
 
     def _once(self, path: Path, words: str) -> None:
         """Report once what every look would find again."""

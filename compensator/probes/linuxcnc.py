@@ -12,9 +12,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from compensator.codes import ProbeSourceRemark, Remark
+from compensator.codes import ProbeSourceRemark
 from compensator.probes.probe import Probe
-from compensator.probes.sender import Report, pause
+from compensator.probes.reports import Report, lost, not_sent
+from compensator.probes.sender import pause
 from compensator.probes.settings import UNITS_UM, LinuxCnc, convention
 from compensator.receiver.subscriber import monotonic_s
 
@@ -95,7 +96,7 @@ class ProbeFile:
             why = error.strerror or str(error)
             if why != self._trouble:
                 self._trouble = why
-                self._report(Remark(ProbeSourceRemark.SOURCE_LOST, f"{self._path}: {why}.").marked)
+                self._report(lost(self._path, why))
             return None
         self._trouble = ""
         return content[: content.rfind(b"\n") + 1]
@@ -139,4 +140,4 @@ class ProbeFile:
             return 0
 
     def _refuse(self, code: ProbeSourceRemark, line: str, why: str) -> None:
-        self._report(Remark(code, f"{self._path}: not sent: {line[:120]!r}: {why}.").marked)
+        self._report(not_sent(code, self._path, line, why))

@@ -8,15 +8,13 @@ from collections.abc import Callable
 from typing import cast
 
 from compensator.clock import duration
-from compensator.codes import ProbeSourceRemark, Remark
+from compensator.codes import ProbeSourceRemark
 from compensator.probes.dprnt import Printed, Unusable, parse
 from compensator.probes.lines import Bits, Line, Lines
 from compensator.probes.probe import Probe
-from compensator.probes.sender import Report
+from compensator.probes.reports import SHOWN, Report, not_sent
 from compensator.probes.settings import Dprnt, convention
 
-#: Longest part of a line in a report, characters.
-_SHOWN = 120
 #: Largest number of lines of others that are reported; the port may have another use.
 _FOREIGN = 5
 #: After so many unusable lines in a row only each so many is reported: a wrong baud rate makes several a second.
@@ -131,12 +129,11 @@ class PrintedProbes:
         self._foreign += 1
         if self._foreign <= _FOREIGN:
             end = "; further ones are not reported" if self._foreign == _FOREIGN else ""
-            self._report(f"{self._settings.name}: not a probe: {text[:_SHOWN]!r}{end}")
+            self._report(f"{self._settings.name}: not a probe: {text[:SHOWN]!r}{end}")
 
     def _refuse(self, code: ProbeSourceRemark, text: str, why: str) -> None:
         self._refused += 1
         if self._refused > _REFUSED and self._refused % _EACH:
             return
         count = f" ({self._refused} in a row)" if self._refused >= _REFUSED else ""
-        figures = f"{self._settings.name}: not sent{count}: {text[:_SHOWN]!r}: {why}."
-        self._report(Remark(code, figures).marked)
+        self._report(not_sent(code, self._settings.name, text, why, count=count))

@@ -9,11 +9,13 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
-from compensator.probes.folder import Handled, WatchedFolder
+from compensator.probes.folder import WatchedFolder
+from compensator.probes.handled import Handled
 from compensator.probes.linuxcnc import ProbeFile
 from compensator.probes.printed import PrintedProbes
 from compensator.probes.probe import Probe, ProbeSink
-from compensator.probes.sender import Report, Sender
+from compensator.probes.reports import Report
+from compensator.probes.sender import Sender
 from compensator.probes.settings import ProbeSettings
 from compensator.probes.stream import Stream
 from compensator.receiver.applied_record import applied_at

@@ -13,11 +13,10 @@ from typing import Literal, NamedTuple
 from compensator.clock import duration
 from compensator.codes import ProbeCode, ProbeSourceRemark, Remark
 from compensator.probes.probe import NotSent, Probe, ProbeSink
+from compensator.probes.reports import Report
 
 log = logging.getLogger("compensator")
 
-#: Called with each line for the log.
-Report = Callable[[str], None]
 #: What became of a probe.
 Outcome = Literal["sent", "refused", "given up"]
 #: Largest number of probes that wait; a source that floods must not fill the memory.

@@ -13,9 +13,9 @@ from contextlib import asynccontextmanager
 
 import serial
 
-from compensator.codes import ProbeSourceRemark, Remark
 from compensator.probes.printed import PrintedProbes
-from compensator.probes.sender import Report, pause
+from compensator.probes.reports import Report, lost
+from compensator.probes.sender import pause
 from compensator.probes.settings import Dprnt, address_of
 from compensator.receiver.subscriber import monotonic_s
 
@@ -136,7 +136,7 @@ class Stream:
     def _lost(self, why: str) -> None:
         if why != self._trouble:
             self._trouble = why
-            self._report(Remark(ProbeSourceRemark.SOURCE_LOST, f"{self._settings.name}: {why}.").marked)
+            self._report(lost(self._settings.name, why))
 
 
 @asynccontextmanager

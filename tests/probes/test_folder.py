@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compensator.errors import ConfigError
-from compensator.probes.folder import READ_AT_ONCE, Handled, WatchedFolder
+from compensator.probes.folder import READ_AT_ONCE, WatchedFolder
+from compensator.probes.handled import Handled
 from compensator.probes.probe import Probe
 from compensator.probes.sender import Outcome
 from compensator.probes.settings import Folder

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from compensator.codes import ProbeSourceRemark
 from compensator.probes.dprnt import CHECK_UM, parse
+from compensator.probes.settings import load_probes
 from compensator.probes.table import COLUMNS, columns, row
 from sim_hardware.wire.printing import Maker, formatted
 
@@ -61,10 +62,22 @@ def test_the_lines_of_the_table_are_read() -> None:
     names = columns(header)
     assert set(names) == set(COLUMNS) - {"time_utc_ns", "axis"}
     assert row(names, line).measured_um == 3.2
-    (echo,) = re.findall(r'^echo "\$\(date -u \+%FT%T.%NZ\),(.*?)" >>', TEXT, flags=re.MULTILINE)
-    at = "2026-03-02T10:15:00.123456789Z"  # as date prints it
-    assert row(names, f"{at},{echo}").stopped_s == 20.0
-    assert len(next(csv.reader([f"{at},{echo}"]))) == len(names)
+
+
+def test_the_shell_writes_a_file_that_is_read(tmp_path: Path) -> None:
+    (script,) = re.findall(r"In a shell:\n```\n(.*?)```", TEXT, flags=re.DOTALL)
+    script = script.replace("/srv/probes/vmc-07", str(tmp_path))
+    for _ in range(2):
+        subprocess.run(["bash", "-euc", script], check=True)
+    (file,) = tmp_path.iterdir()
+    header, *lines = file.read_text(encoding="utf-8").splitlines()
+    assert [row(columns(header), line).feature for line in lines] == ["sphere-1", "sphere-1"]
+
+
+def test_the_settings_of_the_page_are_valid(tmp_path: Path) -> None:
+    (settings,) = re.findall(r"```toml\n(.*?)```", TEXT, flags=re.DOTALL)
+    (tmp_path / "probes.toml").write_text(settings, encoding="utf-8")
+    assert len(load_probes(tmp_path / "probes.toml").folders) == 1
 
 
 def test_links_lead_somewhere() -> None:
