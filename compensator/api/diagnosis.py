@@ -22,7 +22,8 @@ from compensator.codes import Remark
 from compensator.data.measurement import DataLike, Measurement, measurements, runs_in
 from compensator.data.screening import require_y_noise, screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
-from compensator.diagnose.outcome import Diagnosis, FoundEffect
+from compensator.diagnose.found_effect import FoundEffect
+from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Table, Words
 from compensator.model.model_writer import write_model

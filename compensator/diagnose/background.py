@@ -20,7 +20,9 @@ from scipy.optimize import minimize
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Points, RandomColumns, Rest, Whitening, lags_of_paths, without_own_error
+from compensator.diagnose.likelihood import RandomColumns
+from compensator.diagnose.points import Points, Rest, lags_of_paths
+from compensator.diagnose.whitening import Whitening
 from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, MOST_ROWS, Regression
 
 #: Lags of the filter bank, min; those that are longer than a third of the record are left out.
@@ -140,7 +142,7 @@ class _Problem:
     def _rest(self, x: Vector) -> Rest:
         slow_um, tau_min, start_um = np.exp(x[:3]).tolist()
         typical = self.points.typical_rest()
-        return dataclasses.replace(without_own_error(typical), slow_um=slow_um, tau_min=tau_min, start_um=start_um)
+        return dataclasses.replace(typical.without_own_error(), slow_um=slow_um, tau_min=tau_min, start_um=start_um)
 
     def _white(self, x: Vector) -> tuple[Matrix, float, int]:
         """Return target, random columns and channels, whitened; the log determinant; how many are random."""

@@ -18,7 +18,8 @@ from compensator.data.runs import Run
 from compensator.diagnose.evidence import LEAST_VALUES, Evidence
 from compensator.diagnose.findings import Findings, findings_of
 from compensator.diagnose.fit import Fit, fit_terms
-from compensator.diagnose.likelihood import Likelihood, Points, Rest, dense
+from compensator.diagnose.likelihood import Likelihood, dense, learned_rest
+from compensator.diagnose.points import Points, Rest
 
 #: A value so many deviations away from what the others predict is suspected; one so many away is left out.
 SUSPECTED, IMPROBABLE = 3.0, 4.5
@@ -97,7 +98,7 @@ def _suspects(fit: Fit, most: int) -> list[int]:
         if len(found) == most:
             return []
         found.append(worst)
-        rest = points.settled(np.column_stack([columns, _spikes(points, [worst])]), fit.fixed, rest)
+        rest = learned_rest(points, np.column_stack([columns, _spikes(points, [worst])]), fit.fixed, rest)
 
 
 def _improbable(points: Points, fit: Fit, suspects: list[int]) -> tuple[list[int], Vector]:

@@ -1,13 +1,4 @@
-"""By how much a test would decide between two explanations: the expected change of the logarithm of the evidence.
-
-Both explanations, as fitted to the record, predict the test. What they leave unknown (their parameters, the error of
-the base's paths, zero and initial state, slow rest, noise) has the distribution that the record leaves it. With the
-difference *d* of the predictions and the covariance *S* of the second one, the first, if it is true, gains
-
-    E[Δ log p] ≈ ½ dᵀ S⁻¹ d
-
-on average. Either may be true, so the smaller one of both directions counts.
-"""
+"""By how much a test would decide between two explanations, and which test decides soonest."""
 
 from __future__ import annotations
 
@@ -16,28 +7,21 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 
-from compensator.arrays import Indices, Matrix, Vector
+from compensator.arrays import Vector
 from compensator.diagnose.events import DAY, HEAT
-from compensator.diagnose.evidence import Evidence, nuisances_of
-from compensator.diagnose.fit import Fit, Term, raw_columns
-from compensator.diagnose.likelihood import POINTS, Points, Rest, Whitening
+from compensator.diagnose.fit import Fit
+from compensator.diagnose.points import Points
+from compensator.diagnose.record_with_test import HOURS, RecordWithTest
 from compensator.diagnose.trials import REST_H, Trial, Trials
 from compensator.model.effects.blocks import Lag
 
 #: A change of the logarithm of the evidence that decides: odds of about 150 to 1.
 DECIDES = 5.0
-#: Durations of a test that are looked at, with the rest before it, h.
-HOURS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 #: The explanations between which a test decides that shows a hidden source again.
 SHOWN = ("a source that the new sensor shows", "no source")
 #: Where probes as often as in the record do not decide, they are made this often in a test, min.
 PROBED_MIN = 10.0
-#: Step of a searched parameter, as a share of its value.
-STEP = 1e-2
-#: What happened once does not come again by itself in a test.
-ONCE = ("jump", "settling")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +84,7 @@ class Deciding:
 
     def __init__(self, trials: Trials) -> None:
         self.trials = trials
-        self._joint: dict[tuple[int, float], _Joint] = {}
+        self._joint: dict[tuple[int, float], RecordWithTest] = {}
         #: Time between two probes of a test, min: as in the record, or less where that does not decide. 0: always.
         self._every_min: tuple[float, ...] = (0.0,)
         if trials.evidence.is_sparse:
@@ -182,10 +166,10 @@ class Deciding:
         joint = self._of(trial, every_min)
         return self._test(trial, joint.change(first, second), between, joint.every_min)
 
-    def _of(self, trial: Trial, every_min: float) -> _Joint:
+    def _of(self, trial: Trial, every_min: float) -> RecordWithTest:
         key = id(trial), every_min
         if key not in self._joint:
-            self._joint[key] = _Joint(self.trials.evidence, trial, every_min)
+            self._joint[key] = RecordWithTest(self.trials.evidence, trial, every_min)
         return self._joint[key]
 
     @staticmethod
@@ -202,96 +186,6 @@ class Deciding:
         )
 
 
-class _Joint:
-    """A record with a test after it."""
-
-    def __init__(self, evidence: Evidence, trial: Trial, every_min: float) -> None:
-        self.record_period_min = evidence.context.period_min * max(1, math.ceil(evidence.count / POINTS))
-        n, samples = trial.signals.size, 1
-        self.every_min = every_min
-        if every_min:
-            samples = max(1, round(every_min / evidence.context.period_min))
-        measured = (np.arange(n) + 1) % samples == 0
-        rest = nuisances_of(trial.signals, evidence.context)
-        self.evidence = dataclasses.replace(
-            evidence,
-            signals=(*evidence.signals, trial.signals),
-            residual=np.concatenate([evidence.residual, np.zeros(n)]),
-            used=np.concatenate([evidence.used, measured]),
-            nuisances=np.asarray(block_diag(evidence.nuisances, rest)),
-            noise=dataclasses.replace(evidence.noise, count=evidence.count + int(measured.sum())),
-        )
-        self.points = Points(self.evidence)
-        self.before = int(self.points.used[: self.points.starts[-1]].sum())
-        self.ends = np.ceil(np.array(HOURS) * 60.0 / (every_min or self.points.period_min)).astype(int)
-        self._known: dict[int, tuple[Fit, Vector, Matrix, Matrix]] = {}
-
-    def change(self, first: Fit, second: Fit) -> Vector:
-        """Return the expected change of the logarithm of the evidence after each of the durations."""
-        views = [self._prediction(fit, first.rest) for fit in (first, second)]
-        d = views[0][0] - views[1][0]
-        both = [_expected(d, table, precision, self.ends) for _, table, precision in views]
-        return np.minimum(*both)
-
-    def change_by(self, fit: Fit, course: Vector) -> Vector:
-        """Return the same for what a source adds to the test, beside a fit without it."""
-        begin = self.evidence.used.size - course.size
-        added = self.points.averaged(np.concatenate([np.zeros(begin), course])[:, None])
-        d = self._whitening(fit.rest).of(added)[self.before :, 0]
-        _, table, precision = self._prediction(fit, fit.rest)
-        return _expected(d, table, precision, self.ends)
-
-    def _whitening(self, rest: Rest) -> Whitening:
-        # The noise of a point is that of its samples' mean; with the test there may be more of them in a point.
-        share = self.record_period_min / self.points.period_min if self.points.is_exact and not self.every_min else 1.0
-        return Whitening(self.points, dataclasses.replace(rest, noise_um=rest.noise_um * float(np.sqrt(share))))
-
-    def _prediction(self, fit: Fit, rest: Rest) -> tuple[Vector, Matrix, Matrix]:
-        """Return the mean of the test, columns of what stays unknown in it, and their precision after the record."""
-        known = self._known.get(id(fit))
-        if known is None or known[0] is not fit:
-            added, slopes = self._response(fit)
-            table = np.column_stack([self.points.residual - added, added, self.points.random(rest), slopes])
-            white = self._whitening(rest).of(table)
-            seen, test = white[: self.before], white[self.before :]
-            precision = np.eye(white.shape[1] - 2) + seen[:, 2:].T @ seen[:, 2:]
-            mean = test[:, 1] + test[:, 2:] @ np.linalg.solve(precision, seen[:, 2:].T @ seen[:, 0])
-            known = self._known[id(fit)] = (fit, mean, test[:, 2:], precision)
-        return known[1:]
-
-    def _response(self, fit: Fit) -> tuple[Vector, Matrix]:
-        """Return what a fit adds to record and test, and its slopes by every parameter, averaged to points."""
-        total, columns = np.zeros(self.evidence.used.size), [np.zeros((self.evidence.used.size, 0))]
-        for term in fit.terms:
-            added, slopes = self._slopes(term)
-            if term.hypothesis.form in ONCE:
-                begin = sum(record.size for record in self.evidence.signals[:-1])
-                added[begin:], slopes[begin:] = 0.0, 0.0
-            total = total + added
-            columns.append(slopes)
-        table = self.points.averaged(np.column_stack([total, *columns]))
-        return table[:, 0], table[:, 1:]
-
-    def _slopes(self, term: Term) -> tuple[Vector, Matrix]:
-        """Return the response of a term, and its change by each of its parameters within what is usual before data."""
-
-        def response(values: tuple[float, ...]) -> tuple[Vector, Matrix]:
-            table = raw_columns(self.evidence, term.hypothesis, values)
-            added = table @ np.array(term.amplitudes) if term.amplitudes else table[:, 0]
-            return np.array(added), table
-
-        added, table = response(term.values)
-        columns = []
-        if term.amplitudes:
-            spread = np.maximum(np.std(table, axis=0), 1e-12)
-            columns.append(table * (self.points.spread_um / spread))
-        for i, value in enumerate(term.values):
-            step = STEP * max(abs(value), 1e-6)
-            moved = tuple(v + step if i == k else v for k, v in enumerate(term.values))
-            columns.append(((response(moved)[0] - added) / STEP)[:, None])
-        return added, np.concatenate(columns, axis=1) if columns else np.zeros((added.size, 0))
-
-
 def _soonest(test: PlannedTest) -> tuple[bool, float]:
     """Return the rank of a test: one that decides soon, or else one that changes most. Simple ones come first."""
     return test.decides, -test.hours if test.decides else test.expected_evidence
@@ -303,13 +197,3 @@ def _level(trial: Trial) -> Vector:
     values = signals.drive if trial.driver == HEAT else signals.channels[trial.driver]
     change = values - values[0] if trial.driver != HEAT else values
     return np.asarray(change / max(float(np.abs(change).max()), 1e-12))
-
-
-def _expected(d: Vector, table: Matrix, precision: Matrix, ends: Indices) -> Vector:
-    """Return ½ dᵀ S⁻¹ d with S = 1 + T P⁻¹ Tᵀ, over the first points of a test."""
-    found = []
-    for end in ends.tolist():
-        some, part = table[:end], d[:end]
-        moment = some.T @ part
-        found.append(0.5 * float(part @ part - moment @ np.linalg.solve(precision + some.T @ some, moment)))
-    return np.array(found)

@@ -12,39 +12,24 @@ from functools import partial
 
 import numpy as np
 
-from compensator.arrays import Indices, Vector
+from compensator.arrays import Vector
 from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import advice_of, label
 from compensator.diagnose.chips import without_chips
 from compensator.diagnose.deciding import Deciding, PlannedTest
-from compensator.diagnose.event_time import with_time_errors, words_of
+from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, with_paths
-from compensator.diagnose.fit import Term, standard_errors
-from compensator.diagnose.hiding import hiding
+from compensator.diagnose.fit import Term
+from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
+from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.noise import VERDICT_TIMES
-from compensator.diagnose.outcome import (
-    FOLDS,
-    HELD_OUT,
-    HELD_OUT_RECORDINGS,
-    HELD_OUT_VALUES,
-    Ceiling,
-    Diagnosis,
-    FoundEffect,
-    Remainder,
-    Step,
-    Verdict,
-    described,
-    rivals_of,
-    rms_of,
-    seen_of,
-    warnings_of,
-)
+from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
 from compensator.diagnose.search import Candidate
+from compensator.diagnose.standard_errors import standard_errors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials
 from compensator.model.effects import Effect
-from compensator.model.effects.hypothesis import Place
 from compensator.model.late_observer import late_variance_um2
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import ExecutorMap, Progress, unreported
@@ -55,8 +40,6 @@ FAR_OFF = 0.1
 CONTRADICTS = 1.25
 #: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
 LOWERS = 0.97
-#: How the errors are measured where nothing was known of the paths.
-WITH_PATHS = "; before: the paths of the first model alone, also refitted to the others"
 
 
 def diagnose(
@@ -90,34 +73,18 @@ def diagnose(
     effects = _effects(found, deciding)
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects]
-    held_out = _held_out(found, places, progress, executor_map)
+    held_out = held_out_of(found, places, progress, executor_map)
+    found, effects, held_out = _worth_deploying(found, effects, held_out)
     few = evidence.is_sparse
-    beside = found.remainder is not None and found.explains and not evidence.free_paths
-    if beside and rms_of(held_out.whole) > rms_of(held_out.named):
-        # What explains nothing has to show that it helps.
-        found = dataclasses.replace(found, remainder=None)
-        held_out = dataclasses.replace(held_out, whole=held_out.named)
-    if few and found.remainder is not None and not _lowers(held_out):
-        # Few values: chance lowers the error of no remainder by much.
-        found = dataclasses.replace(found, remainder=None, explains=True)
-        effects = tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
-        held_out = dataclasses.replace(held_out, whole=held_out.named)
     # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
     contradicted = not (few or evidence.free_paths) and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
     extended, remarks = (model, ()) if contradicted else _extended(model, found, effects, held_out)
-    remainder = None
-    if found.remainder is not None:
-        remainder = Remainder(
-            deployed=extended is not model,
-            channels=tuple(dict.fromkeys(found.remainder.effect.channels_that_matter())),
-            rms_before_um=rms_of(held_out.named),
-            rms_after_um=rms_of(held_out.whole),
-        )
-    left = evidence.left(evidence.residual, found.whole, at_rest=False)
+    deployed = extended is not model
     verdict, ceiling = _verdict(found, held_out, extended), _ceiling(held_out)
-    could_hide, advice = hiding(found.selection, found.search.price) if few else None, None
+    could_hide = detection_limits(found.selection, found.search.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
+    advice = None
     if verdict != "adequate" or hides:
         tests = [rival.test for effect in effects for rival in effect.rivals if rival.test is not None]
         tests += _between_undecided(found, deciding)
@@ -125,10 +92,12 @@ def diagnose(
         advice = advice_of(
             found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained
         )
+    left = evidence.left(evidence.residual, found.whole, at_rest=False)
+    warnings = warnings_of(effects, held_out.nothing, held_out.whole, deployed=deployed, few=few)
     return Diagnosis(
         verdict="unexplained" if hides else verdict,
         effects=effects,
-        held_out=_how(evidence),
+        held_out=how_held_out(evidence),
         model=extended,
         evidence=evidence,
         residual_before=np.where(evidence.used, found.search.left(found.selection.before) - found.paths, np.nan),
@@ -137,16 +106,40 @@ def diagnose(
         held_out_named=held_out.named,
         held_out_after=held_out.whole,
         tried=_ranked(found),
-        warnings=(
-            *left_out,
-            *remarks,
-            *warnings_of(effects, held_out.nothing, held_out.whole, deployed=extended is not model, few=few),
-        ),
+        warnings=(*left_out, *remarks, *warnings),
         steps=held_out.steps,
-        remainder=remainder,
+        remainder=_remainder(found, held_out, deployed=deployed),
         ceiling=ceiling,
         advice=advice,
         could_hide=could_hide,
+    )
+
+
+def _worth_deploying(
+    found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
+) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
+    """Leave out a remainder that held-out data do not confirm: what explains nothing has to show that it helps."""
+    if found.remainder is None:
+        return found, effects, held_out
+    evidence, without = found.search.evidence, dataclasses.replace(held_out, whole=held_out.named)
+    beside = found.explains and not evidence.free_paths
+    if beside and rms_of(held_out.whole) > rms_of(held_out.named):
+        return dataclasses.replace(found, remainder=None), effects, without
+    if evidence.is_sparse and not _lowers(held_out):
+        # Few values: chance lowers the error of no remainder by much.
+        named = tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
+        return dataclasses.replace(found, remainder=None, explains=True), named, without
+    return found, effects, held_out
+
+
+def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remainder | None:
+    if found.remainder is None:
+        return None
+    return Remainder(
+        deployed=deployed,
+        channels=tuple(dict.fromkeys(found.remainder.effect.channels_that_matter())),
+        rms_before_um=rms_of(held_out.named),
+        rms_after_um=rms_of(held_out.whole),
     )
 
 
@@ -169,74 +162,6 @@ def _between_undecided(found: Findings, deciding: Deciding) -> list[PlannedTest]
         first, second, (label(first.terms[-1]), label(second.terms[-1]) if second.terms else "nothing")
     )
     return [test] if test is not None else []
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _HeldOut:
-    """What is left on every sample by estimates that did not see it, µm; NaN where y is missing."""
-
-    nothing: Vector
-    named: Vector
-    whole: Vector
-    ceiling: Vector
-    steps: tuple[Step, ...]
-
-
-def _held_out(found: Findings, places: Sequence[Place], progress: Progress, executor_map: ExecutorMap) -> _HeldOut:
-    """Repeat the search without each block; of two choices of nuisances, that which leaves less before."""
-    evidence = found.search.evidence
-    blocks = list(evidence.blocks(FOLDS))
-    progress(1, len(blocks) + 1)
-    views = [evidence.without(block) for block in blocks]
-    timed = [t.effect for t in found.terms if not t.effect.deployable]
-    only_unobserved = bool(found.terms) and not any(term.hypothesis.effect.observed for term in found.terms)
-    unobserved = any(not effect.observed for effect in timed) and not only_unobserved
-    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved), views)
-    left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
-    searches = np.zeros(len(places), dtype=int)
-    for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
-        progress(done, len(blocks) + 1)
-        searches += several.has
-        for choice in (0, 1):
-            for i, one in enumerate(several.added):
-                left[choice, i, block] = seen.left(evidence.residual, one, at_rest=choice == 0)[block]
-    best = min((0, 1), key=lambda choice: rms_of(left[choice, 0]))
-    nothing, named, whole, ceiling, *steps = left[best]
-    return _HeldOut(
-        nothing=nothing,
-        named=named,
-        whole=whole,
-        ceiling=ceiling,
-        steps=tuple(Step(rms_um=rms_of(s), searches=n) for s, n in zip(steps, searches.tolist(), strict=True)),
-    )
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class _Predictions:
-    """What a search in a part of the evidence predicts on every sample of all.
-
-    Parameters
-    ----------
-    added : tuple of numpy.ndarray, shape (n,)
-        Of nothing, the named effects, effects and remainder, all channels; of the first place, the first two, …, µm.
-    has : numpy.ndarray of int, shape (places,)
-        1 where it found an effect of that place.
-    """
-
-    added: tuple[Vector, ...]
-    has: Indices
-
-
-def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool) -> _Predictions:
-    found = findings_of(seen, unobserved=unobserved)
-    steps, total = [], found.own_paths
-    for place in places:
-        total = sum(
-            (r for t, r in zip(found.terms, found.responses, strict=True) if t.hypothesis.place == place), total
-        )
-        steps.append(total)
-    has = np.array([any(term.hypothesis.place == place for term in found.terms) for place in places], dtype=int)
-    return _Predictions(added=(found.paths, found.named, found.whole, found.ceiling, *steps), has=has)
 
 
 def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
@@ -262,7 +187,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
 
         effect = described(term, std, signal, evidence)
         if few:
-            words = effect.explanation + words_of(std, search.points.period_min)
+            words = effect.explanation + time_words(std, search.points.period_min)
             effect = dataclasses.replace(effect, explanation=words)
         effects.append(
             FoundEffect(
@@ -279,7 +204,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
 
 
 def _extended(
-    model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: _HeldOut
+    model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
 ) -> tuple[ThermalModel, tuple[Remark, ...]]:
     """Return the model with every effect that can be deployed, the remainder, and the error that is left."""
     evidence = found.search.evidence
@@ -319,16 +244,7 @@ def _refitted(old: ThermalModel, new: ThermalModel) -> str:
     )
 
 
-def _how(evidence: Evidence) -> str:
-    """Return how the errors are measured."""
-    count = len(list(evidence.blocks(FOLDS)))
-    words = HELD_OUT_VALUES if evidence.is_sparse else HELD_OUT
-    if evidence.holds_out_recordings:
-        words = HELD_OUT_RECORDINGS.format(count=count)
-    return words + WITH_PATHS * evidence.free_paths
-
-
-def _ceiling(held_out: _HeldOut) -> Ceiling | None:
+def _ceiling(held_out: HeldOut) -> Ceiling | None:
     """Return what all channels could explain, and how much of that the named effects do."""
     before, after, least = (rms_of(values) ** 2 for values in (held_out.nothing, held_out.named, held_out.ceiling))
     if least >= before:
@@ -338,7 +254,7 @@ def _ceiling(held_out: _HeldOut) -> Ceiling | None:
     )
 
 
-def _lowers(held_out: _HeldOut) -> bool:
+def _lowers(held_out: HeldOut) -> bool:
     """Whether the remainder lowers the error on held-out data enough to deploy it from few values."""
     return rms_of(held_out.whole) < LOWERS * min(rms_of(held_out.named), rms_of(held_out.nothing))
 
@@ -351,7 +267,7 @@ def _ranked(found: Findings) -> tuple[tuple[str, float], ...]:
     return tuple(sorted(best.items(), key=lambda item: item[1]))
 
 
-def _verdict(found: Findings, held_out: _HeldOut, extended: ThermalModel) -> Verdict:
+def _verdict(found: Findings, held_out: HeldOut, extended: ThermalModel) -> Verdict:
     """Return the verdict in one word; what the engine cannot know of a late T_Q counts as noise."""
     evidence = found.search.evidence
     observed = [term.hypothesis.effect.observed for term in found.terms]

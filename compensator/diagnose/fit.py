@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,8 @@ from scipy.optimize import least_squares
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Likelihood, Points, Rest, without_own_error
+from compensator.diagnose.likelihood import Likelihood, learned_rest
+from compensator.diagnose.points import Points, Rest
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis, Place
 
@@ -270,7 +270,7 @@ def settled(fit: Fit) -> Fit:
             of = "" if path else channel
             added = response(points.evidence, term)[points.evidence.used]
             sizes[of] = math.hypot(sizes.get(of, 0.0), float(np.std(added)))
-    rest = points.settled(fit.columns, fit.fixed, points.with_forms_of(fit.rest, sizes))
+    rest = learned_rest(points, fit.columns, fit.fixed, points.with_forms_of(fit.rest, sizes))
     return fit_terms(Likelihood(points, rest), fit.starts())
 
 
@@ -283,57 +283,6 @@ def to_search(free: Free, value: float) -> float:
 def from_search(free: Free, x: float) -> float:
     """Return a free parameter's own value."""
     return float(np.exp(x)) if free.log else x * (free.high - free.low)
-
-
-def standard_errors(fit: Fit) -> list[dict[str, float]]:
-    """Return the standard error of everything that each effect is named by.
-
-    Where the calibration states no error of the base's paths, none is counted.
-    """
-    natural = np.array([v for term in fit.terms for v in (*term.values, *term.amplitudes)])
-    if natural.size == 0:
-        return []
-    points, rest = fit.likelihood.points, fit.rest
-    likelihood = Likelihood(points, without_own_error(rest)) if points.is_exact else fit.likelihood
-
-    def moved(values: Vector) -> list[Term]:
-        one = iter(values.tolist())
-        return [
-            dataclasses.replace(
-                term,
-                values=tuple(itertools.islice(one, len(term.values))),
-                amplitudes=tuple(itertools.islice(one, len(term.amplitudes))),
-            )
-            for term in fit.terms
-        ]
-
-    def predicted(values: Vector) -> Vector:
-        total = summed(likelihood.points.evidence, moved(values))
-        return likelihood.projected(likelihood.points.averaged(total[:, None]))[:, 0]
-
-    def named(values: Vector) -> Vector:
-        return np.array([v for term in moved(values) for v in term.named.values()])
-
-    steps = 1e-3 * np.abs(natural) + 1e-9
-    jacobian = _slopes(predicted, natural, steps)
-    scale = np.linalg.norm(jacobian, axis=0)
-    scale[scale == 0.0] = 1.0
-    _, s, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    inverse = vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None]
-    spread = _slopes(named, natural, steps) @ inverse
-    errors = iter(np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread), 0.0)).tolist())
-    return [dict(zip(term.named, errors, strict=False)) for term in fit.terms]
-
-
-def _slopes(function: Callable[[Vector], Vector], at: Vector, steps: Vector) -> Matrix:
-    """Return the derivatives of a function by each of its arguments, shape (values, arguments)."""
-    columns = []
-    for i, step in enumerate(steps.tolist()):
-        above, below = at.copy(), at.copy()
-        above[i] += step
-        below[i] -= step
-        columns.append((function(above) - function(below)) / (2.0 * step))
-    return np.stack(columns, axis=1)
 
 
 def _log_det(matrix: Matrix) -> float:

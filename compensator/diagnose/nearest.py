@@ -20,7 +20,8 @@ import numpy as np
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.fit import Fit, Term, fit_terms
-from compensator.diagnose.likelihood import Likelihood, Points, RandomColumns, Rest
+from compensator.diagnose.likelihood import Likelihood, RandomColumns, learned_rest
+from compensator.diagnose.points import Points, Rest
 from compensator.model.effects.blocks import FilterBank
 from compensator.model.effects.signals import RecordSignals
 
@@ -111,7 +112,9 @@ class _Ranking:
     def __init__(self, base: Fit, unexplained: Rest) -> None:
         self._points = base.likelihood.points
         start = dataclasses.replace(unexplained, own_um=base.rest.own_um)
-        self._likelihood = likelihood = Likelihood(self._points, self._points.settled(base.columns, base.fixed, start))
+        self._likelihood = likelihood = Likelihood(
+            self._points, learned_rest(self._points, base.columns, base.fixed, start)
+        )
         self._kept, self._target = base.projected(likelihood)
         self._alone = RandomColumns(self._kept, self._target).surprise
 

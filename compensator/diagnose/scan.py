@@ -9,7 +9,8 @@ import numpy as np
 
 from compensator.arrays import Matrix
 from compensator.diagnose.fit import Fit, Start, raw_columns
-from compensator.diagnose.likelihood import Likelihood, Points, Rest, dense
+from compensator.diagnose.likelihood import Likelihood, dense
+from compensator.diagnose.points import Points, Rest
 from compensator.model.effects.hypothesis import Hypothesis
 
 

@@ -23,7 +23,8 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, raw_columns, response, settled, summed
-from compensator.diagnose.likelihood import Likelihood, Points, Rest
+from compensator.diagnose.likelihood import Likelihood, learned_rest
+from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.scan import Scan
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, Place, proposals
@@ -111,7 +112,8 @@ class Search:
             Whether an unobserved source is looked for.
         """
         unobserved = unobserved and not self.evidence.free_paths
-        rest = self.points.settled(np.zeros((self.points.used.size, 0)), np.zeros(self.points.used.size), self._typical)
+        nothing = np.zeros(self.points.used.size)
+        rest = learned_rest(self.points, np.zeros((nothing.size, 0)), nothing, self.points.typical_rest())
         before = fit_terms(Likelihood(self.points, rest), [])
         self._something_acts = self.evidence.is_sparse and not self._leaves_noise(before)
         grown, undecided = self._grown(before, unobserved=unobserved)
@@ -185,10 +187,6 @@ class Search:
     def price(self) -> float:
         """What a usual effect must add to the logarithm of the evidence."""
         return MARGIN + math.log(len(self._forms) + 1)
-
-    @property
-    def _typical(self) -> Rest:
-        return self.points.typical_rest()
 
     def _cost(self, hypothesis: Hypothesis) -> float:
         """Return what an effect must add to the evidence."""

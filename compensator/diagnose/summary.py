@@ -10,9 +10,10 @@ from typing import Any
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
 from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_rms, remainder
+from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
-from compensator.diagnose.hiding import Hiding
-from compensator.diagnose.outcome import Ceiling, Diagnosis, FoundEffect, Remainder
+from compensator.diagnose.found_effect import FoundEffect
+from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
 from compensator.display import Table, Words, warnings_of, with_std
 from compensator.model.simulation import SCORE_HEAD, Scores
 
@@ -97,7 +98,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _could_hide(found: Hiding | None) -> dict[str, Any]:
+def _could_hide(found: DetectionLimits | None) -> dict[str, Any]:
     """Return how much could hide under its key; nothing where Y was measured all the time."""
     if found is None:
         return {}

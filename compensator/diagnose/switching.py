@@ -8,7 +8,8 @@ import numpy as np
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.fit import Fit, Start
-from compensator.diagnose.likelihood import Likelihood, Rest, dense
+from compensator.diagnose.likelihood import Likelihood, dense
+from compensator.diagnose.points import Rest
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.hypothesis import Free, Hypothesis
 from compensator.model.effects.unobserved import Unobserved

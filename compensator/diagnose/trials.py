@@ -16,8 +16,9 @@ import numpy as np
 
 from compensator.arrays import Matrix, Vector
 from compensator.data.runs import Run
+from compensator.diagnose.base_run import signals_of
 from compensator.diagnose.events import HEAT, swings
-from compensator.diagnose.evidence import Evidence, signals_of
+from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.nearest import AT, TEMPERATURE
 from compensator.model.effects.blocks import FilterBank, Lag
 from compensator.model.effects.input import unit_of

@@ -9,7 +9,8 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.ceiling import ceiling, falls_short, remainder
-from compensator.diagnose.outcome import Diagnosis, FoundEffect
+from compensator.diagnose.found_effect import FoundEffect
+from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.summary import (
     SHOWN,
     error_table,

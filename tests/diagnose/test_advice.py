@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from compensator.diagnose.advice import advice_of
-from compensator.diagnose.deciding import DECIDES, Deciding, _expected
+from compensator.diagnose.deciding import DECIDES, Deciding
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.events import follows_day, goes_with, swings, switched
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms, settled
-from compensator.diagnose.likelihood import Likelihood, Points
+from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.nearest import nearest
+from compensator.diagnose.points import Points
+from compensator.diagnose.record_with_test import expected_change
 from compensator.diagnose.summary import contents, figures
 from compensator.diagnose.trials import Trials
 from compensator.display import Words
@@ -145,7 +147,7 @@ def test_the_expected_change_is_that_of_the_whole_covariance():
         0.5 * d[:k] @ np.linalg.solve(np.eye(k) + table[:k] @ np.linalg.solve(precision, table[:k].T), d[:k])
         for k in (7, 20)
     ]
-    assert _expected(d, table, precision, np.array([7, 20])) == pytest.approx(wanted)
+    assert expected_change(d, table, precision, np.array([7, 20])) == pytest.approx(wanted)
 
 
 def test_in_a_test_temperatures_follow_what_they_followed_in_the_record():

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from compensator.diagnose.evidence import evidence_of, signals_of
+from compensator.diagnose.base_run import signals_of
+from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.fit import Term, response
 from compensator.errors import ModelError
 from compensator.model.effects import effect_from, kinds

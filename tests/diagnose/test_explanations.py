@@ -11,7 +11,7 @@ import pytest
 
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.fit import Term, response
-from compensator.diagnose.outcome import described, seen_of
+from compensator.diagnose.found_effect import described, seen_of
 from compensator.model.effects import Effect, effect_from
 from compensator.model.effects.hypothesis import Hypothesis, proposals
 from compensator.model.effects.seen import Range, Seen

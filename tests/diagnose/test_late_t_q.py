@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import lfilter
 
 from compensator.data.runs import Run
+from compensator.diagnose.base_run import signals_of
 from compensator.diagnose.diagnosis import Diagnosis, diagnose
-from compensator.diagnose.evidence import signals_of
 from compensator.identify.calibration import predict
 from compensator.model.model_file import load_model, parse_model
 from compensator.model.model_writer import dump_model

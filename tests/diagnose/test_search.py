@@ -8,9 +8,11 @@ import pytest
 from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.fit import fit_terms, standard_errors
-from compensator.diagnose.likelihood import Likelihood, Points
+from compensator.diagnose.fit import fit_terms
+from compensator.diagnose.likelihood import Likelihood
+from compensator.diagnose.points import Points
 from compensator.diagnose.search import Search
+from compensator.diagnose.standard_errors import standard_errors
 from compensator.diagnose.summary import figures, verdict
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import proposals

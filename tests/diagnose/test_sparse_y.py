@@ -8,11 +8,13 @@ import pytest
 import compensator as tc
 from compensator.diagnose import diagnosis
 from compensator.diagnose.background import Background
+from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
-from compensator.diagnose.hiding import hiding
-from compensator.diagnose.likelihood import Likelihood, Points, Rest, Whitening
+from compensator.diagnose.likelihood import Likelihood
+from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.search import Search
+from compensator.diagnose.whitening import Whitening
 from compensator.errors import DataError
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import tone_of
@@ -135,7 +137,9 @@ def test_a_size_that_could_hide_is_one_that_is_just_named():
     columns = probed("none", 3)
     search = Search(evidence_of(QUILL, runs(columns)))
     size = next(
-        one.size_um for one in hiding(search.run(), search.price).what if (one.kind, one.path) == ("gain", "DTF")
+        one.size_um
+        for one in detection_limits(search.run(), search.price).what
+        if (one.kind, one.path) == ("gain", "DTF")
     )
     share = np.concatenate([r.share("DTF") for r in search.evidence.signals])
     for times, named in ((2.0, [("gain", "DTF", "")]), (0.25, [])):
@@ -150,7 +154,7 @@ def test_a_stated_noise_that_is_too_small_is_no_all_clear_and_a_large_one_hides_
     sizes = []
     for std_um in (1.5, 3.0):
         search = Search(evidence_of(QUILL, runs(columns, std_um)))
-        sizes.append(hiding(search.run(), search.price).what[0].size_um)
+        sizes.append(detection_limits(search.run(), search.price).what[0].size_um)
     assert sizes[1] > 1.4 * sizes[0]
 
 

@@ -1,4 +1,4 @@
-"""How much could hide: the size that something would need for the data to show it.
+"""Detection limits: the size that something would need for few values of Y to show it.
 
 Few values with noise fit any model that is not far off. A residual that is noise says only that nothing larger than
 this acts. An effect with the column *w*, whitened and without nuisances, is named where
@@ -32,8 +32,8 @@ LAG_MIN, ACTS_SHARE = 60.0, 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hidden:
-    """Something that might act, and how large it could be without being seen.
+class DetectionLimit:
+    """How large something could be that acts without being seen.
 
     Parameters
     ----------
@@ -49,12 +49,12 @@ class Hidden:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hiding:
-    """How much could hide in a record of few values.
+class DetectionLimits:
+    """How much could act without being seen in a record of few values.
 
     Parameters
     ----------
-    what : tuple of Hidden
+    what : tuple of DetectionLimit
         The largest first.
     matters_um : float
         What must not hide if the model shall be called adequate, peak to peak, µm.
@@ -66,7 +66,7 @@ class Hiding:
         Effects that may act, which the values do not decide.
     """
 
-    what: tuple[Hidden, ...]
+    what: tuple[DetectionLimit, ...]
     matters_um: float
     values: int
     every_min: float
@@ -83,7 +83,7 @@ class Hiding:
         return math.ceil(self.values * (self.what[0].size_um / self.matters_um) ** 2)
 
 
-def hiding(selection: Selection, cost: float) -> Hiding:
+def detection_limits(selection: Selection, cost: float) -> DetectionLimits:
     """Return how much could hide beside what was found.
 
     Parameters
@@ -104,9 +104,9 @@ def hiding(selection: Selection, cost: float) -> Hiding:
         white = likelihood.projected(points.averaged(unit[:, None]))[:, 0]
         square = float(white @ white - (white @ kept) @ (inner @ white))
         least = math.sqrt(2.0 * cost + math.log1p(square * points.spread_um**2)) + SURE
-        found.append(Hidden(kind=kind, path=path, size_um=least / math.sqrt(max(square, 1e-9))))
+        found.append(DetectionLimit(kind=kind, path=path, size_um=least / math.sqrt(max(square, 1e-9))))
     measured, undecided = points.evidence.y_um, selection.undecided[:UNDECIDED]
-    return Hiding(
+    return DetectionLimits(
         what=tuple(sorted(found, key=lambda one: -one.size_um)),
         matters_um=MATTERS * float(np.nanmax(measured) - np.nanmin(measured)),
         values=points.count,

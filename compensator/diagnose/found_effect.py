@@ -1,0 +1,194 @@
+"""An effect that was found, as it is reported: its parameters, what it adds, its explanation and its rivals."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from compensator.arrays import Vector
+from compensator.diagnose.advice import label
+from compensator.diagnose.deciding import PlannedTest
+from compensator.diagnose.evidence import Evidence
+from compensator.diagnose.fit import Term
+from compensator.diagnose.search import Candidate
+from compensator.model.effects import Effect
+from compensator.model.effects.hypothesis import Place
+from compensator.model.effects.seen import Range, Seen
+
+#: Said of an effect in whose place the remainder is deployed.
+REPLACED = " All channels together explain the data better, so the remainder is deployed in its place."
+#: Another explanation is a rival while it leaves no more than this many times as much.
+RIVAL_TIMES = 1.2
+#: Most rivals of an effect.
+MOST_RIVALS = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FoundEffect:
+    """An effect that the model lacks; what `diagnosis.json` says of it also by `effect["kind"]`.
+
+    Parameters
+    ----------
+    term : Term
+        Hypothesis and values.
+    effect : Effect
+        What the extended model gets, with standard errors and explanation.
+    rms_before_um, rms_after_um : float
+        Residual without it and with it, the others in place, µm.
+    signal : numpy.ndarray, shape (n,)
+        What it adds to y, µm, all runs one after another.
+    rivals : tuple of Rival
+        What explains it nearly as well.
+    replaced : bool
+        Whether the remainder is deployed in its place, since it explains the data better.
+    """
+
+    term: Term = field(repr=False)
+    effect: Effect
+    rms_before_um: float
+    rms_after_um: float
+    signal: Vector = field(repr=False)
+    rivals: tuple[Rival, ...] = field(repr=False)
+    replaced: bool = False
+
+    def __getitem__(self, key: str) -> Any:
+        return getattr(self, key)
+
+    @property
+    def place(self) -> Place:
+        """Kind, path and channel."""
+        return self.term.hypothesis.place
+
+    @property
+    def kind(self) -> str:
+        """What it is."""
+        return self.place[0]
+
+    @property
+    def path(self) -> str | None:
+        """Path that it acts on."""
+        return self.place[1] or None
+
+    @property
+    def channel(self) -> str | None:
+        """Channel that it acts by."""
+        return self.place[2] or None
+
+    @property
+    def form(self) -> str:
+        """Which variant of its kind."""
+        return self.term.hypothesis.form
+
+    @property
+    def named(self) -> dict[str, float]:
+        """Every parameter by name."""
+        return self.term.named
+
+    @property
+    def std(self) -> Mapping[str, float]:
+        """Standard error of each parameter."""
+        return self.effect.std
+
+    @property
+    def parameters(self) -> dict[str, dict[str, float]]:
+        """`value` and standard error `std` of each parameter."""
+        return {name: {"value": value, "std": self.std[name]} for name, value in self.named.items()}
+
+    @property
+    def explanation(self) -> str:
+        """For an engineer."""
+        return self.effect.explanation + (REPLACED if self.replaced else "")
+
+    @property
+    def deployable(self) -> bool:
+        """Whether the service can run it."""
+        return self.effect.deployable and not self.replaced
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rival:
+    """Another explanation that is nearly as good.
+
+    Parameters
+    ----------
+    term : Term
+        The other explanation.
+    rms_after_um : float
+        What it leaves, µm rms.
+    test : PlannedTest or None
+        The test that tells both apart best; None where no test is possible.
+    """
+
+    term: Term
+    rms_after_um: float
+    test: PlannedTest | None
+
+    @property
+    def how_to_tell_apart(self) -> str:
+        """The test in words."""
+        return self.test.sentence if self.test else "No test with what was logged tells them apart."
+
+    @property
+    def label(self) -> str:
+        """Kind and place in words."""
+        return label(self.term)
+
+
+def described(term: Term, std: Mapping[str, float], signal: Vector, evidence: Evidence) -> Effect:
+    """Return the effect of a term with its standard errors and, from what was seen of it, an explanation.
+
+    Parameters
+    ----------
+    term : Term
+        Hypothesis and values.
+    std : mapping of str to float
+        Standard error of each parameter.
+    signal : numpy.ndarray, shape (n,)
+        What it adds to y, µm.
+    evidence : Evidence
+        Samples used, channels and paths.
+    """
+    effect = dataclasses.replace(term.effect, std=std)
+    return dataclasses.replace(effect, explanation=effect.explain(seen_of(effect, signal, evidence)))
+
+
+def seen_of(effect: Effect, signal: Vector, evidence: Evidence) -> Seen:
+    """Return the ranges of an effect, of the channel that it acts by and of the path that it acts on."""
+    records, used = evidence.signals, signal[evidence.used]
+    return Seen(
+        rms_um=float(np.std(used)),
+        added_um=Range(float(np.min(used)), float(np.max(used))),
+        channel=Range.of([record.channels[effect.channel] for record in records]) if effect.channel else None,
+        path_um=Range.of([record.share(effect.path) for record in records]) if effect.path else None,
+    )
+
+
+def rivals_of(
+    term: Term, others: Iterable[Candidate], after_um: float, test: Callable[[Candidate], PlannedTest | None]
+) -> tuple[Rival, ...]:
+    """Return the best of other explanations, one for each place, that leave nearly as little as an effect.
+
+    Parameters
+    ----------
+    term : Term
+        The effect.
+    others : iterable of Candidate
+        Other explanations, best first.
+    after_um : float
+        What the effect leaves, µm rms.
+    test : callable
+        Returns the test that tells another explanation apart from the effect.
+    """
+    rivals: dict[Place, Rival] = {}
+    for other in others:
+        place, rms = other.term.hypothesis.place, other.rms_um
+        if place == term.hypothesis.place or place in rivals or rms > RIVAL_TIMES * after_um:
+            continue
+        rivals[place] = Rival(term=other.term, rms_after_um=rms, test=test(other))
+        if len(rivals) == MOST_RIVALS:
+            break
+    return tuple(rivals.values())

@@ -1,0 +1,109 @@
+"""Errors on data that took no part: the whole search is repeated without each block, and what it finds predicts it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from compensator.arrays import Indices, Vector
+from compensator.diagnose.evidence import Evidence
+from compensator.diagnose.findings import Findings, findings_of
+from compensator.diagnose.outcome import FOLDS, Step, rms_of
+from compensator.model.effects.hypothesis import Place
+from compensator.progress import ExecutorMap, Progress
+
+#: How it is described.
+HELD_OUT = (
+    f"each of {FOLDS} blocks of time predicted after choosing and fitting on the others; zero and initial state also "
+    "from the others"
+)
+HELD_OUT_RECORDINGS = (
+    "each of {count} recordings or groups of them predicted after choosing and fitting on the others; its zero is its "
+    "own mean"
+)
+HELD_OUT_VALUES = (
+    f"each of {FOLDS} sets of every {FOLDS}rd value predicted after choosing and fitting on the others; what is named "
+    "and deployed is decided by the likelihood of all values"
+)
+#: How the errors are measured where nothing was known of the paths.
+WITH_PATHS = "; before: the paths of the first model alone, also refitted to the others"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOut:
+    """What is left on every sample by estimates that did not see it, µm; NaN where y is missing."""
+
+    nothing: Vector
+    named: Vector
+    whole: Vector
+    ceiling: Vector
+    steps: tuple[Step, ...]
+
+
+def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, executor_map: ExecutorMap) -> HeldOut:
+    """Repeat the search without each block; of two choices of nuisances, that which leaves less before."""
+    evidence = found.search.evidence
+    blocks = list(evidence.blocks(FOLDS))
+    progress(1, len(blocks) + 1)
+    views = [evidence.without(block) for block in blocks]
+    timed = [t.effect for t in found.terms if not t.effect.deployable]
+    only_unobserved = bool(found.terms) and not any(term.hypothesis.effect.observed for term in found.terms)
+    unobserved = any(not effect.observed for effect in timed) and not only_unobserved
+    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved), views)
+    left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
+    searches = np.zeros(len(places), dtype=int)
+    for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
+        progress(done, len(blocks) + 1)
+        searches += several.has
+        for choice in (0, 1):
+            for i, one in enumerate(several.added):
+                left[choice, i, block] = seen.left(evidence.residual, one, at_rest=choice == 0)[block]
+    best = min((0, 1), key=lambda choice: rms_of(left[choice, 0]))
+    nothing, named, whole, ceiling, *steps = left[best]
+    return HeldOut(
+        nothing=nothing,
+        named=named,
+        whole=whole,
+        ceiling=ceiling,
+        steps=tuple(Step(rms_um=rms_of(s), searches=n) for s, n in zip(steps, searches.tolist(), strict=True)),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Predictions:
+    """What a search in a part of the evidence predicts on every sample of all.
+
+    Parameters
+    ----------
+    added : tuple of numpy.ndarray, shape (n,)
+        Of nothing, the named effects, effects and remainder, all channels; of the first place, the first two, …, µm.
+    has : numpy.ndarray of int, shape (places,)
+        1 where it found an effect of that place.
+    """
+
+    added: tuple[Vector, ...]
+    has: Indices
+
+
+def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool) -> _Predictions:
+    found = findings_of(seen, unobserved=unobserved)
+    steps, total = [], found.own_paths
+    for place in places:
+        total = sum(
+            (r for t, r in zip(found.terms, found.responses, strict=True) if t.hypothesis.place == place), total
+        )
+        steps.append(total)
+    has = np.array([any(term.hypothesis.place == place for term in found.terms) for place in places], dtype=int)
+    return _Predictions(added=(found.paths, found.named, found.whole, found.ceiling, *steps), has=has)
+
+
+def how_held_out(evidence: Evidence) -> str:
+    """Return how the errors are measured."""
+    count = len(list(evidence.blocks(FOLDS)))
+    words = HELD_OUT_VALUES if evidence.is_sparse else HELD_OUT
+    if evidence.holds_out_recordings:
+        words = HELD_OUT_RECORDINGS.format(count=count)
+    return words + WITH_PATHS * evidence.free_paths

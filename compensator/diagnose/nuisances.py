@@ -1,0 +1,35 @@
+"""What every record has and no effect causes: its zero, and the unknown initial state of the base model."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from compensator.arrays import Mask, Matrix
+from compensator.model.effects.hypothesis import Context
+from compensator.model.effects.signals import RecordSignals
+
+#: An initial state moves y by no more than about this many times its spread, with the weight of one sample.
+STATE_PRIOR = 1e-3
+#: Fastest decay of an initial state, samples, and the largest ratio of neighbouring decays.
+FASTEST, DECAY_RATIO = 2.0, 3.5
+
+
+def nuisances_of(record: RecordSignals, context: Context) -> Matrix:
+    """Return a constant and decays from the fastest that can be seen to the base's slowest mode, each of size 1."""
+    fastest = FASTEST * record.period_min
+    slowest = max([3.0 * fastest, *(t for values in context.taus_min.values() for t in values)])
+    taus = np.geomspace(fastest, slowest, 1 + math.ceil(math.log(slowest / fastest, DECAY_RATIO))).tolist()
+    return np.column_stack([np.ones(record.size), *(np.exp(-record.minutes / tau) for tau in taus)])
+
+
+def basis_of(nuisances: Matrix, used: Mask) -> Matrix:
+    """Return orthonormal columns that the nuisances span on the samples used."""
+    u, s, _ = np.linalg.svd(np.where(used[:, None], nuisances, 0.0), full_matrices=False)
+    return u[:, s > STATE_PRIOR * s[0]]
+
+
+def freedom_of(used: Mask, basis: Matrix) -> int:
+    """Return the number of values less what the nuisances may absorb, at least 1."""
+    return max(int(used.sum()) - int(basis.shape[1]), 1)

@@ -1,0 +1,278 @@
+"""Measured data averaged to points, and what no effect explains in them.
+
+For speed, blocks of samples are averaged to about `POINTS` points; a value that was measured now and then is a point of
+its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compensator.arrays import Indices, Matrix, Vector
+from compensator.diagnose.evidence import Evidence
+from compensator.model.effects.blocks import FilterBank
+from compensator.model.effects.hypothesis import Context
+
+#: Points that the samples are averaged to.
+POINTS = 700
+#: Lags of the paths' own error, and which of them are fast, min.
+OWN_LAGS, FAST_MIN = 8, 25.0
+#: Combinations of lagged inputs that differ less than this from others are left out.
+DISTINCT = 3e-3
+#: Own error where the calibration states none: a share of the noise.
+EXACT_OWN = 0.3
+#: Effects have their form only to this share of their size: where forms are exact, and on a real machine.
+FORM_ERROR = (0.02, 0.1)
+#: The zero of a run is free: this many times the spread of the deformation.
+ZERO_TIMES = 10.0
+#: Typical size of an initial state, as a share of the spread of the deformation.
+START_SHARE = 0.1
+#: Typical slow rest where nothing is known of the paths, as a share of the spread of the deformation.
+SLOW_SHARE = 0.03
+#: Typical time constant of the slow rest, min, and how far (in e-folds) noise, slow rest, its time constant, the
+#: initial state and the paths' fast error may be from what is typical.
+REST_MIN, REST_FOLDS = 60.0, (0.4, 1.0, 1.0, 2.0, 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """What no effect explains.
+
+    Parameters
+    ----------
+    noise_um : float
+        White noise of one point, µm.
+    slow_um, tau_min : float
+        Standard deviation, µm, and time constant, min, of the slow rest.
+    start_um : float
+        What the unknown initial state of a run moves, µm.
+    fast_um, own_um : float
+        Fast and slow error of the base's paths, µm.
+    forms : tuple of (str, float)
+        Error of the form in which channels act, µm.
+    """
+
+    noise_um: float
+    slow_um: float
+    tau_min: float
+    start_um: float
+    fast_um: float
+    own_um: float
+    forms: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def logs(self) -> Vector:
+        """Logarithms of what is learned: noise, slow rest, its time constant, initial state, fast error, shape (5,)."""
+        return np.log([self.noise_um, self.slow_um, self.tau_min, self.start_um, max(self.fast_um, 1e-9)])
+
+    def with_logs(self, logs: Vector) -> Rest:
+        """Return the rest with other values of what is learned."""
+        noise_um, slow_um, tau_min, start_um, fast_um = np.exp(logs).tolist()
+        return Rest(noise_um, slow_um, tau_min, start_um, fast_um, self.own_um, self.forms)
+
+    def without_own_error(self) -> Rest:
+        """Return the rest for a base whose paths are exact."""
+        return dataclasses.replace(self, fast_um=0.0, own_um=0.0, forms=())
+
+
+class Points:
+    """The evidence, averaged to points.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        Residual and signals.
+
+    Attributes
+    ----------
+    residual, used : numpy.ndarray, shape (points,)
+        Residual, µm, and which points take part.
+    count : int
+        How many do.
+    starts, begins : numpy.ndarray, frozenset of int
+        First point of each run.
+    period_min : float
+        Time between two points, min; where Y was measured now and then the median.
+    relative_variance : numpy.ndarray, shape (points,)
+        Variance of the noise of each point, relative to a full one; infinite where it is not used.
+    stretches : list of (int, int, float)
+        Stretches with equal noise and times between the points: begin, end, relative variance.
+    is_exact : bool
+        Whether effects have their form exactly: no error of the calibration is stated, or the paths are free.
+    spread_um, own_um : float
+        Standard deviation of the deformation, and the own error of the base's paths, µm.
+    typical_logs : numpy.ndarray, shape (5,)
+        `Rest.logs` as it is expected before the data are seen.
+    zeros, starts_of_modes, fast, slow : numpy.ndarray, shape (points, ·)
+        Columns of the zeros and initial states of runs, and of the fast and slow error of the base's paths.
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence = evidence
+        context = evidence.context
+        self.is_exact = not context.approximate or evidence.free_paths
+        stride = max(1, math.ceil(evidence.count / POINTS))
+        edges = _edges(evidence, stride)
+        self._edges = np.concatenate(edges)
+        self._weights = evidence.used.astype(float)
+        counts = np.add.reduceat(self._weights, self._edges)
+        self._counts = np.maximum(counts, 1.0)
+        is_value = np.repeat(evidence.sparse, [e.size for e in edges])
+        self.used = counts >= np.where(is_value, 1.0, max(1.0, stride / 2.0))
+        self.starts = np.cumsum([0, *[e.size for e in edges[:-1]]])
+        self.begins = frozenset(self.starts.tolist())
+        self.period_min = context.period_min * stride
+        self._minutes = self.period_min * np.ones(self._edges.size)
+        if is_value.any():
+            self._minutes[:-1] = np.where(is_value[:-1], context.period_min * np.diff(self._edges), self.period_min)
+            self.period_min = max(self.period_min, float(np.median(self._minutes[:-1])))
+        self.count = int(self.used.sum())
+        self.relative_variance = np.where(self.used, stride / self._counts, np.inf)
+        self.stretches = _stretches(self.relative_variance, self._minutes, self.starts)
+        self.residual = self.averaged(evidence.residual[:, None])[:, 0]
+        self.spread_um = max(evidence.spread_um, 1e-9)
+        self.own_um = self._own_um()
+        self.typical_logs = self._typical_logs(stride)
+        self.fast, self.slow = self._own_columns()
+        self._forms: dict[str, Matrix] = {}
+        nuisances = self.averaged(evidence.nuisances)
+        is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
+        self.zeros, self.starts_of_modes = ZERO_TIMES * self.spread_um * nuisances[:, is_zero], nuisances[:, ~is_zero]
+
+    def _own_um(self) -> float:
+        evidence = self.evidence
+        if evidence.free_paths:
+            return self.spread_um
+        share = EXACT_OWN if self.is_exact or evidence.is_sparse else 1.0
+        return max(evidence.noise.own_error_um, share * evidence.probe_um)
+
+    def _typical_logs(self, stride: int) -> Vector:
+        noise_um = self.evidence.probe_um / math.sqrt(stride)
+        if not self.is_exact:
+            # What a calibration missed is no slow process: it is largest right after the heat is switched.
+            noise_um = math.hypot(noise_um, self.own_um)
+        slow_um = SLOW_SHARE * self.spread_um if self.evidence.free_paths else self.own_um
+        return np.log([max(noise_um, 1e-3), slow_um, REST_MIN, START_SHARE * self.spread_um, self.own_um])
+
+    def decays(self, tau_min: float) -> Vector:
+        """Return what is left of a slow process from each point to the next, shape (points,)."""
+        lengths, which = np.unique(self._minutes, return_inverse=True)
+        return np.array([math.exp(-length / tau_min) for length in lengths.tolist()])[which]
+
+    def averaged(self, table: Matrix) -> Matrix:
+        """Return the means of columns over the samples used of each point, shape (points, columns)."""
+        sums = np.add.reduceat(table * self._weights[:, None], self._edges, axis=0)
+        return np.asarray(sums / self._counts[:, None])
+
+    def scaled(self, points: Matrix, sizes: Sequence[float], together: int) -> tuple[Matrix, Vector]:
+        """Return averaged columns of which one unit is what is expected of each amplitude, and their scales.
+
+        That moves y by its spread, all amplitudes together, or is the size that the machine bounds it by.
+
+        Parameters
+        ----------
+        points : numpy.ndarray, shape (points, k)
+            One column for each amplitude.
+        sizes : sequence of float
+            Bounds of the amplitudes, repeated over the columns; none where there are none.
+        together : int
+            How many of the columns belong to one effect.
+        """
+        spread = np.std(points[self.used], axis=0)
+        spread[spread < 1e-12] = 1.0
+        scale = self.spread_um / spread
+        if sizes:
+            scale = np.minimum(scale, np.resize(sizes, scale.size))
+        scale = scale / math.sqrt(together)
+        return points * scale, scale
+
+    def typical_rest(self) -> Rest:
+        """Return a rest as it is expected before the data are seen."""
+        return Rest(0.0, 0.0, 0.0, 0.0, 0.0, self.own_um).with_logs(self.typical_logs)
+
+    def with_forms_of(self, rest: Rest, sizes_um: Mapping[str, float]) -> Rest:
+        """Return a rest with the errors that effects have whose form is not quite theirs.
+
+        Parameters
+        ----------
+        rest : Rest
+            Where the other values come from.
+        sizes_um : mapping of str to float
+            Standard deviation of what each channel adds by effects, µm; of the base's paths under an empty name.
+        """
+        share = FORM_ERROR[not self.is_exact]
+        forms = tuple((channel, share * size) for channel, size in sizes_um.items() if channel)
+        return dataclasses.replace(rest, own_um=math.hypot(self.own_um, share * sizes_um.get("", 0.0)), forms=forms)
+
+    def random(self, rest: Rest) -> Matrix:
+        """Return columns whose weights are unknown with standard deviation 1.
+
+        Zeros, initial states, fast and slow own error, errors of form.
+        """
+        starts, forms = rest.start_um * self.starts_of_modes, [size * self.form(name) for name, size in rest.forms]
+        return np.concatenate([self.zeros, starts, rest.fast_um * self.fast, rest.own_um * self.slow, *forms], axis=1)
+
+    def form(self, channel: str) -> Matrix:
+        """Return responses of any linear path from a channel, of size 1 together."""
+        if channel not in self._forms:
+            self._forms[channel] = self._responses([record.channels[channel] for record in self.evidence.signals])[2]
+        return self._forms[channel]
+
+    def log_prior(self, rest: Rest) -> float:
+        """Return the logarithm of the prior of a rest."""
+        return -0.5 * float(np.sum(((rest.logs - self.typical_logs) / REST_FOLDS) ** 2))
+
+    def _own_columns(self) -> tuple[Matrix, Matrix]:
+        """Return fast and slow responses of any linear paths to heat and ambient temperature, of size 1 each."""
+        records = self.evidence.signals
+        both = [self._responses([record.source(path) for record in records]) for path in self.evidence.context.paths]
+        fast, slow, _ = zip(*both, strict=True)
+        return np.concatenate(fast, axis=1), np.concatenate(slow, axis=1)
+
+    def _responses(self, drives: Sequence[Vector]) -> tuple[Matrix, Matrix, Matrix]:
+        """Return fast, slow, and all responses to a drive."""
+        context = self.evidence.context
+        taus = np.array(lags_of_paths(context))
+        bank = FilterBank(taus.tolist(), [(1.0,) * taus.size], context.period_min)
+        table = self.averaged(np.concatenate([bank.columns(drive) for drive in drives]))
+        slow = table[:, taus >= FAST_MIN]
+        # Without a gain at rest, a fast response is one of timing.
+        fast = table[:, taus < FAST_MIN] - slow[:, :1]
+        return self._orthogonal(fast), self._orthogonal(slow), self._orthogonal(table)
+
+    def _orthogonal(self, table: Matrix) -> Matrix:
+        """Return combinations of columns that are orthogonal on the points used and together of size 1."""
+        if not table.shape[1]:
+            return table
+        table = table / np.maximum(np.std(table[self.used], axis=0), 1e-12)
+        _, sizes, directions = np.linalg.svd(table[self.used] - table[self.used].mean(axis=0), full_matrices=False)
+        kept = sizes > DISTINCT * sizes[0]
+        return np.asarray(table @ directions[kept].T / sizes[kept] * math.sqrt(self.count / kept.sum()))
+
+
+def _edges(evidence: Evidence, stride: int) -> list[Indices]:
+    """Return the first sample of each point, for each run; a value measured now and then is a point of its own."""
+    starts = np.cumsum([0, *[record.size for record in evidence.signals[:-1]]])
+    return [
+        s + np.flatnonzero(evidence.used[s : s + record.size]) if sparse else np.arange(s, s + record.size, stride)
+        for s, record, sparse in zip(starts.tolist(), evidence.signals, evidence.sparse, strict=True)
+    ]
+
+
+def _stretches(variance: Vector, minutes: Vector, starts: Indices) -> list[tuple[int, int, float]]:
+    """Return where equal variances and times to the next point begin and end, cut where runs begin."""
+    changes = np.flatnonzero((variance[1:] != variance[:-1]) | (minutes[1:] != minutes[:-1])) + 1
+    edges = np.unique(np.concatenate([starts, changes, [variance.size]])).tolist()
+    return [(a, b, float(variance[a])) for a, b in itertools.pairwise(edges)]
+
+
+def lags_of_paths(context: Context) -> tuple[float, ...]:
+    """Return lags that any linear path is made of, min."""
+    longest = min(600.0, max(context.minutes / 3.0, 20.0 * context.period_min))
+    return (0.0, *np.geomspace(context.period_min, longest, OWN_LAGS).tolist())
