@@ -81,7 +81,7 @@ def diagnose(
     extended, remarks = (model, ()) if contradicted else _extended(model, found, effects, held_out)
     deployed = extended is not model
     verdict, ceiling = _verdict(found, held_out, extended), _ceiling(held_out)
-    could_hide = detection_limits(found.selection, found.search.price) if few else None
+    could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
     hides = verdict == "adequate" and could_hide is not None and (could_hide.is_too_much or could_hide.undecided != ())
     advice = None
@@ -100,7 +100,9 @@ def diagnose(
         held_out=how_held_out(evidence),
         model=extended,
         evidence=evidence,
-        residual_before=np.where(evidence.used, found.search.left(found.selection.before) - found.paths, np.nan),
+        residual_before=np.where(
+            evidence.used, found.search.criterion.left(found.selection.before) - found.paths, np.nan
+        ),
         residual_after=np.where(evidence.used, left, np.nan),
         held_out_before=held_out.nothing,
         held_out_named=held_out.named,
@@ -173,7 +175,7 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
         left = evidence.residual - sum(responses, np.zeros(evidence.used.size))
         return rms_of(evidence.without_nuisances(np.where(evidence.used, left, 0.0))[evidence.used])
 
-    after, searched = rms_without(found.responses), search.rms(selection.fit)
+    after, searched = rms_without(found.responses), search.criterion.rms(selection.fit)
     effects = []
     errors = standard_errors(selection.fit)
     few = evidence.is_sparse
@@ -281,7 +283,7 @@ def _verdict(found: Findings, held_out: HeldOut, extended: ThermalModel) -> Verd
         return "unexplained"
     holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)
     if evidence.is_sparse:
-        # What few values were fitted by is judged by those that it was not fitted to.
+        # What few values were fitted by must hold on those that it was not fitted to.
         level = VERDICT_TIMES**2 * (noise.noise_um**2 + noise.allowance / noise.count)
         holds = holds and rms_of(held_out.whole) ** 2 <= level
     return "explained" if is_noise and holds and all(observed) and found.explains else "partly_explained"

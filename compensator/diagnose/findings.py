@@ -9,9 +9,10 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.background import Background, Regressed
+from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term
-from compensator.diagnose.search import MARGIN, Search, Selection
+from compensator.diagnose.search import Search, Selection
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.regression import AMBIENT, DRIVE, Regression
 from compensator.model.thermal_model import Path, ThermalModel
@@ -139,7 +140,7 @@ def _remainder(
     points, evidence = fit.likelihood.points, fit.likelihood.points.evidence
     beside = background.fitted(points, fit.added, fit.rest) if fit.terms else ceiling
     known = refitted.log_evidence if refitted else _log_evidence(fit)
-    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - search.charge(fit):
+    if fit.terms and ceiling.log_evidence > max(known, beside.log_evidence) - search.criterion.charge(fit):
         return ceiling, False
     size = float(np.std(beside.added[evidence.used]))
     least = LEAST * np.hypot(evidence.noise.noise_um, evidence.noise.own_error_um)

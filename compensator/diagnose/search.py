@@ -1,12 +1,7 @@
 """Search for the effects that a model lacks: proposed by scans, compared by the evidence.
 
-    J = log p(residual | effects) − Σ_effects [ log M + margin ]
-
-with M places (and forms of a place) tried. The evidence counts everything else: parameters and amplitudes cost what
-the data leave of their ranges, and what no effect explains is a slow rest and noise of learned size.
-
 A rest that may be large hides slow effects from a scan, a small one shows them and is fooled by what is missing. So
-effects are proposed with both, and judged with the rest that fits each best.
+effects are proposed with both, and compared with the rest that fits each best.
 """
 
 from __future__ import annotations
@@ -14,15 +9,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.diagnose.criterion import Criterion
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Start, Term, fit_terms, raw_columns, response, settled, summed
+from compensator.diagnose.fit import Fit, Start, Term, fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, learned_rest
 from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.scan import Scan
@@ -31,18 +25,12 @@ from compensator.model.effects.hypothesis import Hypothesis, Place, proposals
 
 #: Most effects looked for.
 MOST = 4
-#: What an effect must add to the logarithm of the evidence, beyond the number of places tried.
-MARGIN = 4.0
-#: What a source that no channel shows must add beyond that where the base has an error of its own, whose form it takes.
-UNSEEN = 15.0
 #: Few values do not decide whether an effect acts that is not worth its price and adds as much as this.
 DOUBT = 4.5
-#: Hypotheses that are fitted after each scan, and how many of those are judged.
+#: Hypotheses that are fitted after each scan, and for how many of those the rest is learned.
 FITTED, JUDGED = 6, 4
 #: Shortest period that averaged points show for what it is, points.
 ALIAS_FREE = 3.0
-#: Columns of an effect that are larger than their sum by this much cancel each other.
-CANCELS = 6.0
 #: A simpler effect on the same path gives its name where it explains this share of what a background effect explains.
 MOSTLY = 0.7
 
@@ -100,8 +88,7 @@ class Search:
             self.hypotheses += proposals(context, background=True)
         self.hypotheses = [_above(hypothesis, ALIAS_FREE * self.points.period_min) for hypothesis in self.hypotheses]
         self._scan = Scan(self.points, self.hypotheses)
-        self._forms = Counter(hypothesis.place for hypothesis in self.hypotheses)
-        self._something_acts = False
+        self.criterion = Criterion(evidence, self.hypotheses)
 
     def run(self, *, unobserved: bool = True) -> Selection:
         """Search what the inputs explain, and a source that no channel shows.
@@ -115,7 +102,7 @@ class Search:
         nothing = np.zeros(self.points.used.size)
         rest = learned_rest(self.points, np.zeros((nothing.size, 0)), nothing, self.points.typical_rest())
         before = fit_terms(Likelihood(self.points, rest), [])
-        self._something_acts = self.evidence.is_sparse and not self._leaves_noise(before)
+        self.criterion.something_acts = self.evidence.is_sparse and not self.criterion.leaves_noise(before)
         grown, undecided = self._grown(before, unobserved=unobserved)
         best = self._pruned(grown)
         if grown.terms and not best.terms:
@@ -146,72 +133,33 @@ class Search:
         apart_from : frozenset of Place
             Effects that are not looked for.
         """
-        while len(best.terms) < MOST and not self._is_expected(best):
+        while len(best.terms) < MOST and not self.criterion.is_expected(best):
             proposed = self._proposed(best, unobserved=unobserved, apart_from=apart_from)
             # A source with many switchings looks poor until the rest is settled with it.
             late = [fit for fit in proposed[JUDGED:] if not fit.terms[-1].hypothesis.effect.observed]
             candidates = [settled(fit) for fit in (*proposed[:JUDGED], *late)]
-            better = max(candidates, key=self.score, default=best)
-            if self.score(better) <= self.score(best):
+            better = max(candidates, key=self.criterion.score, default=best)
+            if self.criterion.score(better) <= self.criterion.score(best):
                 return best, self._undecided(candidates, best)
             best = self._exchanged(better)
         return best, ()
-
-    def score(self, fit: Fit) -> float:
-        """Return *J*."""
-        return fit.log_evidence - self.charge(fit)
-
-    def charge(self, fit: Fit) -> float:
-        """Return what the effects of a fit are charged.
-
-        Where few values are left with more than their stated noise, something acts, and effects that leave no more than
-        that are not charged for being there: one of them is, or a slow cause that has no name.
-        """
-        waived = self._something_acts and bool(fit.terms) and self._leaves_noise(fit)
-        return self.cost(fit) - waived * self.price
-
-    def cost(self, fit: Fit) -> float:
-        """Return what the effects of a fit must add to the evidence."""
-        return sum(self._cost(term.hypothesis) for term in fit.terms)
-
-    def left(self, fit: Fit) -> Vector:
-        """Return what a fit leaves on every sample, nuisances projected out, µm; 0 where samples are not used."""
-        left = self.evidence.residual - summed(self.evidence, fit.terms)
-        return self.evidence.without_nuisances(np.where(self.evidence.used, left, 0.0))
-
-    def rms(self, fit: Fit) -> float:
-        """Return the rms of what a fit leaves, µm."""
-        return float(np.sqrt(np.sum(self.left(fit) ** 2) / self.evidence.count))
-
-    @property
-    def price(self) -> float:
-        """What a usual effect must add to the logarithm of the evidence."""
-        return MARGIN + math.log(len(self._forms) + 1)
-
-    def _cost(self, hypothesis: Hypothesis) -> float:
-        """Return what an effect must add to the evidence."""
-        unseen = UNSEEN if self.evidence.context.approximate and not hypothesis.effect.observed else 0.0
-        return unseen + MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
 
     def _hidden(self, undecided: Sequence[Fit], best: Fit) -> Fit | None:
         """Return a source that no channel shows, if few values show that something acts and nothing else comes nearer.
 
         The slow rest is such a source, too, only without times: it must not keep the one with times from its name.
         """
-        if best.terms or not self._something_acts:
+        if best.terms or not self.criterion.something_acts:
             return None
-        first = next((fit for fit in undecided if self._leaves_noise(fit)), None)
+        first = next((fit for fit in undecided if self.criterion.leaves_noise(fit)), None)
         return first if first and first.terms[-1].hypothesis.effect.kind == "unobserved" else None
-
-    def _leaves_noise(self, fit: Fit) -> bool:
-        return self.evidence.noise.is_explained(self.rms(fit) ** 2 * self.evidence.count)
 
     def _undecided(self, candidates: Sequence[Fit], best: Fit) -> tuple[Fit, ...]:
         """Return the effects that may act, best first, where few values do not decide it."""
         if not self.evidence.is_sparse:
             return ()
-        least = -math.inf if self._something_acts else best.log_evidence + DOUBT
-        return tuple(sorted((f for f in candidates if f.log_evidence > least), key=self.score, reverse=True))
+        least = -math.inf if self.criterion.something_acts else best.log_evidence + DOUBT
+        return tuple(sorted((f for f in candidates if f.log_evidence > least), key=self.criterion.score, reverse=True))
 
     # ------------------------------------------------------------------ steps
 
@@ -232,7 +180,7 @@ class Search:
         found: list[Fit] = []
         seen = set()
         for rest, likelihood in zip(views, likelihoods, strict=True):
-            ranked: Iterable[Start] = self._scan.ranked(rest, fit, self._cost)[:FITTED]
+            ranked: Iterable[Start] = self._scan.ranked(rest, fit, self.criterion.cost_of)[:FITTED]
             if unobserved and rest is views[-1] and all(t.hypothesis.effect.observed for t in fit.terms):
                 ranked = itertools.chain(ranked, self._sources(rest, fit, found))
             for start in ranked:
@@ -242,13 +190,13 @@ class Search:
                 if start[0].effect.jumps and self._starts_anywhere(fit):
                     continue
                 added = fit_terms(likelihood, [*fit.starts(), start], evaluations=8)
-                if not self._is_plausible(added.terms[-1]):
+                if not self.criterion.is_plausible(added.terms[-1]):
                     continue
                 others = [
                     fit_terms(other, added.starts(), evaluations=1) for other in likelihoods if other is not likelihood
                 ]
-                found.append(max([added, *others], key=self.score))
-        return sorted(found, key=self.score, reverse=True)
+                found.append(max([added, *others], key=self.criterion.score))
+        return sorted(found, key=self.criterion.score, reverse=True)
 
     def _exchanged(self, fit: Fit, count: int | None = None) -> Fit:
         """Exchange effects one at a time where that helps: what was found first may have absorbed two.
@@ -265,42 +213,21 @@ class Search:
             for candidate in self._proposed(others, unobserved=False)[:2]:
                 if candidate.places != fit.places:
                     better = settled(candidate)
-                    fit = better if self.score(better) > self.score(fit) else fit
+                    fit = better if self.criterion.score(better) > self.criterion.score(fit) else fit
         return fit
 
     def _pruned(self, fit: Fit) -> Fit:
         """Leave out every effect that is not worth its cost, or too small to name."""
         while fit.terms:
             fewer = [settled(fit_terms(fit.likelihood, fit.starts(i))) for i in range(len(fit.terms))]
-            best = max(range(len(fewer)), key=lambda i: self.score(fewer[i]))
-            small = [i for i, term in enumerate(fit.terms) if not self._is_worth_naming(term, fewer[i], fit)]
-            if self.score(fewer[best]) <= self.score(fit):
+            best = max(range(len(fewer)), key=lambda i: self.criterion.score(fewer[i]))
+            small = [i for i, term in enumerate(fit.terms) if not self.criterion.is_worth_naming(term, fewer[i], fit)]
+            if self.criterion.score(fewer[best]) <= self.criterion.score(fit):
                 if not small:
                     return fit
-                best = max(small, key=lambda i: self.score(fewer[i]))
+                best = max(small, key=lambda i: self.criterion.score(fewer[i]))
             fit = fewer[best]
         return fit
-
-    def _is_expected(self, fit: Fit) -> bool:
-        """Return whether what is left may come by itself on another day, where the calibration states its error."""
-        noise = self.evidence.noise
-        return (
-            noise.own_error_um > 0.0
-            and not self.evidence.is_sparse
-            and noise.is_expected(self.rms(fit) ** 2 * self.evidence.count)
-        )
-
-    def _is_worth_naming(self, term: Term, without: Fit, fit: Fit) -> bool:
-        """Return whether an effect is large enough beside what is left without it and the base model's own error."""
-        if self.evidence.free_paths:
-            # What is left without it is the whole deformation: only the evidence says what it is worth.
-            return True
-        effect, others = term.hypothesis.effect, self.evidence.context.approximate and len(fit.terms) > 1
-        share = effect.worth_with_others if others else effect.worth
-        added = np.where(self.evidence.used, response(self.evidence, term), 0.0)
-        size = float(np.sum(self.evidence.without_nuisances(added) ** 2))
-        left = (self.rms(without) ** 2) * self.evidence.count + self.evidence.noise.allowance
-        return size > share * left
 
     def _sources(self, rest: Rest, fit: Fit, found: Sequence[Fit]) -> Iterator[Start]:
         """Yield a source that no channel shows, where it may compete with the effects found."""
@@ -312,28 +239,19 @@ class Search:
         """Return whether an initial state of an effect is unknown: until its first reversal it looks like a jump."""
         return self.evidence.context.approximate and any(t.hypothesis.effect.starts_anywhere for t in fit.terms)
 
-    def _is_plausible(self, term: Term) -> bool:
-        """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
-        if len(term.amplitudes) < 2 or term.hypothesis.effect.has_any_form:
-            return True
-        table = raw_columns(self.evidence, term.hypothesis, term.values) * np.array(term.amplitudes)
-        table = table[self.evidence.used]
-        table = table - table.mean(axis=0)
-        return bool(np.max(np.linalg.norm(table, axis=0)) < CANCELS * np.linalg.norm(table.sum(axis=1)))
-
     def _with_simpler_name(self, fit: Fit) -> Fit:
         """Name what can absorb any change of the paths by a simple effect that explains most of it."""
         for i, term in enumerate(fit.terms):
             if term.hypothesis.effect.background or (
                 self.evidence.context.approximate and term.hypothesis.effect.kind == "dynamics"
             ):
-                without = self.rms(fit_terms(fit.likelihood, fit.starts(i), evaluations=1)) ** 2
-                all_of_it = without - self.rms(fit) ** 2
+                without = self.criterion.rms(fit_terms(fit.likelihood, fit.starts(i), evaluations=1)) ** 2
+                all_of_it = without - self.criterion.rms(fit) ** 2
                 for hypothesis in self.hypotheses:
                     if hypothesis.effect.names_background and hypothesis.place not in fit.places:
                         starts = [*fit.starts(i)[:i], (hypothesis, ()), *fit.starts(i)[i:]]
                         simple = settled(fit_terms(fit.likelihood, starts))
-                        if without - self.rms(simple) ** 2 > MOSTLY * all_of_it:
+                        if without - self.criterion.rms(simple) ** 2 > MOSTLY * all_of_it:
                             return simple
         return fit
 
@@ -342,10 +260,10 @@ class Search:
         kept = fit.starts(index)
         base = fit_terms(fit.likelihood, kept, evaluations=1)
         found: dict[Place, Candidate] = {}
-        for hypothesis, values in self._scan.ranked(fit.rest, base, self._cost):
+        for hypothesis, values in self._scan.ranked(fit.rest, base, self.criterion.cost_of):
             if hypothesis.place not in found and hypothesis.place not in fit.places and len(found) < FITTED:
                 other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
-                found[hypothesis.place] = Candidate(term=other.terms[-1], fit=other, rms_um=self.rms(other))
+                found[hypothesis.place] = Candidate(term=other.terms[-1], fit=other, rms_um=self.criterion.rms(other))
         return tuple(sorted(found.values(), key=lambda item: item.rms_um))
 
 

@@ -55,15 +55,7 @@ def switchings(rest: Rest, fit: Fit, rival: float = 0.0) -> Start | None:
 
 
 class _Pursuit:
-    """Orthogonal matching pursuit of steps in a residual.
-
-    Parameters
-    ----------
-    rest : Rest
-        What else there is.
-    fit : Fit
-        What leaves the residual.
-    """
+    """Orthogonal matching pursuit of steps in what a fit leaves, beside a rest."""
 
     def __init__(self, rest: Rest, fit: Fit) -> None:
         points = fit.likelihood.points

@@ -124,7 +124,7 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     columns, _, _ = record([draw("gain DTF", 3)], 77, hours=24.0)
     good = diagnose(QUILL, runs_from(columns))
     assert good.verdict == "explained" and good.model.effects and "were found" in verdict(figures(good))
-    held_out = diagnosis_module._held_out
+    held_out = diagnosis_module.held_out_of
 
     def worse(*arguments):
         errors = held_out(*arguments)
@@ -132,7 +132,7 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
 
     times = 1.1
 
-    monkeypatch.setattr(diagnosis_module, "_held_out", worse)
+    monkeypatch.setattr(diagnosis_module, "held_out_of", worse)
     # Each block may hold an event of its own: then it is deployed, and said.
     unsure = diagnose(QUILL, runs_from(columns))
     assert unsure.verdict == "partly_explained" and unsure.model.effects

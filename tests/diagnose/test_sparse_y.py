@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import compensator as tc
-from compensator.diagnose import diagnosis
+from compensator.diagnose import diagnosis, held_out
 from compensator.diagnose.background import Background
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import evidence_of
@@ -138,7 +138,7 @@ def test_a_size_that_could_hide_is_one_that_is_just_named():
     search = Search(evidence_of(QUILL, runs(columns)))
     size = next(
         one.size_um
-        for one in detection_limits(search.run(), search.price).what
+        for one in detection_limits(search.run(), search.criterion.price).what
         if (one.kind, one.path) == ("gain", "DTF")
     )
     share = np.concatenate([r.share("DTF") for r in search.evidence.signals])
@@ -154,7 +154,7 @@ def test_a_stated_noise_that_is_too_small_is_no_all_clear_and_a_large_one_hides_
     sizes = []
     for std_um in (1.5, 3.0):
         search = Search(evidence_of(QUILL, runs(columns, std_um)))
-        sizes.append(detection_limits(search.run(), search.price).what[0].size_um)
+        sizes.append(detection_limits(search.run(), search.criterion.price).what[0].size_um)
     assert sizes[1] > 1.4 * sizes[0]
 
 
@@ -271,7 +271,8 @@ def test_a_remainder_that_helps_nothing_is_not_deployed(monkeypatch):
         everything = Background(evidence).fitted(points, np.zeros(points.used.size), rest)
         return dataclasses.replace(found, remainder=everything, explains=False)
 
-    monkeypatch.setattr(diagnosis, "findings_of", replaced)
+    for module in (diagnosis, held_out):
+        monkeypatch.setattr(module, "findings_of", replaced)
     why = tc.diagnose("quill", probed("gain DTF", 1), y_std_um=STD_UM)
     found = why.to_dict()
     assert found["remainder"] is None

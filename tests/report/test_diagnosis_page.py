@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import compensator as tc
-from compensator.diagnose import diagnosis as diagnosis_module
+from compensator.diagnose import held_out as held_out_module
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Step, rms_of
 from compensator.diagnose.summary import contents, error_table, figures, verdict
@@ -133,9 +133,9 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
             ceiling=nothing,
         )
 
-    monkeypatch.setattr(diagnosis_module, "findings_of", findings_of)
+    monkeypatch.setattr(held_out_module, "findings_of", findings_of)
     all_of = SimpleNamespace(search=SimpleNamespace(evidence=evidence), terms=())
-    held_out = diagnosis_module._held_out(all_of, places, lambda done, of: None, map)
+    held_out = held_out_module.held_out_of(all_of, places, lambda done, of: None, map)
     first, second = held_out.steps
     assert (first.searches, second.searches) == (3, 2)
     assert first.rms_um == pytest.approx(1.0, rel=0.15)

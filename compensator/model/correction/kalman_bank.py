@@ -154,7 +154,7 @@ class KalmanBank:
         return mean, weighted(self.weights, [variance + (value - mean) ** 2 for value, variance in each])
 
     def weigh(self, observation: Observation) -> Weighing:
-        """Judge the filters by a value, and the value by the filters.
+        """Return how probable a value is, and how probable it makes each filter.
 
         A wrong value is further off by about `WRONG_UM`. Where it is more probably wrong, the walks that allow it
         gain weight all the same: what moved may be the machine.

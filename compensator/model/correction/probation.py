@@ -61,7 +61,7 @@ class Probation:
         return both.mean[0], both.covariance[0][0]
 
     def weigh(self, probe: Observation) -> Weighing:
-        """Judge a probe by the more probable bank."""
+        """Return what the more probable bank says of a probe; see `KalmanBank.weigh`."""
         return self._bank.weigh(probe)
 
     def reconsider(self, probe: Observation) -> None:

@@ -37,9 +37,6 @@ _MOST_SAMPLES = 300
 _KNOWN = 100
 #: Refusals after which no other probe is wanted: the same value is known already, or none can be used.
 _NOT_ASKED = (ProbeCode.DUPLICATE, ProbeCode.TOO_MANY_FEATURES, ProbeCode.AXIS)
-_WORDS = {"": "taken", ProbeCode.OUTLIER: "refused", ProbeCode.BELIEVED: "taken against earlier ones"}
-#: From this standard deviation on nothing was known about the value: it is the first of its feature, µm.
-UNKNOWN_UM = 200.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -288,20 +285,7 @@ class Probing:
         if request.feature not in self._state.features:
             self._state.features = [*self._state.features, request.feature]
         self._state.refused = "" if found.taken else ProbeCode.OUTLIER
-        std_um = found.innovation_std_um
-        known = f"±{std_um:.2f} µm" if std_um < UNKNOWN_UM else "anything: the first of this feature"
-        text = (
-            f"probe {_WORDS[found.reason or '']}: deformation {deformation_um:.2f} µm, "
-            f"{found.innovation_um:+.2f} µm from the prediction (expected {known})"
-        )
-        return Verdict(
-            taken=found.taken,
-            code=found.reason or "",
-            text=text,
-            predicted_um=predicted.y_um,
-            innovation_um=found.innovation_um,
-            innovation_std_um=found.innovation_std_um,
-        )
+        return Verdict.of(found, deformation_um, predicted.y_um)
 
     def wanted(self, y_std_um: float) -> Wanted:
         """Return whether, by when and why a probe is wanted after the last sample.

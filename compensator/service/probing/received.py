@@ -11,8 +11,12 @@ from compensator.arrays import NAN
 from compensator.codes import ProbeCode, Reason
 from compensator.errors import ServiceError
 from compensator.messages import SCHEMA, Probe, ProbeRequest, number
+from compensator.model.correction import ProbeVerdict
 
 _REQUEST = msgspec.json.Decoder(ProbeRequest)
+_WORDS = {"": "taken", ProbeCode.OUTLIER: "refused", ProbeCode.BELIEVED: "taken against earlier ones"}
+#: From this standard deviation on nothing was known about the value: it is the first of its feature, µm.
+UNKNOWN_UM = 200.0
 
 
 class ProbeRefused(ServiceError):
@@ -80,6 +84,24 @@ class Verdict:
     predicted_um: float = NAN
     innovation_um: float = NAN
     innovation_std_um: float = NAN
+
+    @classmethod
+    def of(cls, found: ProbeVerdict, deformation_um: float, predicted_um: float) -> Verdict:
+        """Return the verdict on a probe that was compared with the prediction."""
+        std_um = found.innovation_std_um
+        known = f"±{std_um:.2f} µm" if std_um < UNKNOWN_UM else "anything: the first of this feature"
+        text = (
+            f"probe {_WORDS[found.reason or '']}: deformation {deformation_um:.2f} µm, "
+            f"{found.innovation_um:+.2f} µm from the prediction (expected {known})"
+        )
+        return cls(
+            taken=found.taken,
+            code=found.reason or "",
+            text=text,
+            predicted_um=predicted_um,
+            innovation_um=found.innovation_um,
+            innovation_std_um=std_um,
+        )
 
 
 def read_probe(payload: bytes) -> ProbeRequest:

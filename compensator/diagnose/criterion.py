@@ -1,0 +1,119 @@
+"""The criterion of selection: the evidence of an explanation, less what naming its effects costs.
+
+    J = log p(residual | effects) − Σ_effects [ log M + margin ]
+
+with M places (and forms of a place) tried. The evidence counts everything else: parameters and amplitudes cost what
+the data leave of their ranges, and what no effect explains is a slow rest and noise of learned size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from compensator.arrays import Vector
+from compensator.diagnose.evidence import Evidence
+from compensator.diagnose.fit import Fit, Term, raw_columns, response, summed
+from compensator.model.effects.hypothesis import Hypothesis
+
+#: What an effect must add to the logarithm of the evidence, beyond the number of places tried.
+MARGIN = 4.0
+#: What a source that no channel shows must add beyond that where the base has an error of its own, whose form it takes.
+UNSEEN = 15.0
+#: Columns of an effect that are larger than their sum by this much cancel each other.
+CANCELS = 6.0
+
+
+class Criterion:
+    """Compares fits, and says which effects are worth naming.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        The data.
+    hypotheses : sequence of Hypothesis
+        Everything that is tried.
+
+    Attributes
+    ----------
+    something_acts : bool
+        Whether few values are left with more than their stated noise where nothing is assumed to act.
+    """
+
+    def __init__(self, evidence: Evidence, hypotheses: Sequence[Hypothesis]) -> None:
+        self._evidence = evidence
+        self._forms = Counter(hypothesis.place for hypothesis in hypotheses)
+        self.something_acts = False
+
+    def score(self, fit: Fit) -> float:
+        """Return *J*."""
+        return fit.log_evidence - self.charge(fit)
+
+    def charge(self, fit: Fit) -> float:
+        """Return what the effects of a fit are charged.
+
+        Where few values are left with more than their stated noise, something acts, and effects that leave no more than
+        that are not charged for being there: one of them is, or a slow cause that has no name.
+        """
+        waived = self.something_acts and bool(fit.terms) and self.leaves_noise(fit)
+        return self.cost(fit) - waived * self.price
+
+    def cost(self, fit: Fit) -> float:
+        """Return what the effects of a fit must add to the evidence."""
+        return sum(self.cost_of(term.hypothesis) for term in fit.terms)
+
+    def left(self, fit: Fit) -> Vector:
+        """Return what a fit leaves on every sample, nuisances projected out, µm; 0 where samples are not used."""
+        left = self._evidence.residual - summed(self._evidence, fit.terms)
+        return self._evidence.without_nuisances(np.where(self._evidence.used, left, 0.0))
+
+    def rms(self, fit: Fit) -> float:
+        """Return the rms of what a fit leaves, µm."""
+        return float(np.sqrt(np.sum(self.left(fit) ** 2) / self._evidence.count))
+
+    @property
+    def price(self) -> float:
+        """What a usual effect must add to the logarithm of the evidence."""
+        return MARGIN + math.log(len(self._forms) + 1)
+
+    def cost_of(self, hypothesis: Hypothesis) -> float:
+        """Return what an effect must add to the evidence."""
+        unseen = UNSEEN if self._evidence.context.approximate and not hypothesis.effect.observed else 0.0
+        return unseen + MARGIN + math.log(len(self._forms) + 1) + math.log(max(self._forms[hypothesis.place], 1))
+
+    def leaves_noise(self, fit: Fit) -> bool:
+        """Return whether what a fit leaves may be noise alone."""
+        return self._evidence.noise.is_explained(self.rms(fit) ** 2 * self._evidence.count)
+
+    def is_expected(self, fit: Fit) -> bool:
+        """Return whether what is left may come by itself on another day, where the calibration states its error."""
+        noise = self._evidence.noise
+        return (
+            noise.own_error_um > 0.0
+            and not self._evidence.is_sparse
+            and noise.is_expected(self.rms(fit) ** 2 * self._evidence.count)
+        )
+
+    def is_worth_naming(self, term: Term, without: Fit, fit: Fit) -> bool:
+        """Return whether an effect is large enough beside what is left without it and the base model's own error."""
+        if self._evidence.free_paths:
+            # What is left without it is the whole deformation: only the evidence says what it is worth.
+            return True
+        effect, others = term.hypothesis.effect, self._evidence.context.approximate and len(fit.terms) > 1
+        share = effect.worth_with_others if others else effect.worth
+        added = np.where(self._evidence.used, response(self._evidence, term), 0.0)
+        size = float(np.sum(self._evidence.without_nuisances(added) ** 2))
+        left = (self.rms(without) ** 2) * self._evidence.count + self._evidence.noise.allowance
+        return size > share * left
+
+    def is_plausible(self, term: Term) -> bool:
+        """Refuse an effect whose columns cancel: two lags that imitate a derivative or a ramp are not physical."""
+        if len(term.amplitudes) < 2 or term.hypothesis.effect.has_any_form:
+            return True
+        table = raw_columns(self._evidence, term.hypothesis, term.values) * np.array(term.amplitudes)
+        table = table[self._evidence.used]
+        table = table - table.mean(axis=0)
+        return bool(np.max(np.linalg.norm(table, axis=0)) < CANCELS * np.linalg.norm(table.sum(axis=1)))
