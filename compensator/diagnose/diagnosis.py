@@ -91,6 +91,10 @@ def diagnose(
     # Paths that were refitted with all effects say nothing beside only some of them.
     places = [] if evidence.free_paths else [effect.place for effect in effects]
     held_out = _held_out(found, places, progress, executor_map)
+    if not effects and not evidence.free_paths:
+        # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
+        whole = held_out.whole if found.remainder is not None else held_out.nothing
+        held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
     few = evidence.is_sparse
     beside = found.remainder is not None and found.explains and not evidence.free_paths
     if beside and rms_of(held_out.whole) > rms_of(held_out.named):
@@ -360,7 +364,8 @@ def _verdict(found: Findings, held_out: _HeldOut, extended: ThermalModel) -> Ver
     noise = dataclasses.replace(evidence.noise, noise_um=float(np.hypot(evidence.noise.noise_um, unknown_um2**0.5)))
     is_noise = noise.is_explained(float(left @ left))
     if not observed:
-        return "adequate" if is_noise and not evidence.free_paths else "unexplained"
+        nothing_acts = is_noise and not evidence.free_paths and found.remainder is None
+        return "adequate" if nothing_acts else "unexplained"
     if not any(observed):
         return "unexplained"
     holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)

@@ -17,8 +17,13 @@ from compensator.display import Table, Words, warnings_of, with_std
 from compensator.model.simulation import SCORE_HEAD, Scores
 
 _VERDICTS = {
-    "adequate": "The model is adequate: the residual is within the noise and the model's own error.",
-    "explained": "The missing effects were found; what remains is within the noise and the model's own error.",
+    "adequate": (
+        "The model is adequate: with its zero and initial state fitted, the residual is within the noise and the "
+        "model's own error."
+    ),
+    "explained": (
+        "The missing effects were found; what the fit to all data leaves is within the noise and the model's own error."
+    ),
     "partly_explained": "Some of the missing effects were found; part of the residual remains unexplained.",
     "unexplained": "The model lacks an effect that no channel shows.",
 }
@@ -45,6 +50,8 @@ _DOES_NOT_HOLD = (
 )
 #: The same of few values, which do not decide what is deployed.
 _NOT_FORETOLD = "The model lacks an effect; the best explanation found does not predict held-out values."
+#: The verdict if nothing was named and the channels show some of what acts.
+_WITHOUT_A_NAME = "The model lacks an effect that has no name here; the logged channels show some of it."
 #: The verdict if the effects found explain clearly less than the channels can, whatever a remainder corrects.
 _FALLS_SHORT = "Some of the missing effects were found; the channels show more than these explain."
 
@@ -151,6 +158,8 @@ def verdict(found: Mapping[str, Any]) -> str:
         words = _NOT_FORETOLD
     elif found["verdict"] == "explained" and falls_short(found):
         words = _FALLS_SHORT
+    elif _without_a_name(found):
+        words = _WITHOUT_A_NAME
     before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
     share = f" {sentence}" if (sentence := explained(found)) else ""
     with_remainder = f", {after:.2f} with the remainder" if found.get("remainder") else ""
@@ -161,6 +170,12 @@ def verdict(found: Mapping[str, Any]) -> str:
         f"{words} {_names(found['effects'])}. On held-out data the residual was {before:.2f} µm rms without and is "
         f"{named_rms(found):.2f} µm rms with them{with_remainder} (sensor noise {noise:.2f}).{share}"
     )
+
+
+def _without_a_name(found: Mapping[str, Any]) -> bool:
+    """Whether something acts that the channels show and that has no name."""
+    shown = bool(found.get("remainder")) or falls_short(found)
+    return found["verdict"] == "unexplained" and not found["effects"] and shown and not _cannot_show(found)
 
 
 def _cannot_show(found: Mapping[str, Any]) -> bool:
