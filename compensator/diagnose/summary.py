@@ -67,6 +67,7 @@ _UNITS = {
     "s": "s",
     "degc": "°C",
     "rpm": "(1/min)",
+    "lpm": "(l/min)",
     "pct": "%",
     "bar": "bar",
 }
@@ -300,7 +301,16 @@ def in_words(key: str) -> str:
     --------
     >>> in_words("half_width_um"), in_words("gain_um_per_rpm2"), in_words("um_per_h"), in_words("change_per_100")
     ('half width, µm', 'gain, µm/(1/min)²', 'rate, µm/h', 'change per 100')
+    >>> in_words("gain_1_um_per_unit"), in_words("gain_um_per_rpm_5_3")
+    ('gain 1, µm per unit', 'gain, µm/(1/min)^(5/3)')
     """
+    name, um, channel = key.partition("_um_per_")
+    if um:
+        base, five_thirds, _ = channel.partition("_5_3")
+        power = "^(5/3)" if five_thirds else "²" if base.endswith("2") else ""
+        unit = base.removesuffix("2")
+        per = f"/{_UNITS[unit]}" if unit in _UNITS else f" per {unit}"
+        return f"{name.replace('_', ' ')}, µm{per}{power}"
     words = key.split("_")
     at = len(words)
     while at and (words[at - 1].rstrip("2") in _UNITS or words[at - 1] == "per"):
