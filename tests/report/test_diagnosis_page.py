@@ -280,6 +280,8 @@ def test_the_remainder_is_named_as_what_it_is(found: Diagnosis) -> None:
         "best linear use of all channels",
         "sensor noise alone",
     ]
+    worse = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, rms_after_um=1.5))
+    assert "corrects some of the rest" not in text(worse) and "does not lower the error" in text(worse)
     idle = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, deployed=False))
     assert "Not deployed in the extended model." in text(idle)
 
