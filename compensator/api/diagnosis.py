@@ -20,7 +20,7 @@ from compensator.atomic_write import require_folder
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import Remark
 from compensator.data.measurement import DataLike, Measurement, measurements, runs_in
-from compensator.data.screening import require_y_noise, screen_temperatures
+from compensator.data.screening import check_deformation_scale, require_y_noise, screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.outcome import Diagnosis
@@ -164,6 +164,7 @@ def diagnose(
     name = ", ".join(dict.fromkeys(run.name for run in runs))
     screen_temperatures(name, runs, quiet_air=True)
     require_y_noise(name, runs)
+    check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))
 
     def executor_map(function: Callable[..., Any], *values: Iterable[Any]) -> Iterable[Any]:
         return executor.map(partial(in_one_thread, function), *values) if executor else map(function, *values)

@@ -267,6 +267,33 @@ def _check_deformation(name: str, runs: Sequence[Run]) -> None:
         raise DataError(f"{name}: y_um has {known.size} values, expected at least {LEAST_VALUES} for a model")
     if not sparse and known.size < (1.0 - MISSING_SHARE) * y.size:
         raise DataError(f"{name}: y_um is missing in {y.size - known.size} of {y.size} samples, expected at least half")
+    check_deformation_scale(name, known)
+    stated = runs[0].y_std_um
+    if is_noise(known, stated):
+        raise DataError(
+            f"{name}: y_um moves by {np.ptp(known):.3g} µm and its noise alone is "
+            f"{noise_std(known) if stated is None else stated:.2g} µm: no deformation in it to make a model from"
+        )
+
+
+def check_deformation_scale(name: str, values: Vector) -> None:
+    """Refuse a deformation that never moves, and one in another unit.
+
+    Parameters
+    ----------
+    name : str
+        File or files, for the message.
+    values : numpy.ndarray
+        µm; NaN where missing.
+
+    Raises
+    ------
+    DataError
+        If all values are the same, or move by so little or so much that they are no µm.
+    """
+    known = values[~np.isnan(values)]
+    if known.size == 0:
+        return
     spread = float(np.ptp(known))
     if spread == 0.0:
         raise DataError(f"{name}: y_um = {known[0]:g} in every row: a dead probe, or a column of another meaning")
@@ -277,12 +304,6 @@ def _check_deformation(name: str, runs: Sequence[Run]) -> None:
         )
     if spread > high:
         raise DataError(f"{name}: y_um moves by {spread:.4g} in all: nanometres? expected µm, at most {high:g} of them")
-    stated = runs[0].y_std_um
-    if is_noise(known, stated):
-        raise DataError(
-            f"{name}: y_um moves by {spread:.3g} µm and its noise alone is "
-            f"{noise_std(known) if stated is None else stated:.2g} µm: no deformation in it to make a model from"
-        )
 
 
 def _check_heat(name: str, runs: Sequence[Run]) -> None:

@@ -19,7 +19,7 @@ from compensator.diagnose.deciding import DECIDES, Deciding, PlannedTest
 from compensator.diagnose.events import DAY, GoesWith, Time, follows_day, goes_with, steepest
 from compensator.diagnose.findings import Findings
 from compensator.diagnose.fit import Fit, Term, fit_terms, response
-from compensator.diagnose.nearest import AT, Near, acts_by_temperature, course_evidence, nearest
+from compensator.diagnose.nearest import AT, TEMPERATURE, Near, acts_by_temperature, course_evidence, nearest
 from compensator.diagnose.trials import Trials
 from compensator.model.effects.seen import digits
 from compensator.model.effects.unobserved import Unobserved
@@ -222,6 +222,9 @@ def _sensor(unexplained: Unexplained, near: Sequence[Near]) -> str:
     if not alike:
         return f"Place the next sensor {where}; no logged channel resembles it."
     first = alike[0]
+    if first.lag_min < 0.0 and not first.channel.endswith(TEMPERATURE):
+        # A speed or a switch follows nothing: it is commanded.
+        return f"Place the next sensor {where}; it acts before {first.channel} changes."
     if first.lag_min < 0.0:
         return (
             f"Place the next sensor {where}; {first.channel} follows it, so closer to the cause than {first.channel}."

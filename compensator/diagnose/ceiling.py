@@ -72,7 +72,12 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     if found["effects"] and (named := named_rms(found)) < _LESS * best["rms_um"]:
         lines.append(f"They leave less, {named:.2f} µm rms: not every effect is a linear use of the channels.")
     if falls_short(found):
-        rest = "the remainder corrects some of the rest" if found.get("remainder") else "no remainder was added"
+        rest = "no remainder was added"
+        if beside := found.get("remainder"):
+            lowers = beside["rms_after_um"] < beside["rms_before_um"]
+            rest = (
+                "the remainder corrects some of the rest" if lowers else "the remainder does not lower the error there"
+            )
         lines.append(
             "They fall clearly short: the channels show more than the effects that have a name, and " + rest + "."
             if found["effects"]

@@ -177,7 +177,7 @@ class Deciding:
         enough = np.flatnonzero(change >= DECIDES)
         at = int(enough[0]) if enough.size else int(np.argmax(change))
         return PlannedTest(
-            words=trial.words,
+            words=trial.words_of(HOURS[at]),
             driver=trial.driver,
             hours=HOURS[at],
             expected_evidence=float(change[at]),

@@ -78,8 +78,9 @@ def diagnose(
     few = evidence.is_sparse
     # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
     contradicted = not (few or evidence.free_paths) and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
-    extended, remarks = (model, ()) if contradicted else _extended(model, found, effects, held_out)
+    extended, remarks = (model, ()) if contradicted else _extended(model, found, effects)
     deployed = extended is not model
+    extended = _with_deviation(extended, model, found, effects, held_out)
     verdict, ceiling = _verdict(found, held_out, extended), _ceiling(held_out)
     could_hide = detection_limits(found.selection, found.search.criterion.price) if few else None
     # Without an effect the verdict says of few values whether they are noise; that something could hide comes on top.
@@ -121,17 +122,24 @@ def _worth_deploying(
     found: Findings, effects: tuple[FoundEffect, ...], held_out: HeldOut
 ) -> tuple[Findings, tuple[FoundEffect, ...], HeldOut]:
     """Leave out a remainder that held-out data do not confirm: what explains nothing has to show that it helps."""
+    evidence = found.search.evidence
+    if not effects and not evidence.free_paths:
+        # Nothing has a name: what the searches for the blocks named is not deployed and credits nothing.
+        whole = held_out.whole if found.remainder is not None else held_out.nothing
+        held_out = dataclasses.replace(held_out, named=held_out.nothing, whole=whole)
     if found.remainder is None:
         return found, effects, held_out
-    evidence, without = found.search.evidence, dataclasses.replace(held_out, whole=held_out.named)
-    beside = found.explains and not evidence.free_paths
-    if beside and rms_of(held_out.whole) > rms_of(held_out.named):
-        return dataclasses.replace(found, remainder=None), effects, without
-    if evidence.is_sparse and not _lowers(held_out):
+    whole_um, named_um, nothing_um = (rms_of(each) for each in (held_out.whole, held_out.named, held_out.nothing))
+    if evidence.is_sparse:
         # Few values: chance lowers the error of no remainder by much.
-        named = tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
-        return dataclasses.replace(found, remainder=None, explains=True), named, without
-    return found, effects, held_out
+        helps = whole_um < LOWERS * min(named_um, nothing_um)
+    else:
+        helps = evidence.free_paths or whole_um <= (named_um if found.explains else min(named_um, nothing_um))
+    if helps:
+        return found, effects, held_out
+    named = tuple(dataclasses.replace(effect, replaced=False) for effect in effects)
+    without = dataclasses.replace(held_out, whole=held_out.named)
+    return dataclasses.replace(found, remainder=None, explains=True), named, without
 
 
 def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remainder | None:
@@ -148,9 +156,9 @@ def _remainder(found: Findings, held_out: HeldOut, *, deployed: bool) -> Remaind
 def _evidence(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     """Return the evidence of runs, with free paths where the model is far off."""
     evidence = evidence_of(model, runs)
-    if model.held_out_rms_um is not None and model.held_out_rms_um > FAR_OFF * evidence.spread_um:
-        return evidence.with_free_paths()
-    return evidence
+    # The noise of a calibration says nothing about its paths.
+    own_um2 = (model.held_out_rms_um or 0.0) ** 2 - evidence.noise.noise_um**2
+    return evidence.with_free_paths() if own_um2 > (FAR_OFF * evidence.spread_um) ** 2 else evidence
 
 
 def _between_undecided(found: Findings, deciding: Deciding) -> list[PlannedTest]:
@@ -206,9 +214,9 @@ def _effects(found: Findings, deciding: Deciding) -> tuple[FoundEffect, ...]:
 
 
 def _extended(
-    model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
+    model: ThermalModel, found: Findings, effects: Sequence[FoundEffect]
 ) -> tuple[ThermalModel, tuple[Remark, ...]]:
-    """Return the model with every effect that can be deployed, the remainder, and the error that is left."""
+    """Return the model with every effect that can be deployed and the remainder; the model itself without any."""
     evidence = found.search.evidence
     deployed: list[Effect] = [effect.effect for effect in effects if effect.deployable]
     remarks: tuple[Remark, ...] = ()
@@ -222,16 +230,30 @@ def _extended(
         deployed.append(dataclasses.replace(remainder, explanation=remainder.explain(seen)))
     if not deployed and base is model:
         return model, ()
-    kept_out = [effect.signal[evidence.used] for effect in effects if not effect.effect.deployable]
-    left = found.rest_um**2 + (float(np.var(np.sum(kept_out, axis=0))) if kept_out else 0.0)
-    extended = dataclasses.replace(base, effects=(*model.effects, *deployed), sha256="")
-    if not kept_out and not evidence.is_sparse:
+    return dataclasses.replace(base, effects=(*model.effects, *deployed), sha256=""), remarks
+
+
+def _with_deviation(
+    extended: ThermalModel, model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
+) -> ThermalModel:
+    """Return a model with the standard deviation of its own error that the data show.
+
+    Where nothing is deployed, what the model stated is replaced only if the data contradict it.
+    """
+    evidence, deploys = found.search.evidence, extended is not model
+    # What depends on time alone is an error of the measurement: it is not in the machine that the model runs on.
+    of_machine = [effect for effect in effects if effect.effect.deployable or not effect.effect.observed]
+    kept_out = [effect.signal[evidence.used] for effect in of_machine if not (deploys and effect.effect.deployable)]
+    left = found.rest_um**2 + (rms_of(np.sum(kept_out, axis=0)) ** 2 if kept_out else 0.0)
+    if deploys and not kept_out and len(of_machine) == len(effects) and not evidence.is_sparse:
         # Half what the fit expects, half what held-out blocks show: the one is too small, the other has few blocks.
         shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
         left = 0.5 * (left + shown)
     # The engine states by itself what it cannot know of a late T_Q.
     left = max(left - (late_variance_um2(extended) - late_variance_um2(model)), 0.0)
-    return dataclasses.replace(extended, y_std_um=float(np.sqrt(left))), remarks
+    if not deploys and left <= VERDICT_TIMES**2 * model.y_std_um**2 and model.y_std_um**2 <= VERDICT_TIMES**2 * left:
+        return model
+    return dataclasses.replace(extended, y_std_um=float(np.sqrt(left)), sha256="")
 
 
 def _refitted(old: ThermalModel, new: ThermalModel) -> str:
@@ -256,11 +278,6 @@ def _ceiling(held_out: HeldOut) -> Ceiling | None:
     )
 
 
-def _lowers(held_out: HeldOut) -> bool:
-    """Whether the remainder lowers the error on held-out data enough to deploy it from few values."""
-    return rms_of(held_out.whole) < LOWERS * min(rms_of(held_out.named), rms_of(held_out.nothing))
-
-
 def _ranked(found: Findings) -> tuple[tuple[str, float], ...]:
     best: dict[str, float] = {}
     for candidate in found.selection.rivals[0] if found.selection.rivals else ():
@@ -278,7 +295,8 @@ def _verdict(found: Findings, held_out: HeldOut, extended: ThermalModel) -> Verd
     noise = dataclasses.replace(evidence.noise, noise_um=float(np.hypot(evidence.noise.noise_um, unknown_um2**0.5)))
     is_noise = noise.is_explained(float(left @ left))
     if not observed:
-        return "adequate" if is_noise and not evidence.free_paths else "unexplained"
+        nothing_acts = is_noise and not evidence.free_paths and found.remainder is None
+        return "adequate" if nothing_acts else "unexplained"
     if not any(observed):
         return "unexplained"
     holds = rms_of(held_out.whole) <= rms_of(held_out.nothing)

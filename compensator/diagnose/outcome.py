@@ -180,10 +180,7 @@ def warnings_of(
     if effects and rms_after > rms_before:
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
         if deployed or few:
-            text = (
-                f"The effects are clear in the data as a whole, but do not predict held-out blocks better {numbers}: "
-                "something happened only once. Check the extended model on another day."
-            )
+            text = f"The effects are clear in the data as a whole, but do not predict held-out blocks better {numbers}."
             warnings.append(Remark(ModelWarning.NOT_CONFIRMED, text))
         else:
             text = f"On held-out blocks the effects make it worse {numbers}, so the model was left as it is."

@@ -18,8 +18,13 @@ from compensator.display import Table, Words, warnings_of, with_std
 from compensator.model.simulation import SCORE_HEAD, Scores
 
 _VERDICTS = {
-    "adequate": "The model is adequate: the residual is within the noise and the model's own error.",
-    "explained": "The missing effects were found; what remains is within the noise and the model's own error.",
+    "adequate": (
+        "The model is adequate: with its zero and initial state fitted, the residual is within the noise and the "
+        "model's own error."
+    ),
+    "explained": (
+        "The missing effects were found; what the fit to all data leaves is within the noise and the model's own error."
+    ),
     "partly_explained": "Some of the missing effects were found; part of the residual remains unexplained.",
     "unexplained": "The model lacks an effect that no channel shows.",
 }
@@ -46,6 +51,8 @@ _DOES_NOT_HOLD = (
 )
 #: The same of few values, which do not decide what is deployed.
 _NOT_FORETOLD = "The model lacks an effect; the best explanation found does not predict held-out values."
+#: The verdict if nothing was named and the channels show some of what acts.
+_WITHOUT_A_NAME = "The model lacks an effect that has no name here; the logged channels show some of it."
 #: The verdict if the effects found explain clearly less than the channels can, whatever a remainder corrects.
 _FALLS_SHORT = "Some of the missing effects were found; the channels show more than these explain."
 
@@ -61,6 +68,7 @@ _UNITS = {
     "s": "s",
     "degc": "°C",
     "rpm": "(1/min)",
+    "lpm": "(l/min)",
     "pct": "%",
     "bar": "bar",
 }
@@ -152,6 +160,8 @@ def verdict(found: Mapping[str, Any]) -> str:
         words = _NOT_FORETOLD
     elif found["verdict"] == "explained" and falls_short(found):
         words = _FALLS_SHORT
+    elif _without_a_name(found):
+        words = _WITHOUT_A_NAME
     before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
     share = f" {sentence}" if (sentence := explained(found)) else ""
     with_remainder = f", {after:.2f} with the remainder" if found.get("remainder") else ""
@@ -162,6 +172,12 @@ def verdict(found: Mapping[str, Any]) -> str:
         f"{words} {_names(found['effects'])}. On held-out data the residual was {before:.2f} µm rms without and is "
         f"{named_rms(found):.2f} µm rms with them{with_remainder} (sensor noise {noise:.2f}).{share}"
     )
+
+
+def _without_a_name(found: Mapping[str, Any]) -> bool:
+    """Whether something acts that the channels show and that has no name."""
+    shown = bool(found.get("remainder")) or falls_short(found)
+    return found["verdict"] == "unexplained" and not found["effects"] and shown and not _cannot_show(found)
 
 
 def _cannot_show(found: Mapping[str, Any]) -> bool:
@@ -286,7 +302,16 @@ def in_words(key: str) -> str:
     --------
     >>> in_words("half_width_um"), in_words("gain_um_per_rpm2"), in_words("um_per_h"), in_words("change_per_100")
     ('half width, µm', 'gain, µm/(1/min)²', 'rate, µm/h', 'change per 100')
+    >>> in_words("gain_1_um_per_unit"), in_words("gain_um_per_rpm_5_3")
+    ('gain 1, µm per unit', 'gain, µm/(1/min)^(5/3)')
     """
+    name, um, channel = key.partition("_um_per_")
+    if um:
+        base, five_thirds, _ = channel.partition("_5_3")
+        power = "^(5/3)" if five_thirds else "²" if base.endswith("2") else ""
+        unit = base.removesuffix("2")
+        per = f"/{_UNITS[unit]}" if unit in _UNITS else f" per {unit}"
+        return f"{name.replace('_', ' ')}, µm{per}{power}"
     words = key.split("_")
     at = len(words)
     while at and (words[at - 1].rstrip("2") in _UNITS or words[at - 1] == "per"):

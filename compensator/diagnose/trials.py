@@ -22,7 +22,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.nearest import AT, TEMPERATURE
 from compensator.model.effects.blocks import FilterBank, Lag
 from compensator.model.effects.input import unit_of
-from compensator.model.effects.seen import digits
+from compensator.model.effects.seen import digits, unit_of_channel
 from compensator.model.effects.signals import RecordSignals
 
 #: Longest test, the rest that it begins with and that shows its zero and initial state, and how long each level of one
@@ -53,12 +53,19 @@ class Trial:
         What it would give.
     by_itself : bool
         Whether it changes by itself what only followed other things in the record, which takes a heater or a cooler.
+    first_level : str
+        The same instruction for a test that ends within the first of several levels; empty where there is one.
     """
 
     words: str
     driver: str
     signals: RecordSignals
     by_itself: bool = False
+    first_level: str = ""
+
+    def words_of(self, hours: float) -> str:
+        """Return the instruction for a test of this length, h: none of a level that it does not reach."""
+        return self.first_level if self.first_level and hours <= REST_H + LEVEL_H else self.words
 
 
 class Trials:
@@ -142,26 +149,29 @@ class Trials:
             yield dataclasses.replace(self._trial(words, name, {name: hold}), by_itself=True)
             return
         label = "the heat" if name == HEAT else name
-        yield self._trial(f"Step {label} by {by} and hold it, all else steady", name, {name: hold})
-        yield self._trial(
-            f"Switch {label} by {by} on and off every {LEVEL_H:g} h, all else steady", name, {name: cycle}
-        )
+        step = f"Step {label} by {by} and hold it, all else steady"
+        yield self._trial(step, name, {name: hold})
+        words = f"Switch {label} by {by} on and off every {LEVEL_H:g} h, all else steady"
+        yield self._trial(words, name, {name: cycle}, first_level=step)
         if name == self.heating or name not in self._temperatures:
             words = f"Step {label} by half of {by}, all of it, half and none, {LEVEL_H:g} h each"
-            yield self._trial(words, name, {name: sizes})
+            half = f"Step {label} by half of {by} and hold it, all else steady"
+            yield self._trial(words, name, {name: sizes}, first_level=half)
         if name != self.heating and size:
-            heated = f"while {'the heat' if self.heating == HEAT else self.heating} stays "
-            heated += f"{self._in_words(self.heating)} above its start"
-            words = f"Switch {name} by {by} on and off every {LEVEL_H:g} h {heated}"
-            yield self._trial(words, name, {name: 1.0 - cycle, self.heating: hold})
+            heating, above = "the heat" if self.heating == HEAT else self.heating, self._in_words(self.heating)
+            words = (
+                f"Switch {name} by {by} on and off every {LEVEL_H:g} h while {heating} stays {above} above its start"
+            )
+            step = f"Step {heating} by {above} and hold it, all else steady"
+            yield self._trial(words, name, {name: 1.0 - cycle, self.heating: hold}, first_level=step)
 
-    def _trial(self, words: str, driver: str, courses: Mapping[str, Vector]) -> Trial:
+    def _trial(self, words: str, driver: str, courses: Mapping[str, Vector], *, first_level: str = "") -> Trial:
         begun = self._t_h >= 0.0
         changes = {name: self.size(name) * course * begun for name, course in courses.items()}
         for name, course in changes.items():
             if name in self._temperatures:
                 changes[name] = Lag(SET_MIN, self.period_min).filter(course)
-        return Trial(words=words, driver=driver, signals=self._signals(changes))
+        return Trial(words=words, driver=driver, signals=self._signals(changes), first_level=first_level)
 
     def _signals(self, changes: Mapping[str, Vector]) -> RecordSignals:
         """Return the signals of a test in which some things change and all else follows or stays."""
@@ -215,9 +225,11 @@ class Trials:
         unit = unit_of(name)
         if name == HEAT:
             unit = "w" if self.evidence.context.has_ttf else "k"
+        elif not unit_of_channel(name):
+            unit = ""
         size = self.size(name)
         what = " of T_Q − AT" if name == HEAT and unit == "k" else ""
-        return f"{digits(size)} {_UNITS.get(unit, unit)}{what}"
+        return f"{digits(size)} {_UNITS.get(unit, unit)}{what}".strip()
 
     def _filtered(self, values: Vector) -> Matrix:
         return FilterBank(LAGS_MIN, [(1.0,) * len(LAGS_MIN)], self.period_min).columns(values)

@@ -161,7 +161,7 @@ def _ranking(diagnosis: Diagnosis) -> Details:
 
 
 def _details(time: TimeAxis, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Details:
-    rows = [["extended model, SHA-256", model.sha256]]
+    rows = [["extended model, SHA-256", model.sha256], ["its own error as it states it, µm", f"{model.y_std_um:.2f}"]]
     rows += [
         [f"data: {d.get('file') or d['table']}", d["sha256"]]
         for d in model.provenance.get("diagnosis", {}).get("data", [])

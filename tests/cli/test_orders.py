@@ -37,12 +37,12 @@ def test_a_wrong_prefix_is_told_from_a_service_that_is_away(tmp_path: Path, caps
     with Publisher(settings, lambda *_: {"ok": True, "text": "held"}):
         assert main(["hold", "--prefix", "shop/vmc-70", "--zenoh", operator(tmp_path, port), "--timeout", "2"]) == 1
         error = capsys.readouterr().err
-        assert "no service with that prefix" in error and error.endswith("services there: shop/vmc-07\n")
+        assert "no service with that prefix" in error and "services there: shop/vmc-07\n" in error
         assert main(["hold", "--prefix", "shop/vmc-07", "--zenoh", operator(tmp_path, port)]) == 0
         capsys.readouterr()
         assert main(["watch", "--connect", f"tcp/127.0.0.1:{port}", "--prefix", "shop/vmc-70", "--once"]) == 1
         error = capsys.readouterr().err
-        assert "no messages below shop/vmc-70" in error and error.endswith("services there: shop/vmc-07\n")
+        assert "no messages below shop/vmc-70" in error and "services there: shop/vmc-07\n" in error
 
 
 def test_a_folder_that_a_service_holds_is_known_to_be_held(tmp_path: Path) -> None:

@@ -131,6 +131,21 @@ def test_a_dead_sensor_makes_no_finding_and_judges_no_model(
     refused(capsys, words[command], "dead.csv: t_q_degc = 20 in every row: a dead sensor")
 
 
+@pytest.mark.parametrize(
+    ("factor", "words"), [("0.0", "y_um = 0 in every row: a dead probe"), ("0.001", "millimetres?")]
+)
+def test_a_deformation_that_is_none_makes_no_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], factor: str, words: str
+) -> None:
+    rows = [row.split(",") for row in table(tmp_path / "run.csv").read_text().splitlines()]
+    at = rows[0].index("y_um")
+    for row in rows[1:]:
+        row[at] = str(float(row[at]) * float(factor))
+    spoilt = tmp_path / "spoilt.csv"
+    spoilt.write_text("\n".join(map(",".join, rows)))
+    refused(capsys, ["diagnose", str(spoilt), "--model", "quill", "--out", str(tmp_path / "d")], words)
+
+
 def test_an_error_of_the_system_is_told_without_its_number(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from compensator.diagnose.advice import advice_of
+from compensator.diagnose.advice import Unexplained, _sensor, advice_of
 from compensator.diagnose.deciding import DECIDES, Deciding
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.events import follows_day, goes_with, swings, switched
@@ -13,11 +13,11 @@ from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.fit import fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood
-from compensator.diagnose.nearest import nearest
+from compensator.diagnose.nearest import Near, nearest
 from compensator.diagnose.points import Points
 from compensator.diagnose.record_with_test import expected_change
 from compensator.diagnose.summary import contents, figures
-from compensator.diagnose.trials import Trials
+from compensator.diagnose.trials import LEVEL_H, REST_H, Trials
 from compensator.display import Words
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import page_of
@@ -223,6 +223,39 @@ def as_measured(planned, columns, count):
     table = {"t_q_degc": at + difference, "at_degc": at}
     table = {name: values + rng.normal(0.0, 0.02, values.size) for name, values in table.items()}
     return {name: values[:count] for name, values in (table | {"y_um": y} | dict(planned.channels)).items()}
+
+
+def test_a_test_names_no_level_that_it_does_not_reach():
+    trials = Trials(evidence_of(QUILL, runs_from(machine(lambda s: np.zeros(s[0]), 31))))
+    several = [trial for trial in trials.of(["coolant_flow_lpm"]) if trial.first_level]
+    assert len(several) >= 4
+    for trial in several:
+        first, later = trial.words_of(REST_H + LEVEL_H), trial.words_of(REST_H + LEVEL_H + 1.0)
+        assert "hold it" in first and "every" not in first and "each" not in first
+        assert later == trial.words and ("every 2 h" in later or "2 h each" in later)
+
+
+def test_a_switch_without_a_unit_is_stepped_without_one():
+    flow = signals(31, HOURS)[1]["coolant_flow_lpm"]
+    columns = machine(lambda s: np.zeros(s[0]), 31, fan_on=(flow > 1.0) * 1.0)
+    trials = Trials(evidence_of(QUILL, runs_from(columns)))
+    [step] = [
+        trial for trial in trials.of(["fan_on"]) if trial.words.startswith("Step fan_on") and "half" not in trial.words
+    ]
+    assert step.words in (
+        "Step fan_on by 1 and hold it, all else steady",
+        "Step fan_on by −1 and hold it, all else steady",
+    )
+
+
+@pytest.mark.parametrize(
+    ("channel", "words"), [("fan_rpm", "before fan_rpm changes"), ("oil_degc", "oil_degc follows")]
+)
+def test_what_is_commanded_follows_no_source(channel, words):
+    hidden = Unexplained(
+        kind="residual", rms_um=1.0, peak_to_peak_um=3.0, tau_min=40.0, times=(), goes_with=None, sensor_evidence=20.0
+    )
+    assert words in _sensor(hidden, [Near(channel=channel, evidence=2.0 * DECIDES, lag_min=-12.0)])
 
 
 # ---------------------------------------------------------------------- seen once

@@ -54,11 +54,10 @@ def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, capsys):
     write_model(base, dataclasses.replace(load_model("quill"), y_std_um=0.05))
     assert main(["diagnose", str(table), "--model", str(base), "--out", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["effects"][1]["kind"] == "drift"
-    # The drift is not deployed and goes on acting: the standard deviation that a service publishes has to say so.
+    # The drift is of the measurement: what the service states is the error on the machine.
     _, drifted, _ = record([draw("scheduled", 3), draw("drift", 3)], 77)
     _, scheduled, _ = record([draw("scheduled", 3)], 77)
-    share = np.std(drifted - scheduled)
-    assert 0.8 * share < load_model(out / "model.toml").y_std_um < 1.25 * share
+    assert load_model(out / "model.toml").y_std_um < 0.1 * np.std(drifted - scheduled)
     again = tmp_path / "second"
     assert main(["diagnose", str(table), "--model", str(out / "model.toml"), "--out", str(again), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -66,7 +65,7 @@ def test_the_extended_model_is_a_base_like_any_other(tmp_path, table, capsys):
     assert main(["simulate", str(table), "--model", str(out / "model.toml"), "--out", str(tmp_path / "s.csv")]) == 0
 
 
-def test_an_adequate_model_is_written_as_it_was(tmp_path, capsys):
+def test_an_adequate_model_is_written_with_the_deviation_that_the_data_show(tmp_path, capsys):
     columns, _, _ = record([], 78, 24.0)
     path = tmp_path / "run.csv"
     write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
@@ -74,7 +73,13 @@ def test_an_adequate_model_is_written_as_it_was(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["verdict"] == "adequate"
     model = load_model(tmp_path / "d" / "model.toml")
     assert (model.dtf, model.effects) == (load_model("quill").dtf, ())
-    assert model.y_std_um == load_model("quill").y_std_um
+    # The published model states 2.3 µm; on a machine that it describes exactly nothing of that is left.
+    assert load_model("quill").y_std_um > 2.0
+    assert model.y_std_um < 0.3
+    # What the data do not contradict stays: the same model again.
+    again = tmp_path / "again"
+    assert main(["diagnose", str(path), "--model", str(tmp_path / "d" / "model.toml"), "--out", str(again)]) == 0
+    assert load_model(again / "model.toml").y_std_um == model.y_std_um
 
 
 def test_data_without_y_is_refused(tmp_path, capsys):

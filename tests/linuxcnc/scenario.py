@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import re
 import signal
@@ -348,6 +349,19 @@ def service(folder: Path) -> None:
                 lambda: f"{nominal_um} + {witness.wanted_um()} µm: joint at {control.um()}",
             )
 
+        def holds() -> float:
+            """Wait until it holds and the axis stands: a last change may still be on its way to the control."""
+            until(lambda: not bench.pin("alive") and bench.pin("state") == 2, "it holds")
+            seen = [math.nan]
+
+            def stands() -> bool:
+                seen.append(control.um())
+                time.sleep(0.2)
+                return seen[-1] == seen[-2]
+
+            until(stands, "the axis stands")
+            return seen[-1]
+
         until(lambda: witness.messages and abs(witness.messages[-1][1]["y_offset_um"] or 0.0) > 0.3, "an offset", 90.0)
         control.do("mdi", "G0 Y0")
         follows()
@@ -356,8 +370,7 @@ def service(folder: Path) -> None:
         control.do("mdi", "G0 Y0")
         with control.watched() as periods:  # the router goes
             shop.close()
-            until(lambda: not bench.pin("alive") and bench.pin("state") == 2, "it holds")
-            at_um = control.um()
+            at_um = holds()
             heard = witness.heard()
             time.sleep(1.0)
             assert control.um() == at_um and witness.heard() == heard
@@ -366,8 +379,7 @@ def service(folder: Path) -> None:
             follows()
             process.kill()  # the service is killed
             process.wait()
-            until(lambda: not bench.pin("alive") and bench.pin("state") == 2, "it holds")
-            at_um, seq = control.um(), witness.messages[-1][1]["seq"]
+            at_um, seq = holds(), witness.messages[-1][1]["seq"]
             time.sleep(1.0)
             assert control.um() == at_um
             daemon.enter_context(running(config))

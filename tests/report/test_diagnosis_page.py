@@ -280,8 +280,20 @@ def test_the_remainder_is_named_as_what_it_is(found: Diagnosis) -> None:
         "best linear use of all channels",
         "sensor noise alone",
     ]
+    worse = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, rms_after_um=1.5))
+    assert "corrects some of the rest" not in text(worse) and "does not lower the error" in text(worse)
     idle = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, deployed=False))
     assert "Not deployed in the extended model." in text(idle)
+
+
+def test_what_only_the_remainder_corrects_is_not_called_unseen(found: Diagnosis) -> None:
+    nameless = {"effects": (), "steps": (), "tried": ()}
+    alone = dataclasses.replace(with_ceiling(found, 0.0, remainder=REMAINDER, **nameless), verdict="unexplained")
+    assert "has no name here" in page(alone).verdict and "no channel shows" not in page(alone).verdict
+    assert page(alone).tone == "warn"
+    # Where the channels show nothing of it, that is said.
+    unseen = dataclasses.replace(alone, remainder=None, ceiling=None)
+    assert "no channel shows" in page(unseen).verdict and "has no name here" not in page(unseen).verdict
 
 
 def test_without_effect_ceiling_and_remainder_the_page_says_so_and_claims_nothing(found: Diagnosis) -> None:

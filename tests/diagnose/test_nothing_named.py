@@ -1,0 +1,70 @@
+"""Nothing has a name: what the searches for the held-out blocks found credits nothing, and a remainder must help."""
+
+import dataclasses
+
+import numpy as np
+
+from compensator.diagnose import diagnosis
+from compensator.diagnose.background import Background
+from compensator.diagnose.diagnosis import diagnose
+from compensator.diagnose.findings import findings_of
+from compensator.diagnose.summary import figures, verdict
+from compensator.model.model_file import load_model
+from tests.diagnose.scenarios import record
+from tests.identify.quill_runs import runs_from
+
+QUILL = load_model("quill")
+
+
+def wave(size):
+    return np.sin(np.arange(size) / 40.0)
+
+
+def day():
+    """A day with a wave that is too small for a name."""
+    columns, _, _ = record([], 60, 24.0)
+    return runs_from(columns | {"y_um": columns["y_um"] + 0.1 * wave(columns["y_um"].size)})
+
+
+def diagnosed(monkeypatch, remainder_um):
+    """Diagnose that day with a remainder that is a wave of this size in every search."""
+
+    def found_in(evidence, **given):
+        found = findings_of(evidence, **given)
+        assert not found.terms
+        points = found.search.points
+        fitted = Background(evidence).fitted(points, np.zeros(points.used.size), found.selection.before.rest)
+        remainder = dataclasses.replace(fitted, added=remainder_um * wave(fitted.added.size))
+        return dataclasses.replace(found, remainder=remainder, explains=True)
+
+    monkeypatch.setattr(diagnosis, "findings_of", found_in)
+    return diagnose(QUILL, day())
+
+
+def test_a_remainder_that_held_out_blocks_contradict_is_not_deployed(monkeypatch):
+    found = diagnosed(monkeypatch, -0.1)
+    table = figures(found)
+    assert table["remainder"] is None and found.model is QUILL
+    assert table["verdict"] == "adequate" and table["after"] == table["before"]
+
+
+def test_a_model_that_gets_a_remainder_is_not_called_adequate(monkeypatch):
+    table = figures(diagnosed(monkeypatch, 0.1))
+    assert table["remainder"]["deployed"] and table["verdict"] == "unexplained"
+    assert table["remainder"]["rms_before_um"] == table["before"]["rms_um"] > table["after"]["rms_um"]
+    assert "has no name here" in verdict(table)
+    assert table["advice"]["unexplained"]["kind"] == "remainder"
+
+
+def test_what_only_the_blocks_named_is_no_error_after(monkeypatch):
+    whole = diagnosis.evidence_of(QUILL, day()).count
+
+    def found_in(evidence, **given):
+        found = findings_of(evidence, **given)
+        wrong = () if evidence.count == whole else (wave(found.ceiling.size),)
+        return dataclasses.replace(found, responses=(*found.responses, *wrong))
+
+    monkeypatch.setattr(diagnosis, "findings_of", found_in)
+    table = figures(diagnose(QUILL, day()))
+    assert table["effects"] == [] and table["remainder"] is None
+    assert table["after"] == table["before"]
