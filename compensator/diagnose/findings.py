@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import Mask, Vector
 from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
@@ -21,6 +23,8 @@ from compensator.model.transfer_function import SampledTransferFunction
 #: The remainder is worth deploying where it adds this much to the logarithm of the evidence, and this share of noise
 #: and own error.
 WORTH, LEAST = 2.0 * MARGIN, 0.5
+#: A fitted path has no more lags than this, and fewer where this share of its step response is all that it loses.
+PATH_LAGS, PATH_EXACT = 4, 0.003
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,18 +184,42 @@ def with_paths(model: ThermalModel, found: Regression) -> tuple[ThermalModel, Re
 
 
 def _function(found: Regression, channel: int, period_s: float) -> SampledTransferFunction:
-    """Return a channel's filter bank as one transfer function."""
-    lagged = [tau for tau in found.taus_min if tau > 0.0]
-    poles = np.array([Lag(tau, period_s / 60.0).pole for tau in lagged])
-    denominator = np.poly(poles)
-    numerator = np.zeros(poles.size + 1)
-    rest = iter(range(poles.size))
-    for tau, gain in zip(found.taus_min, found.gains[channel], strict=True):
-        if tau == 0.0:
+    """Return a channel's filter bank as one transfer function with as few of its lags as its step response needs.
+
+    With all of them poles lie so close that the observer's covariance has no valid digit.
+    """
+    poles = np.array([Lag(tau, period_s / 60.0).pole if tau > 0.0 else 0.0 for tau in found.taus_min])
+    is_lag = np.array(found.taus_min) > 0.0
+    count = np.arange(round(3.0 * max(found.taus_min) * 60.0 / period_s))[:, None]
+    steps = np.where(is_lag, 1.0 - poles**count * (1.0 + poles) / 2.0, 1.0)
+    wanted = steps @ np.array(found.gains[channel])
+    lagged, direct = np.flatnonzero(is_lag).tolist(), np.flatnonzero(~is_lag).tolist()
+    square, products = steps.T @ steps, steps.T @ wanted
+    kept: tuple[float, tuple[int, ...], Vector] = (np.inf, (), np.zeros(0))
+    for size in range(1, min(PATH_LAGS, len(lagged)) + 1):
+        for some in itertools.combinations(lagged, size):
+            which = (*direct, *some)
+            gains = np.linalg.solve(square[np.ix_(which, which)], products[list(which)])
+            left = float(np.linalg.norm(wanted - steps[:, which] @ gains))
+            kept = min(kept, (left, which, gains), key=lambda each: each[0])
+        if kept[0] <= PATH_EXACT * float(np.linalg.norm(wanted)):
+            break
+    return _summed(poles, is_lag, kept[1], kept[2], period_s)
+
+
+def _summed(
+    poles: Vector, is_lag: Mask, which: Sequence[int], gains: Vector, period_s: float
+) -> SampledTransferFunction:
+    """Return a sum of lags and a direct part as one transfer function."""
+    lags = [i for i in which if is_lag[i]]
+    denominator = np.poly(poles[lags])
+    numerator = np.zeros(len(lags) + 1)
+    for i, gain in zip(which, gains, strict=True):
+        if not is_lag[i]:
             numerator += gain * denominator
         else:
-            i = next(rest)
-            numerator += gain * (1.0 - poles[i]) / 2.0 * np.convolve([1.0, 1.0], np.poly(np.delete(poles, i)))
+            others = np.poly(poles[[other for other in lags if other != i]])
+            numerator += gain * (1.0 - poles[i]) / 2.0 * np.convolve([1.0, 1.0], others)
     return SampledTransferFunction(
         b=tuple(numerator.tolist()), a=tuple(np.asarray(denominator).tolist()), period_s=period_s
     )
