@@ -17,7 +17,7 @@ from compensator.data.measurement import DataLike, measurements
 from compensator.data.record import require
 from compensator.display import Table
 from compensator.errors import DataError, UsageError
-from compensator.model.simulation import SCORE_HEAD, Scores, scores, simulate
+from compensator.model.simulation import SCORE_HEAD, Scores, require_channels, scores, simulate
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -140,6 +140,8 @@ def compare(
     for one in measured:
         for record in one.at_period(periods.copy().pop()).records:
             require(one.name, record, ("t_q_degc", "at_degc", "y_um"))
+            for model in found.values():
+                require_channels(model, record, one.name)
             runs = {name: simulate(model, record, source=one.name) for name, model in found.items()}
             residuals = {name: run["residual_um"] for name, run in runs.items()}
             y = next(iter(runs.values()))["y_um"]

@@ -27,6 +27,7 @@ from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Table, Words
 from compensator.model.model_writer import write_model
+from compensator.model.simulation import require_channels
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
 
@@ -160,6 +161,9 @@ def diagnose(
     """
     base = model_of(model)
     measured = measurements(data, "data", columns, needed=True)
+    for one in measured:
+        for record in one.at_period(base.period_s).records:
+            require_channels(base, record, one.name)
     runs, remarks = runs_in(measured, base.period_s, y_std_um=y_std_um)
     name = ", ".join(dict.fromkeys(run.name for run in runs))
     screen_temperatures(name, runs, quiet_air=True)

@@ -20,7 +20,7 @@ from compensator.data.screening import DEAD_SAMPLES, check_scale, check_y_std, y
 from compensator.errors import UsageError
 from compensator.model.corrected_simulation import COLUMNS as CORRECTED_COLUMNS
 from compensator.model.corrected_simulation import CorrectedRun, compared, simulate_corrected
-from compensator.model.simulation import COLUMNS, Scores, scores
+from compensator.model.simulation import COLUMNS, Scores, require_channels, scores
 from compensator.model.simulation import simulate as run_free
 from compensator.model.thermal_model import ThermalModel
 
@@ -80,6 +80,7 @@ def simulate(
         remarks += gridded.remarks
         for record in gridded.records:
             require(one.name, record, ("t_q_degc", "at_degc"))
+            require_channels(what, record, one.name)
             remarks += doubts(one.name, what, record)
             if not correct:
                 parts.append(run_free(what, record, source=one.name))

@@ -45,7 +45,7 @@ class SampledData:
     remarks: tuple[Remark, ...]
 
 
-def require(name: str, record: SampledRecord, columns: Sequence[str]) -> None:
+def require(name: str, record: SampledRecord, columns: Sequence[str], *, why: str = "") -> None:
     """Refuse a record that lacks a column.
 
     Raises
@@ -56,5 +56,6 @@ def require(name: str, record: SampledRecord, columns: Sequence[str]) -> None:
     for column in columns:
         if column not in record.columns:
             raise DataError(
-                f"{name}: no column {column}; it has: {', '.join(record.columns)}. Name it with --column {column}=NAME"
+                f"{name}: no column {column}{why}; it has: {', '.join(record.columns)}. "
+                f"Name it with --column {column}=NAME"
             )

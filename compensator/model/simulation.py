@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import Vector
-from compensator.data.record import SampledRecord
+from compensator.data.record import SampledRecord, require
 from compensator.errors import DataError
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
@@ -40,6 +40,17 @@ class Scores:
     def cells(self) -> list[str]:
         """Return them as cells of a table below `SCORE_HEAD`."""
         return [f"{self.rms_um:.2f}", f"{self.peak_to_peak_um:.2f}", f"{self.fit_pct:.2f}"]
+
+
+def require_channels(model: ThermalModel, record: SampledRecord, name: str) -> None:
+    """Refuse a record without a channel that an effect of a model needs: without it the effect would stay at zero.
+
+    Raises
+    ------
+    DataError
+        Naming data, channel and model.
+    """
+    require(name, record, Engine(model).channels, why=f", which an effect of model {model.name} needs")
 
 
 def simulate(model: ThermalModel, record: SampledRecord, *, source: str = "") -> dict[str, Vector]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 import compensator as tc
 from compensator.codes import Remark, SampleQuality
+from compensator.model.effects.input import Input
 from tests.api.tables import frame, write_run
 from tests.identify.quill_runs import VALIDATION_W
 
@@ -46,6 +48,21 @@ def test_no_data_is_refused(nothing: object) -> None:
     for verb in (tc.identify, lambda data: tc.simulate("quill", data), lambda data: tc.diagnose("quill", data)):
         with pytest.raises(tc.CompensatorError, match="empty, expected a path"):
             verb(nothing)
+
+
+def test_data_without_a_channel_that_an_effect_needs_are_refused(table: pd.DataFrame) -> None:
+    """Without the channel the effect would stay at zero, with the same stated deviation: 11 µm wrong without a word."""
+    coolant = Input(channel="coolant_degc", curve="linear", tau_min=(30.0,), gain=(2.0,), delay_min=0.0)
+    model = dataclasses.replace(tc.load_model("quill"), effects=(coolant,), sha256="")
+    calls = (
+        lambda: tc.simulate(model, table),
+        lambda: tc.diagnose(model, table),
+        lambda: tc.compare({"extended": model}, table),
+    )
+    for call in calls:
+        with pytest.raises(tc.CompensatorError, match="no column coolant_degc, which an effect of model quill needs"):
+            call()
+    assert np.isfinite(tc.simulate(model, table.assign(coolant_degc=20.0))["y_pred_um"]).all()
 
 
 def test_what_is_no_model_is_refused(table: pd.DataFrame) -> None:
