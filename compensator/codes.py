@@ -443,6 +443,11 @@ class ModelWarning(Code):
         "The effects are clear in the data as a whole, but what is found without a block does not predict that block.",
         "Check the extended model on another day: something in the data happened only once.",
     )
+    PATH_REVERSED = (
+        "path_reversed",
+        "Measured Y moves against a path of the model; the effect that would reverse the path is not deployed.",
+        "Check the sign of measured Y, and that the model is one of this machine.",
+    )
     HARDLY_DETERMINED = (
         "hardly_determined",
         "The standard error of a parameter is larger than the parameter.",

@@ -78,7 +78,8 @@ def diagnose(
     few = evidence.is_sparse
     # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
     contradicted = not (few or evidence.free_paths) and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
-    extended, remarks = (model, ()) if contradicted else _extended(model, found, effects)
+    reverses = any(effect.reverses_path for effect in effects)
+    extended, remarks = (model, ()) if contradicted or reverses else _extended(model, found, effects)
     deployed = extended is not model
     extended = _with_deviation(extended, model, found, effects, held_out)
     verdict, ceiling = _verdict(found, held_out, extended), _ceiling(held_out)
@@ -96,7 +97,7 @@ def diagnose(
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
     warnings = warnings_of(effects, held_out.nothing, held_out.whole, deployed=deployed, few=few)
     return Diagnosis(
-        verdict="unexplained" if hides else verdict,
+        verdict="unexplained" if hides or reverses else verdict,
         effects=effects,
         held_out=how_held_out(evidence),
         model=extended,

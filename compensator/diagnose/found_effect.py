@@ -108,6 +108,11 @@ class FoundEffect:
         """Whether the service can run it."""
         return self.effect.deployable and not self.replaced
 
+    @property
+    def reverses_path(self) -> bool:
+        """Whether a path with it would act the other way round: Y is reversed, or the model is of another machine."""
+        return self.kind == "gain" and self.named["change"] < -1.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rival:

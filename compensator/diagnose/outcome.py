@@ -188,6 +188,9 @@ def warnings_of(
     for effect in effects:
         kind, named = effect.place[0], effect.named
         loose = [name for name, std in effect.std.items() if std > abs(named[name]) > 0.0]
+        if effect.reverses_path:
+            text = f"{kind}: Y moves against the {effect.place[1]}, so the model was left as it is."
+            warnings.append(Remark(ModelWarning.PATH_REVERSED, text))
         if loose:
             text = f"{kind}: the standard error of {', '.join(loose)} is larger than the value."
             warnings.append(Remark(ModelWarning.HARDLY_DETERMINED, text))

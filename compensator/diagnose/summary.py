@@ -44,6 +44,8 @@ _HIDDEN = {
     "step": "a step",
     "unobserved": "a source that no channel shows",
 }
+#: The verdict if a path would have to be reversed.
+_REVERSED = "Measured Y moves against the model: a wrong sign, or a model of another machine. Nothing is deployed."
 #: The verdict if the effects found increase the error on held-out data.
 _DOES_NOT_HOLD = (
     "The model lacks an effect; the best explanation found increases the error on held-out data, so the model was "
@@ -154,7 +156,9 @@ def verdict(found: Mapping[str, Any]) -> str:
     elif _cannot_show(found):
         names = found["could_hide"]["undecided"]
         words = _UNDECIDED.format(names=" or ".join(names)) if names else _CANNOT_SHOW
-    if ModelWarning.MADE_WORSE in found["warning_codes"]:
+    if ModelWarning.PATH_REVERSED in found["warning_codes"]:
+        words = _REVERSED
+    elif ModelWarning.MADE_WORSE in found["warning_codes"]:
         words = _DOES_NOT_HOLD
     elif ModelWarning.NOT_CONFIRMED in found["warning_codes"] and "could_hide" in found:
         words = _NOT_FORETOLD

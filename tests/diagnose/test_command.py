@@ -82,6 +82,17 @@ def test_an_adequate_model_is_written_with_the_deviation_that_the_data_show(tmp_
     assert load_model(again / "model.toml").y_std_um == model.y_std_um
 
 
+def test_a_reversed_y_is_no_effect_of_the_machine(tmp_path, capsys):
+    """Deployed, the gains that reverse both paths would double the error of the part."""
+    columns, _, _ = record([], 80, 24.0)
+    path, out = tmp_path / "run.csv", tmp_path / "d"
+    write_table(path, {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns, "y_um": -columns["y_um"]})
+    assert main(["diagnose", str(path), "--model", "quill", "--out", str(out), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "unexplained" and "path_reversed" in found["warning_codes"]
+    assert load_model(out / "model.toml").effects == ()
+
+
 def test_data_without_y_is_refused(tmp_path, capsys):
     columns, _, _ = record([], 79, 6.0)
     del columns["y_um"]

@@ -25,6 +25,8 @@ class Gain(Effect):
         return self.change * signals.share(self.path)
 
     def explain(self, seen: Seen) -> str:
+        if self.change < -1.0:
+            return f"{seen.words}: Y moves against the {self.path}{seen.path_words}. Check the sign of measured Y."
         return (
             f"{seen.words}: the gain of the {self.path}{seen.path_words} is {digits(abs(100.0 * self.change))} % too "
             f"{'low' if self.change > 0 else 'high'}. The machine responds differently than during calibration."
