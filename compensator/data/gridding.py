@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -15,6 +16,8 @@ from compensator.errors import DataError
 
 #: Longest table, in samples of the model: eleven years of minutes.
 MOST_SAMPLES = 6_000_000
+#: A stretch of so many rows in order that overlaps another one was recorded by a clock that was set back.
+STRETCH_ROWS = 10
 #: Number of stretches that a remark lists.
 _SHOWN = 3
 
@@ -35,6 +38,7 @@ def to_grid(table: Table, period_s: float) -> SampledData:
         If a value or time cannot have been measured.
     """
     _check_size(table, period_s)
+    _check_clock(table, period_s)
     remarks = []
     t_s = table.t_s
     order = np.argsort(t_s, kind="stable")
@@ -91,6 +95,27 @@ def _missing_inputs(
             more = f" and {len(long) - _SHOWN} more" if len(long) > _SHOWN else ""
             words = f"{name}: {column} is missing for {hours:.1f} h from t_s = {where}{more}; not interpolated."
             yield Remark(DataRemark.TEMPERATURE_MISSING, words)
+
+
+def _check_clock(table: Table, period_s: float) -> None:
+    """Refuse a table whose time was set back: sorted, rows of two hours would stand between each other.
+
+    Raises
+    ------
+    DataError
+        Naming the row from which on the time repeats.
+    """
+    t_s = table.t_s
+    back = np.flatnonzero(np.diff(t_s) < 0) + 1
+    stretches = np.split(np.arange(t_s.size), back)
+    long = [rows for rows in stretches if rows.size >= STRETCH_ROWS]
+    for before, after in itertools.pairwise(long):
+        repeated_s = min(t_s[before[-1]], t_s[after[-1]]) - max(t_s[before[0]], t_s[after[0]])
+        if repeated_s > STRETCH_ROWS * period_s:
+            raise DataError(
+                f"{table.name}: row {table.rows[after[0]]}: {repeated_s / 60.0:.0f} min occur twice, expected once: a "
+                "clock that was set back, or two files in one? Give each part as a file of its own"
+            )
 
 
 def _check_size(table: Table, period_s: float) -> None:

@@ -65,6 +65,15 @@ def test_data_without_a_channel_that_an_effect_needs_are_refused(table: pd.DataF
     assert np.isfinite(tc.simulate(model, table.assign(coolant_degc=20.0))["y_pred_um"]).all()
 
 
+def test_a_clock_that_was_set_back_is_refused_and_single_rows_are_sorted(table: pd.DataFrame) -> None:
+    """Sorted, rows of two hours would stand between each other."""
+    back = table.assign(t_s=np.where(np.arange(len(table)) < 300, table["t_s"], table["t_s"] - 3600.0))
+    with pytest.raises(tc.CompensatorError, match="row 300: 59 min occur twice"):
+        tc.simulate("quill", back)
+    for order in (np.arange(len(table))[::-1], np.random.default_rng(1).permutation(len(table))):
+        assert tc.simulate("quill", table.iloc[order])["t_s"].size == len(table)
+
+
 def test_what_is_no_model_is_refused(table: pd.DataFrame) -> None:
     for call in (lambda: tc.simulate(table, "quill"), lambda: tc.simulate(3, table), lambda: tc.diagnose(None, table)):
         with pytest.raises(tc.CompensatorError, match="expected a model, a result, a path"):
