@@ -1,0 +1,79 @@
+"""The diagnosis of the loop: from a record that may be used to a candidate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from compensator.api.diagnosis import DiagnosisResult, diagnose
+from compensator.data.frames import hash_of
+from compensator.data.measurement import Measurement, Origin
+from compensator.data.table import Table
+from compensator.errors import DataError
+from compensator.model.model_file import parse_model
+from compensator.model.model_writer import dump_model
+from compensator.service.loop.record import is_probed, usable_table
+from compensator.service.loop.weighing import Diagnosed, name_of
+from compensator.service.outcome import Outcome
+
+
+def diagnosis_of_record(record: Sequence[Outcome], model: bytes, *, probe_std_um: float | None = None) -> Diagnosed:
+    """Return what a diagnosis of a record gives; stands in for the process of the service.
+
+    Parameters
+    ----------
+    record : sequence of Outcome
+        Outcomes of the service in the time that is diagnosed.
+    model : bytes
+        File of the calibrated model.
+    probe_std_um : float, optional
+        Standard deviation of one probe, µm.
+
+    Raises
+    ------
+    CompensatorError
+        If there is too little data.
+    """
+    return summarised(diagnosis_of_table(usable_table(record), model, probe_std_um=probe_std_um))
+
+
+def diagnosis_of_table(table: Table, model: bytes, *, probe_std_um: float | None = None) -> DiagnosisResult:
+    """Diagnose a table of `service.loop.record`.
+
+    Raises
+    ------
+    CompensatorError
+        If there is too little data.
+    """
+    if not np.isfinite(table.columns["y_um"]).any():
+        raise DataError(f"{table.name}: no measured Y that may be used")
+    columns = {name: values for name, values in table.columns.items() if np.isfinite(values).any()}
+    table = Table(name=table.name, t_s=table.t_s, columns=columns, rows=table.rows)
+    origin = Origin(name=table.name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
+    measured = Measurement(table=table, label=table.name, origins=(origin,))
+    y_std_um = probe_std_um if is_probed(table) else None
+    return diagnose(parse_model(model, source="calibrated model"), [measured], y_std_um=y_std_um)
+
+
+def summarised(found: DiagnosisResult) -> Diagnosed:
+    """Return the result of a diagnosis as the loop needs it."""
+    deployed = tuple(name_of(effect) for effect in found.model.effects)
+    effects = deployed[len(deployed) - _added(found) :] if _added(found) else ()
+    left = [effect for effect in found.effects if not effect.deployable and not effect.replaced]
+    needs = [f"{effect.kind}: {effect.explanation}" for effect in left]
+    advice = found.diagnosis.advice
+    if advice is not None and advice.sensor:
+        needs.append(advice.sensor)
+    text = f"diagnosis: {found.verdict}, {', '.join(effects) or 'nothing to deploy'}"
+    before, after = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um
+    text += f"; held-out error {before:.2f} µm rms before, {after:.2f} after"
+    model = dump_model(found.model).encode() if effects else None
+    return Diagnosed(found.verdict, effects, model, text, " ".join(needs))
+
+
+def _added(found: DiagnosisResult) -> int:
+    """Return how many effects the extended model has more than the base."""
+    remainder = found.diagnosis.remainder
+    named = sum(effect.deployable for effect in found.effects)
+    return min(named + (remainder is not None and remainder.deployed), len(found.model.effects))
