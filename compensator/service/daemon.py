@@ -242,6 +242,11 @@ class Daemon:
         self._publish("offset", encode(offset or held))
         self._events.sequence += 1
 
+    @property
+    def is_diagnosing(self) -> bool:
+        """Whether a diagnosis, or what follows from it, is in progress beside the samples: simulated time may wait."""
+        return self._loop is not None and self._loop.is_working
+
     def stop(self) -> None:
         """End the run after the current poll; the recording is finished."""
         self._stop = True

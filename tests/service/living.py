@@ -61,11 +61,15 @@ class Machine:
 
         #: Promises of commands; while one is open simulated time does not run away from the thread that works on it.
         self.promised: list[Future[Any]] = []
+        #: Whether simulated time waits for diagnoses and what follows from them.
+        self.waits_for_diagnoses = True
 
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
             self.promised = [promise for promise in self.promised if not promise.done()]
             if self.promised:
+                await asyncio.sleep(PATIENCE_S)
+            while self.waits_for_diagnoses and self.daemon is not None and self.daemon.is_diagnosing:
                 await asyncio.sleep(PATIENCE_S)
 
         self.clock = VirtualClock(START_NS, advance)

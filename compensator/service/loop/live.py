@@ -110,6 +110,11 @@ class LiveLoop:
         """Whether a decided exchange has not happened yet: another change of the model has to wait."""
         return self._core is not None and bool(self._core.state.exchange)
 
+    @property
+    def is_working(self) -> bool:
+        """Whether a diagnosis, a warm-up or the storing of a model is in progress."""
+        return self._task is not None or self._storing is not None
+
     def opening(self) -> Mapping[str, bytes]:
         """Return what a recording that starts with the next sample begins with."""
         return self._core.attachments() if self._core is not None else {}
