@@ -63,6 +63,7 @@ class Machine:
         self.promised: list[Future[Any]] = []
         #: Whether simulated time waits for diagnoses and what follows from them.
         self.waits_for_diagnoses = True
+        self.at_poll: Callable[[], Any] = lambda: None
 
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
@@ -131,7 +132,7 @@ class Machine:
             if until(outcome):
                 daemon.stop()
 
-        await daemon.run(samples=samples, on_sample=step)
+        await daemon.run(samples=samples, on_sample=step, on_poll=lambda: self.at_poll())
 
     async def run_and_kill(self, samples: int, *, torn: int = 0) -> None:
         """Run the service and leave on disk what a kill after the last sample leaves, less some bytes."""

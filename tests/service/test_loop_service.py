@@ -246,13 +246,16 @@ async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_th
     machine = Looping(tmp_path, shown(extended()))
     copy = tmp_path / "killed"
 
-    def stored(_: Any) -> bool:
-        if machine.store.in_use() == extended():
+    def stored() -> None:
+        model = machine.outcomes[-1].offset.model_sha256 if machine.outcomes else ""
+        if not copy.exists() and model == sha256_of(QUILL) and machine.store.in_use() == extended():
             shutil.copytree(machine.recordings, copy)
-            return True
-        return False
+            assert machine.daemon is not None
+            machine.daemon.stop()
 
-    await machine.run(1800, until=stored)
+    machine.at_poll = stored
+    await machine.run(1800)
+    machine.at_poll = lambda: None
     last = machine.outcomes[-1]
     assert last.offset.model_sha256 == sha256_of(QUILL)
     shutil.rmtree(machine.recordings)
