@@ -346,7 +346,8 @@ class Loop:
         if back:
             self._avoid(state.effects, now_ns)
         state.effects, state.diagnosis = list(effects), None
-        return self.give_up("by_hand", "an operator has changed the model") if state.shadow is not None else []
+        words = "a person has changed the model or the configuration"
+        return self.give_up("by_hand", words) if state.shadow is not None else []
 
     def give_up(self, why: str, text: str) -> list[Note]:
         """End the shadow for a cause outside of the loop, or a candidate that could not be warmed up."""
