@@ -240,7 +240,11 @@ class Loop:
         since_last_h = (now_ns - state.diagnosed_utc_ns) / _HOUR_NS
         if night_ns > state.night_utc_ns:
             why = "night"
-        elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_h >= MISFIT_AGAIN_H:
+        elif (
+            state.misfit_min >= 60.0 * settings.misfit_h
+            and since_last_h >= MISFIT_AGAIN_H
+            and state.phase in ("idle", "watching")  # otherwise a candidate is compared already
+        ):
             why = "misfit"
         else:
             return []
