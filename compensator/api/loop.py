@@ -19,7 +19,7 @@ from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
 
 #: Ends of a record that are diagnosed if the whole is not explained, h.
-ENDS_H = (24.0, 16.0, 10.0)
+ENDS_H = (24.0, 16.0, 10.0, 7.0)
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
 #: A shorter end must leave less than this part of what a longer one does.

@@ -169,13 +169,13 @@ def test_a_proposal_is_a_line_with_two_commands() -> None:
     shop, clock = filled("vmc-01")
     assert "Model:" not in shown(shop, 200)
     shop.receive("shop/vmc-01/thermal/status", status(3, clock.now_ns, loop=LOOP))
-    text = " ".join(shown(shop, 200).split())
+    text = " ".join(shown(shop, 200).replace("│", "").split())
     assert "a better one is proposed" in text and "compensator adopt --candidate" in text
     assert "compensator dismiss" in text
     one = shop.one("shop/vmc-01")
     assert one is not None and "better model proposed" in line(one)
     watching = LOOP | {"phase": "watching", "diagnosing": True}
     shop.receive("shop/vmc-01/thermal/status", status(4, clock.now_ns, loop=watching))
-    text = " ".join(shown(shop, 200).split())
+    text = " ".join(shown(shop, 200).replace("│", "").split())
     assert "goes on beside the adopted one" in text and "A diagnosis is in progress." in text
     assert "adopt --candidate" not in text
