@@ -24,7 +24,7 @@ def nothing_follows(why: str, found: DiagnosisData) -> str:
         "failed": f"the diagnosis failed: {found.needs}",
         "unexplained": f"the diagnosis explains nothing that can be compensated ({found.verdict}); {found.needs}",
         "refused": f"the candidate cannot be used: {found.refused}",
-        "nothing_found": "the diagnosis finds nothing that the model lacks",
+        "nothing_found": f"the diagnosis finds nothing that can be compensated; {found.needs}",
         "unchanged": f"the diagnosis finds what the model has: {effects}",
         "in_shadow": f"the diagnosis finds what is in shadow already: {effects}",
         "avoided": f"{effects}: the service went back from it, or an operator dismissed it, a short time ago",
