@@ -66,6 +66,12 @@ USERS = {
             "commands.adopt:adopt",
         ),
         Command("back", "return to the previous model", "back --config machine.toml", "commands.adopt:back"),
+        Command(
+            "dismiss",
+            "refuse the model that the service proposes",
+            "dismiss --config machine.toml",
+            "commands.adopt:dismiss",
+        ),
     ),
     "operator": (
         Command("watch", "show one machine or many, live", "watch --connect tcp/127.0.0.1:7447 --prefix shop"),

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from compensator.clock import NS
 from compensator.codes import State, WatchWarning, explain
-from compensator.events import EventKind, RecordingData, data_of
+from compensator.events import EventKind, LoopAction, RecordingData, data_of
 from compensator.messages import Event
 from compensator.report.notation import plain
 
@@ -81,6 +81,10 @@ def to_do(event: Event) -> str:
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
         return " ".join(dict.fromkeys(explained(code).do for code in codes)) if state not in ("", State.OK) else ""
+    if event.kind == EventKind.DIAGNOSIS:
+        return str(event.data.get("needs", ""))
+    if event.kind == EventKind.LOOP and event.data.get("step") == LoopAction.PROPOSE:
+        return f"Answer with `{LOOP_COMMANDS[0]}` or `{LOOP_COMMANDS[1]}`."
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
     if recording is not None and recording.is_resolved:
         return ""
@@ -103,6 +107,29 @@ def probe_text(probe: dict[str, Any]) -> str:
     if probe["by_ns"] is not None:
         return f"No probe wanted before {here(probe['by_ns']):%H:%M} ({figures}). {PROBE_FOR}"
     return f"No probe wanted ({figures}). {PROBE_FOR}"
+
+
+#: What a person can answer to a candidate; the first is the yes.
+LOOP_COMMANDS = ("compensator adopt --candidate --config machine.toml", "compensator dismiss --config machine.toml")
+
+
+def loop_text(loop: Mapping[str, Any]) -> str:
+    """Return in one line what the service does about its model.
+
+    Parameters
+    ----------
+    loop : mapping
+        `loop` of a status.
+    """
+    effects = ", ".join(loop["effects"]) or "no added effect"
+    words = {
+        "idle": "Model: nothing better is known.",
+        "shadow": f"Model: a candidate with {effects} runs beside the present one. {loop['text']}.",
+        "proposed": f"Model: a better one is proposed, with {effects}. {loop['text']}.",
+        "watching": f"Model: the one before ({effects}) goes on beside the adopted one. {loop['text']}.",
+    }
+    text = words[loop["phase"]]
+    return f"{text} A diagnosis is in progress." if loop["diagnosing"] else text
 
 
 def here(time_ns: int) -> datetime:
