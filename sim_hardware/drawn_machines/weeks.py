@@ -35,7 +35,7 @@ Mask = NDArray[np.bool_]
 OF_WEEKS = ("transfer", "conduction")
 ATTEMPTS = 60
 #: An effect that begins has at least so much time before the end, min, and is at least so large while it acts, µm rms.
-LEAST_MIN, LEAST_UM = 2 * DAY_MIN, 1.5
+LEAST_MIN, LEAST_UM = 5 * DAY_MIN // 2, 1.5
 #: Standard deviation of a touch probe, µm, and the time between two, min.
 PROBE_STD_UM, PROBE_EVERY_MIN = (0.5, 1.5), (30, 60)
 #: How often a chip lies on the feature, and how much that shifts a probe, µm.
