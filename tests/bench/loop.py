@@ -301,7 +301,9 @@ def _spell(week, spell, diagnoses, steps, errors, base_sha):
     right = {":".join(filter(None, place)) for place in spell.places}
     direct = {name.replace("TTF", "DTF") for name in right}
     named = [
-        key[0] for key, one in diagnoses.found.items() if begin <= key[0] <= until and set(one.effects) & (right | direct)
+        key[0]
+        for key, one in diagnoses.found.items()
+        if begin <= key[0] <= until and set(one.effects) & (right | direct)
     ]
     changed = [
         steps[i].outcome.sample.seq
@@ -352,14 +354,17 @@ def lines(r):
         yield [what, r["failed"], "", "", "", "", "", "", f"{r['seconds']:.0f}"]
         return
     changes = " ".join(
-        f"{c['minute'] / 1440:.1f}{'←' if c['to_calibrated'] else '→'}{'WORSE' if c['worse'] else ''}" for c in r["changes"]
+        f"{c['minute'] / 1440:.1f}{'←' if c['to_calibrated'] else '→'}{'WORSE' if c['worse'] else ''}"
+        for c in r["changes"]
     )
     flags = ("" if r["reproduced"] else " NOT REPRODUCED") + ("" if all(r["restarts"]) else " RESTART DIFFERS")
     blank = {"effect": "none", "from_min": 0, "to_min": 0, "found_h": None, "adopted_h": None, "removed_pct": None}
     blank |= {"size_um": 0.0, "fair": True, "deployable": False}
     blank |= {f"{name}_um": value for name, value in r["whole"].items()}
     for spell in r["spells"] or [blank]:
-        numbers = [f"{spell[key]:.0f}" if spell[key] is not None else "–" for key in ("found_h", "adopted_h", "removed_pct")]
+        numbers = [
+            f"{spell[key]:.0f}" if spell[key] is not None else "–" for key in ("found_h", "adopted_h", "removed_pct")
+        ]
         size = f"{spell['effect']} {spell['size_um']:.1f} µm" + ("" if spell["fair"] else " (unfair)")
         days = f"{spell['from_min'] / 1440:.1f}–{spell['to_min'] / 1440:.1f}"
         errors = " ".join(f"{spell[f'{name}_um']:.2f}" for name in ("base", "loop", "best"))
