@@ -1,8 +1,7 @@
 """Second opinion before another model takes over: both models on the measured Y on record.
 
 Both run through the same replay of the recordings as a warm-up, about the zeros of the record, with the probes of the
-record. Compared are the last `COMPARED_H` hours: block means of a displacement sensor, or what each probe showed beyond
-the prediction before it. `evidence` says how strongly they speak for one of the models.
+record. Compared are the last `COMPARED_H` hours (`comparison`).
 
 Left out: samples before the state of both models is known, without T_Q or AT, while the service suspected a sensor and
 not the model, blocks of a sensor that does not change at all, and probes that both models refuse.
@@ -10,53 +9,26 @@ not the model, blocks of a sensor that does not change at all, and probes that b
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
-import msgspec
-import numpy as np
-
-from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.config import Config
 from compensator.errors import CompensatorError, DataError, ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
-from compensator.messages import number
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
-from compensator.service.probing import UNKNOWN_UM
 from compensator.service.replay import RecordedStep, steps_of
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import RecordedRun, Window, window_of
-from compensator.service.transfer.evidence import evidence, followed
+from compensator.service.transfer.comparison import BLOCK_MIN, FEWEST, Comparison, changed, not_judged
 
 #: How much of the record is compared, h.
 COMPARED_H = 24.0
-#: From this number of standard deviations of the difference on a model is better or worse.
-DEVIATIONS = 4.0
-#: A model whose changes are wrong by more than the present one's by less than this part is not worse.
-WORSE_PART = 0.05
-#: Fewer changes of block means, or probes, do not judge a model.
-FEWEST = 8
-#: Length of a block, min, and the part of it that must be measured.
-BLOCK_MIN, _MEASURED = 30.0, 0.5
 _UNUSABLE = (Reason.COLD_START, Reason.T_Q_MISSING, Reason.AT_MISSING, Reason.T_Q_AT_EXCHANGED)
-
-
-@dataclass(slots=True)
-class _Compared:
-    """What both models made of the record; a row of `samples` is block, residuals of both, Y."""
-
-    samples: list[tuple[tuple[int, int], float, float, float]] = field(default_factory=list)
-    probes: list[tuple[float, float]] = field(default_factory=list)
-    first_ns: int = 0
-    #: Samples with measured Y during which a sensor was suspected.
-    suspected: int = 0
-    offset_change_um: float = math.nan
 
 
 def second_opinion(
@@ -85,20 +57,12 @@ def second_opinion(
         compared_ns = round(COMPARED_H * 3600 * NS)
         window = window_of(folder, config.machine.name, slowest, between_samples, compared_ns=compared_ns)
         runs = [RecordedRun(config, Compensation(config, model), probes=True) for model in (present, candidate)]
-        found = _run(runs, window, window.end_ns - compared_ns, between_samples)
+        found, move_um = _run(runs, window, window.end_ns - compared_ns, between_samples)
     except (CompensatorError, OSError) as error:
         return not_judged(NotJudged.NO_RECORD, remark=str(error))
-    move_um = None if math.isnan(found.offset_change_um) else found.offset_change_um
-    hours = (window.end_ns - found.first_ns) / (3600 * NS) if found.first_ns else 0.0
-    by_sensor = _judged_by_sensor(found, BLOCK_MIN * 60.0 / present.period_s)
-    by_probes = _judged_by_probes(found)
-    chosen = by_sensor if by_sensor.why is None or not found.probes else by_probes
-    return _with(chosen, hours=hours, offset_change_um=move_um)
-
-
-def not_judged(why: NotJudged, *, remark: str = "") -> ComparisonData:
-    """Return a comparison without a verdict."""
-    return ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=why, remark=remark)
+    first_ns = found.state.first_ns
+    hours = (window.end_ns - first_ns) / (3600 * NS) if first_ns else 0.0
+    return changed(found.verdict(), hours=hours, offset_change_um=None if math.isnan(move_um) else move_um)
 
 
 def refuse_if_worse(found: ComparisonData, model: ThermalModel, *, force: bool) -> None:
@@ -155,10 +119,12 @@ def _why(found: ComparisonData) -> str:
 # ---------------------------------------------------------------------- the record
 
 
-def _run(runs: Sequence[RecordedRun], window: Window, from_ns: int, between_samples: Callable[[], None]) -> _Compared:
-    """Run both models through the record."""
-    found, zeros, models = _Compared(), 0, [run.compensation.model for run in runs]
-    block_ns = round(BLOCK_MIN * 60 * NS)
+def _run(
+    runs: Sequence[RecordedRun], window: Window, from_ns: int, between_samples: Callable[[], None]
+) -> tuple[Comparison, float]:
+    """Run both models through the record; return also by how much the offset would move, µm."""
+    models = [run.compensation.model for run in runs]
+    found = Comparison(models[0].period_s)
     begun = window.at_rest is not None
     for run in runs:
         run.compensation.begin(None)
@@ -177,15 +143,15 @@ def _run(runs: Sequence[RecordedRun], window: Window, from_ns: int, between_samp
             begun = True
             for run in runs:
                 run.compensation.begin(zero)
-        zeros += step.zero is not None
+        if step.zero is not None:
+            found.set_zero()
         outcomes = [outcome for run in runs if (outcome := run.process(step)) is not None]
         if len(outcomes) == len(runs) and outcomes[0].sample.time_utc_ns > from_ns:
-            _compare(found, step, outcomes[0], outcomes[1], (zeros, outcomes[0].sample.time_utc_ns // block_ns))
+            _compare(found, step, outcomes[0], outcomes[1])
     present, candidate = (run.compensation for run in runs)
     # As at the exchange: with probes the corrected deformation stays as it is.
     candidate.continue_from(replace(present.status.handover, model_changed=True))
-    found.offset_change_um = candidate.status.target_um - present.status.target_um
-    return found
+    return found, candidate.status.target_um - present.status.target_um
 
 
 def _steps(window: Window, between_samples: Callable[[], None]) -> Iterator[RecordedStep]:
@@ -202,116 +168,18 @@ def _recorded_zero(step: RecordedStep) -> Zero | None:
     return zero if zero is not None and not math.isnan(zero.t_q_ref_degc) else None
 
 
-def _compare(
-    found: _Compared, step: RecordedStep, present: Outcome, candidate: Outcome, block: tuple[int, int]
-) -> None:
+def _compare(found: Comparison, step: RecordedStep, present: Outcome, candidate: Outcome) -> None:
     """Add one sample and its probes."""
-    if any(reason in _UNUSABLE for one in (present, candidate) for reason in one.offset.reasons):
-        return
-    residuals = number(present.estimate.residual_um), number(candidate.estimate.residual_um)
-    probes = [
-        (number(own.innovation_um), number(other.innovation_um))
-        for own, other in zip(present.probes, candidate.probes, strict=True)
-        if (own.taken or other.taken)
-        and max(number(own.innovation_std_um), number(other.innovation_std_um)) < UNKNOWN_UM
-    ]
-    is_measured = math.isfinite(sum(residuals))
-    if _sensor_suspected(step):
-        found.suspected += is_measured
-        return
-    found.probes += probes
-    if is_measured:
-        found.samples.append((block, *residuals, number(present.estimate.y_um)))
-    if probes or is_measured:
-        found.first_ns = found.first_ns or present.sample.time_utc_ns - round(present.sample.period_s * NS)
+    if not is_unusable(present, candidate):
+        found.add(present, candidate, suspected=sensor_suspected(step.offset.reasons if step.offset is not None else ()))
 
 
-def _sensor_suspected(step: RecordedStep) -> bool:
-    """Return whether the service suspected a sensor, and not the model, at a sample."""
-    reasons = step.offset.reasons if step.offset is not None else []
+def is_unusable(*outcomes: Outcome) -> bool:
+    """Return whether one of the predictions of a sample lacks a temperature or a known state."""
+    return any(reason in _UNUSABLE for outcome in outcomes for reason in outcome.offset.reasons)
+
+
+def sensor_suspected(reasons: Sequence[str]) -> bool:
+    """Return whether the service suspected a sensor, and not the model, at a sample with these reasons."""
     suspects = [reason for reason in reasons if reason.startswith(Reason.IMPLAUSIBLE)]
     return Reason.T_Q_AT_APART in reasons or (bool(suspects) and f"{Reason.IMPLAUSIBLE}:model" not in suspects)
-
-
-# ---------------------------------------------------------------------- the verdict
-
-
-def _judged_by_sensor(found: _Compared, samples_in_block: float) -> ComparisonData:
-    if not found.samples:
-        return not_judged(NotJudged.SUSPECT if found.suspected else NotJudged.NO_Y)
-    present, candidate, y = np.array([row[1:] for row in found.samples]).T
-    scores = ComparisonData(
-        verdict=ComparisonVerdict.NOT_JUDGED,
-        measured_by="sensor",
-        samples=present.size,
-        present_rms_um=_rms(present),
-        candidate_rms_um=_rms(candidate),
-    )
-    changes = _changes([row[0] for row in found.samples], (present, candidate, y), _MEASURED * samples_in_block)
-    own, other, moves = changes
-    if own.size < FEWEST:
-        still = float(np.mean(np.diff(y) == 0.0)) > 0.5 if y.size > 1 else False
-        suspected = NotJudged.SUSPECT if found.suspected > y.size else NotJudged.TOO_LITTLE
-        return _with(scores, why=NotJudged.UNRELATED if still else suspected)
-    kept = followed(moves, own, own - other, parts=own.size // FEWEST, deviations=DEVIATIONS)
-    if np.sum(kept) < FEWEST:
-        return _with(scores, why=NotJudged.UNRELATED)
-    return _judged(scores, own[kept], own[kept] - other[kept])
-
-
-def _changes(
-    blocks: Sequence[tuple[int, int]], columns: Sequence[Vector], fewest: float
-) -> tuple[Vector, Vector, Vector]:
-    """Return the changes of both residuals and of Y from each usable block to the next one, about the same zero."""
-    rows: list[list[float]] = []
-    before: tuple[tuple[int, int], list[float]] | None = None
-    edges = [0, *(i for i in range(1, len(blocks)) if blocks[i] != blocks[i - 1]), len(blocks)]
-    for begin, end in itertools.pairwise(edges):
-        parts = [column[begin:end] for column in columns]
-        if end - begin < fewest or np.ptp(parts[-1]) == 0.0:
-            before = None
-            continue
-        block, means = blocks[begin], [float(np.mean(part)) for part in parts]
-        if before is not None and before[0] == (block[0], block[1] - 1):
-            rows.append([new - old for new, old in zip(means, before[1], strict=True)])
-        before = block, means
-    own, other, y = np.array(rows).reshape(-1, 3).T
-    return own, other, y
-
-
-def _judged_by_probes(found: _Compared) -> ComparisonData:
-    if not found.probes:
-        return not_judged(NotJudged.SUSPECT if found.suspected else NotJudged.NO_Y)
-    own, other = np.array(found.probes).T
-    scores = ComparisonData(
-        verdict=ComparisonVerdict.NOT_JUDGED,
-        measured_by="probe",
-        probes=own.size,
-        present_rms_um=_rms(own),
-        candidate_rms_um=_rms(other),
-    )
-    if own.size < FEWEST:
-        return _with(scores, why=NotJudged.TOO_LITTLE)
-    # Each model has been corrected by the probes before: what a probe shows beyond that is a change already.
-    return _judged(scores, own, own - other)
-
-
-def _judged(scores: ComparisonData, own: Vector, difference: Vector) -> ComparisonData:
-    weighed = evidence(own, difference)
-    assert scores.present_rms_um is not None and scores.candidate_rms_um is not None
-    verdict, is_larger = ComparisonVerdict.ALIKE, scores.candidate_rms_um > scores.present_rms_um
-    if weighed.deviations >= DEVIATIONS and weighed.ratio < 1.0:
-        verdict = ComparisonVerdict.BETTER
-    elif weighed.deviations <= -DEVIATIONS and weighed.ratio > 1.0 + WORSE_PART:
-        verdict = ComparisonVerdict.WORSE
-    y_moved = verdict != ComparisonVerdict.ALIKE and is_larger != (verdict == ComparisonVerdict.WORSE)
-    scores = _with(scores, y_moved=y_moved)
-    return _with(scores, verdict=verdict, deviations=weighed.deviations, effective=weighed.effective)
-
-
-def _rms(values: Vector) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _with(found: ComparisonData, **changes: object) -> ComparisonData:
-    return msgspec.structs.replace(found, **changes)

@@ -1,0 +1,289 @@
+"""Two models compared on measured Y, sample by sample: for the second opinion, and for a shadow.
+
+Compared are block means of a displacement sensor, as changes from one block to the next, or what each probe showed
+beyond the prediction before it. `evidence` says how strongly they speak for one of the models.
+
+The caller leaves out what must not judge: samples without T_Q or AT, or while a sensor is suspected.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from compensator.arrays import Vector
+from compensator.clock import NS
+from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
+from compensator.messages import number
+from compensator.service.outcome import Outcome
+from compensator.service.probing import UNKNOWN_UM
+from compensator.service.transfer.evidence import evidence, followed
+
+#: From this number of standard deviations of the difference on a model is better or worse.
+DEVIATIONS = 4.0
+#: A model whose changes are wrong by more than the present one's by less than this part is not worse.
+WORSE_PART = 0.05
+#: Fewer changes of block means, or probes, do not judge a model.
+FEWEST = 8
+#: Length of a block, min, and the part of it that must be measured.
+BLOCK_MIN, _MEASURED = 30.0, 0.5
+BLOCK_NS = round(BLOCK_MIN * 60 * NS)
+
+
+class Block(msgspec.Struct, frozen=True, array_like=True):
+    """A block of samples about one zero.
+
+    Parameters
+    ----------
+    zeros, number : int
+        Number of the zero, and of the block since 1970.
+    samples : int
+        Samples with measured Y.
+    squares : tuple of two floats
+        Sums of squares of the residuals of both models, µm².
+    means : tuple of three floats, optional
+        Means of both residuals and of Y, µm; None if too little was measured, or Y did not change at all.
+    """
+
+    zeros: int
+    number: int
+    samples: int
+    squares: tuple[float, float]
+    means: tuple[float, float, float] | None
+
+
+class ComparedProbe(msgspec.Struct, frozen=True, array_like=True):
+    """What a probe showed beyond the predictions of both models, µm, and the time of its sample."""
+
+    time_utc_ns: int
+    own_um: float
+    other_um: float
+
+
+class ComparisonState(msgspec.Struct, kw_only=True):
+    """Everything that was compared.
+
+    Parameters
+    ----------
+    zeros : int
+        Zeros so far.
+    rows : list of three floats
+        Residuals of both models and Y of the samples of the open block, µm.
+    number : int
+        Number of the open block.
+    blocks : list of Block
+        The blocks before it.
+    probes : list of ComparedProbe
+        The probes.
+    first_ns, last_ns : int
+        Begin of the first compared value and time of the last sample, ns since 1970 UTC; 0 before.
+    suspected, steps, still : int
+        Samples with measured Y while a sensor was suspected; steps of Y, and those of them without any change.
+    y_um : float, optional
+        The last measured Y.
+    """
+
+    zeros: int = 0
+    rows: list[tuple[float, float, float]] = []
+    number: int = 0
+    blocks: list[Block] = []
+    probes: list[ComparedProbe] = []
+    first_ns: int = 0
+    last_ns: int = 0
+    suspected: int = 0
+    steps: int = 0
+    still: int = 0
+    y_um: float | None = None
+
+
+class Comparison:
+    """Compares two models.
+
+    Parameters
+    ----------
+    period_s : float
+        Length of a sample, s.
+    state : ComparisonState, optional
+        What was compared before.
+    """
+
+    def __init__(self, period_s: float, state: ComparisonState | None = None) -> None:
+        self._fewest = _MEASURED * BLOCK_MIN * 60.0 / period_s
+        self.state = state if state is not None else ComparisonState()
+
+    def add(self, present: Outcome, candidate: Outcome, *, suspected: bool) -> bool:
+        """Add a sample with its probes; return whether the verdict may have changed.
+
+        Parameters
+        ----------
+        present, candidate : Outcome
+            Outcomes of the sample by both models; with the same probes.
+        suspected : bool
+            Whether a sensor is suspected: the sample is counted, but not compared.
+        """
+        residuals = number(present.estimate.residual_um), number(candidate.estimate.residual_um)
+        probes = [
+            (number(own.innovation_um), number(other.innovation_um))
+            for own, other in zip(present.probes, candidate.probes, strict=True)
+            if (own.taken or other.taken)
+            and max(number(own.innovation_std_um), number(other.innovation_std_um)) < UNKNOWN_UM
+        ]
+        state, is_measured, now_ns = self.state, math.isfinite(sum(residuals)), present.sample.time_utc_ns
+        if suspected:
+            state.suspected += is_measured
+            return False
+        if not (probes or is_measured):
+            return False
+        state.first_ns = state.first_ns or now_ns - round(present.sample.period_s * NS)
+        state.last_ns = now_ns
+        state.probes += [ComparedProbe(now_ns, *pair) for pair in probes]
+        return (self._add_measured(*residuals, number(present.estimate.y_um), now_ns) if is_measured else False) or bool(
+            probes
+        )
+
+    def set_zero(self) -> None:
+        """Begin a new block: Y before and after a zero are not comparable."""
+        self._close()
+        self.state.zeros += 1
+
+    def forget_before(self, time_utc_ns: int, keep_probes: int) -> None:
+        """Forget what is older than a time, but for the last probes."""
+        state, oldest = self.state, time_utc_ns // BLOCK_NS
+        state.blocks = [block for block in state.blocks if block.number >= oldest]
+        older = len([probe for probe in state.probes if probe.time_utc_ns < time_utc_ns])
+        state.probes = state.probes[max(min(older, len(state.probes) - keep_probes), 0) :]
+        begins = [state.blocks[0].number * BLOCK_NS] if state.blocks else []
+        begins += [state.probes[0].time_utc_ns] if state.probes else []
+        state.first_ns = max(state.first_ns, min(begins, default=state.first_ns)) if state.first_ns else 0
+
+    @property
+    def judged_h(self) -> float:
+        """Time of the usable blocks, h."""
+        return sum(block.means is not None for block in self._blocks()) * BLOCK_MIN / 60.0
+
+    def verdict(self, *, deviations: float = DEVIATIONS) -> ComparisonData:
+        """Return the verdict on what was compared.
+
+        Parameters
+        ----------
+        deviations : float
+            From this number of standard deviations of the difference on a model is better or worse.
+        """
+        by_sensor = self._by_sensor(deviations)
+        chosen = by_sensor if by_sensor.why is None or not self.state.probes else self._by_probes(deviations)
+        hours = (self.state.last_ns - self.state.first_ns) / (3600 * NS)
+        return changed(chosen, hours=hours)
+
+    # ------------------------------------------------------------------ blocks
+
+    def _add_measured(self, own: float, other: float, y_um: float, now_ns: int) -> bool:
+        state, block = self.state, now_ns // BLOCK_NS
+        closed = bool(state.rows) and block != state.number
+        if closed:
+            self._close()
+        state.number = block
+        state.rows = [*state.rows, (own, other, y_um)]
+        if state.y_um is not None:
+            state.steps, state.still = state.steps + 1, state.still + (y_um == state.y_um)
+        state.y_um = y_um
+        return closed
+
+    def _close(self) -> None:
+        self.state.blocks, self.state.rows = self._blocks(), []
+
+    def _blocks(self) -> list[Block]:
+        """Return all blocks, with the open one as far as it goes."""
+        state = self.state
+        if not state.rows:
+            return state.blocks
+        own, other, y = np.array(state.rows).T
+        means = None
+        if y.size >= self._fewest and np.ptp(y) != 0.0:
+            means = float(np.mean(own)), float(np.mean(other)), float(np.mean(y))
+        squares = float(np.sum(own**2)), float(np.sum(other**2))
+        return [*state.blocks, Block(state.zeros, state.number, y.size, squares, means)]
+
+    # ------------------------------------------------------------------ the verdict
+
+    def _by_sensor(self, deviations: float) -> ComparisonData:
+        state, blocks = self.state, self._blocks()
+        samples = sum(block.samples for block in blocks)
+        if not samples:
+            return not_judged(NotJudged.SUSPECT if state.suspected else NotJudged.NO_Y)
+        own_rms, other_rms = (math.sqrt(sum(block.squares[i] for block in blocks) / samples) for i in (0, 1))
+        scores = ComparisonData(
+            verdict=ComparisonVerdict.NOT_JUDGED,
+            measured_by="sensor",
+            samples=samples,
+            present_rms_um=own_rms,
+            candidate_rms_um=other_rms,
+        )
+        own, other, moves = _changes(blocks)
+        if own.size < FEWEST:
+            still = state.still > 0.5 * state.steps
+            suspected = NotJudged.SUSPECT if state.suspected > samples else NotJudged.TOO_LITTLE
+            return changed(scores, why=NotJudged.UNRELATED if still else suspected)
+        kept = followed(moves, own, own - other, parts=own.size // FEWEST, deviations=deviations)
+        if np.sum(kept) < FEWEST:
+            return changed(scores, why=NotJudged.UNRELATED)
+        return _judged(scores, own[kept], own[kept] - other[kept], deviations)
+
+    def _by_probes(self, deviations: float) -> ComparisonData:
+        own, other = np.array([(probe.own_um, probe.other_um) for probe in self.state.probes]).T
+        scores = ComparisonData(
+            verdict=ComparisonVerdict.NOT_JUDGED,
+            measured_by="probe",
+            probes=own.size,
+            present_rms_um=_rms(own),
+            candidate_rms_um=_rms(other),
+        )
+        if own.size < FEWEST:
+            return changed(scores, why=NotJudged.TOO_LITTLE)
+        # Each model has been corrected by the probes before: what a probe shows beyond that is a change already.
+        return _judged(scores, own, own - other, deviations)
+
+
+def not_judged(why: NotJudged, *, remark: str = "") -> ComparisonData:
+    """Return a comparison without a verdict."""
+    return ComparisonData(verdict=ComparisonVerdict.NOT_JUDGED, why=why, remark=remark)
+
+
+def changed(found: ComparisonData, **changes: object) -> ComparisonData:
+    """Return a comparison with some of its data replaced."""
+    return msgspec.structs.replace(found, **changes)
+
+
+def _changes(blocks: list[Block]) -> tuple[Vector, Vector, Vector]:
+    """Return the changes of both residuals and of Y from each usable block to the next one, about the same zero."""
+    rows: list[list[float]] = []
+    before: Block | None = None
+    for block in blocks:
+        if block.means is None:
+            before = None
+            continue
+        if before is not None and (before.zeros, before.number) == (block.zeros, block.number - 1):
+            assert before.means is not None
+            rows.append([new - old for new, old in zip(block.means, before.means, strict=True)])
+        before = block
+    own, other, y = np.array(rows).reshape(-1, 3).T
+    return own, other, y
+
+
+def _judged(scores: ComparisonData, own: Vector, difference: Vector, deviations: float) -> ComparisonData:
+    weighed = evidence(own, difference)
+    assert scores.present_rms_um is not None and scores.candidate_rms_um is not None
+    verdict, is_larger = ComparisonVerdict.ALIKE, scores.candidate_rms_um > scores.present_rms_um
+    if weighed.deviations >= deviations and weighed.ratio < 1.0:
+        verdict = ComparisonVerdict.BETTER
+    elif weighed.deviations <= -deviations and weighed.ratio > 1.0 + WORSE_PART:
+        verdict = ComparisonVerdict.WORSE
+    y_moved = verdict != ComparisonVerdict.ALIKE and is_larger != (verdict == ComparisonVerdict.WORSE)
+    return changed(
+        scores, verdict=verdict, deviations=weighed.deviations, effective=weighed.effective, y_moved=y_moved
+    )
+
+
+def _rms(values: Vector) -> float:
+    return float(np.sqrt(np.mean(values**2)))
