@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from compensator.api.diagnosis import DiagnosisResult, diagnose
-from compensator.arrays import Vector
-from compensator.clock import NS
-from compensator.codes import SampleQuality
 from compensator.config import Config
-from compensator.data.files import measured_probes
 from compensator.diagnose.advice_words import advice_lines
 from compensator.errors import CompensatorError
-from compensator.messages import number
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
-from compensator.service.loop.run import Diagnosed
+from compensator.service.loop.record import usable_table
+from compensator.service.loop.weighing import FAILED, Diagnosed
 from compensator.service.outcome import Outcome
-
-#: Verdict where a diagnosis could not be made.
-NOT_MADE = "not_made"
 
 
 def diagnosis_in_process(config: Config) -> Callable[[Sequence[Outcome], bytes], Diagnosed]:
@@ -48,7 +38,7 @@ def diagnosed(outcomes: Sequence[Outcome], model: bytes, *, y_std_um: float | No
     Parameters
     ----------
     outcomes : sequence of Outcome
-        Samples in order; missing ones are gaps.
+        Samples in order; what must not be used is left out (`usable_table`).
     model : bytes
         File of the base model.
     y_std_um : float, optional
@@ -57,14 +47,16 @@ def diagnosed(outcomes: Sequence[Outcome], model: bytes, *, y_std_um: float | No
     Returns
     -------
     Diagnosed
-        With the verdict `not_made` where there is too little data, or the data cannot be used.
+        With the verdict `failed` where there is too little data, or the data cannot be used.
     """
     try:
-        columns, is_probed = table_of_outcomes(outcomes)
+        table = usable_table(outcomes)
+        columns = {"t_s": table.t_s - (table.t_s[0] if table.t_s.size else 0.0), **table.columns}
+        is_probed = not any("y_um" in outcome.sample.channels for outcome in outcomes)
         base = parse_model(model, source="model of the loop")
         found = diagnose(base, columns, y_std_um=y_std_um if is_probed else None)
     except CompensatorError as error:
-        return Diagnosed(verdict=NOT_MADE, effects=(), model=None, text=str(error), needs=str(error))
+        return Diagnosed(verdict=FAILED, effects=(), model=None, text=str(error), needs=str(error))
     return diagnosed_of(found)
 
 
@@ -85,35 +77,6 @@ def diagnosed_of(found: DiagnosisResult) -> Diagnosed:
         text=f"{text}.",
         needs=_needs(found),
     )
-
-
-def table_of_outcomes(outcomes: Sequence[Outcome]) -> tuple[dict[str, Any], bool]:
-    """Return the samples as a table; whether Y is from touch probes, as where recordings are read.
-
-    Raises
-    ------
-    CompensatorError
-        If there are none.
-    """
-    names = sorted({name for outcome in outcomes for name in outcome.sample.channels})
-    t_s: Vector = np.array([outcome.sample.time_utc_ns / NS for outcome in outcomes], dtype=np.float64)
-    columns = {name: np.array([_value(outcome, name) for outcome in outcomes]) for name in names}
-    probes, _ = measured_probes("probes", [[probe for outcome in outcomes for probe in outcome.probes]])
-    is_probed = bool(probes) and bool(np.isnan(columns.get("y_um", np.array([math.nan]))).all())
-    if is_probed:
-        blank = np.full(len(probes), math.nan)
-        columns = {name: np.concatenate([values, blank]) for name, values in columns.items() if name != "y_um"}
-        shown = [number(probe.deformation_um) for probe in probes]
-        columns["y_um"] = np.concatenate([np.full(t_s.size, math.nan), shown])
-        t_s = np.concatenate([t_s, [probe.time_utc_ns / NS for probe in probes]])
-    order = np.argsort(t_s, kind="stable")
-    start_s = t_s[order[0]] if order.size else 0.0
-    return {"t_s": t_s[order] - start_s, **{name: values[order] for name, values in columns.items()}}, is_probed
-
-
-def _value(outcome: Outcome, name: str) -> float:
-    channel = outcome.sample.channels.get(name)
-    return number(channel.mean) if channel is not None and channel.quality == SampleQuality.GOOD else math.nan
 
 
 def _name(effect: Any) -> str:

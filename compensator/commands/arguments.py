@@ -69,6 +69,17 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     _column(parser)
 
 
+def loop(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `loop`."""
+    add = parser.add_argument
+    words = "recordings of a machine, or a folder that contains such folders"
+    add("folder", type=Path, nargs="+", metavar="FOLDER", help=words)
+    words = "for a machine whose service has no loop of its own: what a better model leads to (default adopt)"
+    add("--policy", choices=("propose", "adopt"), default="adopt", help=words)
+    add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
+    _page(parser)
+
+
 def export(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `export`."""
     words = "recordings of one machine, in any order"

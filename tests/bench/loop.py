@@ -39,6 +39,7 @@ from compensator.api.loop import diagnosis_in_process
 from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.demo.offline import probe_of, run_alone, sample_of
+from compensator.events import EventKind
 from compensator.messages import number
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
@@ -55,6 +56,7 @@ WITHIN_MIN, FAIR_MIN = 48 * 60, 36 * 60
 STATE_EVERY = 60
 #: Samples that a killed service misses.
 KILLED_MIN = 3
+KINDS = ("zero", "loop", "diagnosis", "adopt", "plausibility")
 LOOP = '[loop]\npolicy = "adopt"\n'
 
 
@@ -70,7 +72,7 @@ def config_of(week, model):
         probe = f"[probe]\nstd_um = {week.probe_std_um}\nmeasured_max_um = 100.0\nlargest_um = 60.0\n"
     text = f"""
 line = []
-device = []
+device = [{{name = "simulated"}}]
 machine.name = "{week.family}-{week.seed}"
 model.file = "model.toml"
 loss.predict_for_min = 30.0
@@ -115,7 +117,7 @@ def samples_of(week, columns):
             ),
             float(shown[i]),
         )
-        for i in np.flatnonzero(week.running)
+        for i in np.flatnonzero(week.running).tolist()
     ]
 
 
@@ -152,9 +154,10 @@ class Service:
         self._kept, self._state = 0, self.run.state()
 
     def process(self, sample, probe):
-        if len(self.steps) % STATE_EVERY == 0:
+        waits = self.steps and any(is_begin(note) for note in self.steps[-1][2].events)
+        if len(self.steps) - self._kept >= STATE_EVERY and not waits:
             self._kept, self._state = len(self.steps), self.run.state()
-        step = self.run.process(sample, [probe] if probe is not None else [])
+        step = advance(self.run, self.steps[-1][0].seq if self.steps else None, sample, probe)
         self.steps.append((sample, probe, step))
         return step
 
@@ -162,15 +165,29 @@ class Service:
         """Continue from the last state and what is recorded since; return whether every step came out the same."""
         self.run = self._made()
         self.run.restore(self._state)
-        again = [self.run.process(s, [p] if p is not None else []) for s, p, _ in self.steps[self._kept :]]
-        return all(
-            seen(one) == seen(step[2]) and one.outcome.offset == step[2].outcome.offset
-            for one, step in zip(again, self.steps[self._kept :], strict=True)
-        )
+        last = self.steps[self._kept - 1][0].seq if self._kept else None
+        same = True
+        for sample, probe, step in self.steps[self._kept :]:
+            again = advance(self.run, last, sample, probe)
+            same = same and seen(again) == seen(step) and again.outcome.offset == step.outcome.offset
+            last = sample.seq
+        return same
 
     @property
     def last(self):
         return self.steps[-1][2].outcome.offset if self.steps else None
+
+
+def advance(run, last, sample, probe):
+    """Process a sample after the pause before it."""
+    if last is not None and sample.seq > last + 1:
+        run.pause(sample.seq - last - 1)
+    return run.process(sample, [probe] if probe is not None else [])
+
+
+def is_begin(note):
+    """Return whether a diagnosis begins with this event: its result is not in a state yet."""
+    return note.kind == EventKind.LOOP and note.data["step"] == "diagnose"
 
 
 def seen(step):
@@ -233,11 +250,10 @@ def _figures(week):
     diagnoses = Diagnoses(diagnosis_in_process(config), kill_at=(2,))
     service, restarts = looped(config, file, samples, diagnoses)
     steps = [step for _, _, step in service.steps]
-    again = LoopRun(config, file, _recorded(diagnoses))
-    same = all(
-        seen(again.process(sample, [probe] if probe is not None else [])) == seen(step)
-        for sample, probe, step in service.steps
-    )
+    again, last, same = LoopRun(config, file, _recorded(diagnoses)), None, True
+    for sample, probe, step in service.steps:
+        same = same and seen(advance(again, last, sample, probe)) == seen(step)
+        last = sample.seq
     errors = {
         "loop": error_of([step.outcome for step in steps], week.true_um),
         "best": error_of(run_alone(config, parse_model(file, source="base"), healthy), week.healthy_um),
@@ -253,7 +269,7 @@ def _figures(week):
         "spells": [_spell(week, spell, diagnoses, steps, errors, base_sha) for spell in week.spells],
         "changes": _changes(steps, errors),
         "diagnoses": [[key[0], one.verdict, list(one.effects), one.text] for key, one in diagnoses.found.items()],
-        "events": [[s.outcome.sample.seq, n.kind, n.text] for s in steps for n in s.events],
+        "events": [[s.outcome.sample.seq, n.kind, n.text] for s in steps for n in s.events if n.kind in KINDS],
         "reproduced": same,
         "restarts": restarts,
         "diagnose_s": diagnoses.seconds,
@@ -279,7 +295,7 @@ def _changes(steps, errors):
     """Return each change of the model: when, to what, and how the error compares with that of the model before."""
     at = [i for i in range(1, len(steps)) if steps[i].model_sha256 != steps[i - 1].model_sha256]
     found = []
-    for i, end in zip(at, [*at[1:], len(steps)], strict=True):
+    for i, end in zip(at, [*at[1:], len(steps)][: len(at)], strict=True):
         minutes = [step.outcome.sample.seq for step in steps[i:end]]
         new, old = rms(errors["loop"][minutes]), rms(errors[steps[i - 1].model_sha256][minutes])
         first = steps[0].model_sha256
