@@ -164,6 +164,40 @@ class Probe(_Table, frozen=True, kw_only=True):
     match_um: Positive = 1.0
 
 
+class Loop(_Table, frozen=True, kw_only=True):
+    """`[loop]`: the service looks for what its model lacks; without this table it does not.
+
+    `policy`: `propose` asks a person before a better model is adopted, `adopt` adopts it. `at_utc`: time of the nightly
+    diagnosis, UTC; `misfit_h`: one is made at once after the model has been suspected for so long. `record_h`: how
+    much is diagnosed. `shadow_h`, `probes`, `deviations`: what a candidate must show beside the present model, on data
+    after the diagnosis: hours of measured Y or the number of probes, and by how many standard deviations it is better.
+    `watch_h`: how long the model before is compared after an adoption. `memory_mb`, `time_limit_min`: limits of a
+    diagnosis.
+    """
+
+    policy: Literal["off", "propose", "adopt"] = "off"
+    at_utc: Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$")] = "02:00"
+    misfit_h: Annotated[float, Meta(ge=1)] = 6.0
+    record_h: Annotated[float, Meta(ge=6, le=336)] = 36.0
+    shadow_h: Annotated[float, Meta(ge=6, le=168)] = 12.0
+    probes: Annotated[int, Meta(ge=8, le=100)] = 8
+    deviations: Annotated[float, Meta(ge=3, le=20)] = 4.0
+    watch_h: Annotated[float, Meta(ge=24, le=1000)] = 168.0
+    memory_mb: Annotated[float, Meta(ge=256)] = 1500.0
+    time_limit_min: Annotated[float, Meta(ge=1, le=720)] = 120.0
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the service looks for better models."""
+        return self.policy != "off"
+
+    @property
+    def at_min(self) -> int:
+        """Minute of the day of the nightly diagnosis, UTC."""
+        hours, minutes = self.at_utc.split(":")
+        return 60 * int(hours) + int(minutes)
+
+
 class Zenoh(_Table, frozen=True, kw_only=True):
     """`[zenoh]`: where the offset is published. The service listens only on endpoints that are given here.
 
@@ -234,6 +268,7 @@ class Config(_Table, frozen=True, kw_only=True):
     restart: Restart = Restart()
     plausibility: Plausibility | None = None
     probe: Probe | None = None
+    loop: Loop | None = None
 
 
 class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -362,6 +397,10 @@ def _check(config: Config) -> None:
     probe, offset_max = config.probe, config.limits.offset_max_um
     if probe is not None and probe.largest_um > offset_max:
         raise ConfigError(f"probe.largest_um = {probe.largest_um:g}, expected at most offset_max_um = {offset_max:g}")
+    if config.loop is not None and config.loop.is_on and probe is None and "y_um" not in names:
+        raise ConfigError(
+            f"loop.policy = {config.loop.policy!r}: nothing measures Y, expected a channel 'y_um' or the table [probe]"
+        )
     for key in ("t_q_degc", "at_degc"):
         _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key))
     _check_zenoh(config.zenoh)

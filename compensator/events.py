@@ -33,6 +33,10 @@ class EventKind(StrEnum):
     ADOPT = "adopt"
     #: A probe was taken or refused (`ProbeData`).
     PROBE = "probe"
+    #: Result of a diagnosis (`DiagnosisData`).
+    DIAGNOSIS = "diagnosis"
+    #: A decision about the model (`LoopData`).
+    LOOP = "loop"
     #: A device stopped answering, or answers again.
     DEVICE = "device"
     #: The wall clock was set.
@@ -55,6 +59,8 @@ class CommandName(StrEnum):
     BACK = "back"
     #: What a touch probe measured (`ProbeRequest`).
     PROBE = "probe"
+    #: Ends a proposed model.
+    DISMISS = "dismiss"
 
 
 class Note(NamedTuple):
@@ -186,6 +192,8 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
         By how many standard deviations of the difference the other model is better; negative if it is worse.
     effective : float, optional
         Number of independent values that this rests on.
+    ratio : float, optional
+        Root mean square of the changes of the other model's residual over that of the present one's.
     y_moved : bool
         Whether the errors about the zero contradict the verdict, because measured Y has moved by itself.
     offset_change_um : float, optional
@@ -203,8 +211,102 @@ class ComparisonData(_Data, frozen=True, kw_only=True):
     candidate_rms_um: float | None = None
     deviations: float | None = None
     effective: float | None = None
+    ratio: float | None = None
     y_moved: bool = False
     offset_change_um: float | None = None
+
+
+class LoopAction(StrEnum):
+    """Decisions about the model, `step` in the data of such an event."""
+
+    #: A diagnosis begins.
+    DIAGNOSE = "diagnose"
+    #: What the diagnosis found begins to run beside the present model.
+    SHADOW = "shadow"
+    #: Nothing follows from the diagnosis.
+    NOTHING = "nothing"
+    PROPOSE = "propose"
+    #: A proposal does not stand any longer.
+    WITHDRAW = "withdraw"
+    ADOPT = "adopt"
+    BACK = "back"
+    #: The comparison ends without another model.
+    END = "end"
+
+
+class DiagnosisData(_Data, frozen=True, kw_only=True):
+    """What a diagnosis has found, and how that differs from the present model.
+
+    Parameters
+    ----------
+    verdict : str
+        As in `diagnosis.json`; `failed` if there is none.
+    effects : list of str
+        Effects of the candidate, each with its kind and place.
+    candidate_sha256, candidate : str
+        Hash and name of the candidate's model file; empty if there is none.
+    same_effects : bool
+        Whether the present model has the same effects.
+    change_deviations : float, optional
+        If so, by how many standard deviations the parameter that differs most does.
+    in_shadow : bool
+        Whether the candidate is the model in shadow, or differs from it by less than the deviations say.
+    refused : str
+        Why the candidate cannot be used.
+    needs : str
+        What a person has to do.
+    from_utc_ns, to_utc_ns : int
+        What was diagnosed, ns since 1970 UTC.
+    seconds : float
+        How long it took.
+    """
+
+    verdict: str
+    effects: list[str] = []
+    candidate_sha256: str = ""
+    candidate: str = ""
+    same_effects: bool = False
+    change_deviations: float | None = None
+    in_shadow: bool = False
+    refused: str = ""
+    needs: str = ""
+    from_utc_ns: int = 0
+    to_utc_ns: int = 0
+    seconds: float = 0.0
+
+
+class LoopData(_Data, frozen=True, kw_only=True):
+    """A decision about the model, with the figures on which it rests.
+
+    Parameters
+    ----------
+    step : LoopAction
+        The decision.
+    why : str
+        Its reason in a word.
+    role : {"candidate", "before", ""}
+        What the compared model is.
+    model_sha256 : str
+        Hash of its file.
+    effects : list of str
+        Its effects.
+    from_utc_ns, to_utc_ns : int
+        What is diagnosed.
+    since_utc_ns : int
+        When the comparison began.
+    comparison : ComparisonData, optional
+        The comparison at that time.
+    """
+
+    step: LoopAction
+    why: str = ""
+    role: Literal["candidate", "before", ""] = ""
+    model_sha256: str = ""
+    effects: list[str] = []
+    from_utc_ns: int = 0
+    to_utc_ns: int = 0
+    since_utc_ns: int = 0
+    comparison: ComparisonData | None = None
 
 
 class RecordingCode(StrEnum):

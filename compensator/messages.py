@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from importlib import resources
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
@@ -311,6 +311,53 @@ class Probe(Message, frozen=True, kw_only=True):
         return self.measured_um is not None
 
 
+class Candidate(Message, frozen=True, kw_only=True):
+    """What another model makes of the same sample, and how both compare so far, `/candidate`; only with `[loop]`.
+
+    It is published to nobody; the record is between `/estimate` and `/offset` of the same `seq`.
+
+    Parameters
+    ----------
+    model_sha256 : str
+        Hash of its model file.
+    role : {"candidate", "before"}
+        Whether it may be adopted, or is the model from before the last adoption.
+    y_pred_um, y_std_um : float or None
+        Its predicted deformation since the zero and its standard deviation, µm.
+    residual_um, present_residual_um : float or None
+        Measured − predicted, µm: of this model, and of the present one.
+    innovations_um : list of float or None
+        What each compared probe of the sample showed beyond its prediction, µm, in their order.
+    reasons : list of str
+        Its reasons, as in `/offset`.
+    verdict : str
+        On the compared data so far: `better`, `alike`, `worse` or `not_judged`.
+    present_rms_um, candidate_rms_um : float or None
+        Root mean square of measured − predicted Y, µm.
+    deviations : float or None
+        By how many standard deviations of the difference it is better; negative if it is worse.
+    hours : float
+        Hours of usable blocks of measured Y.
+    probes : int
+        Number of compared probes.
+    """
+
+    model_sha256: str
+    role: Literal["candidate", "before"]
+    y_pred_um: float | None
+    y_std_um: float | None
+    residual_um: float | None
+    present_residual_um: float | None
+    innovations_um: list[float | None]
+    reasons: list[str]
+    verdict: str
+    present_rms_um: float | None
+    candidate_rms_um: float | None
+    deviations: float | None
+    hours: float
+    probes: int
+
+
 class ChainPart(msgspec.Struct, frozen=True, kw_only=True):
     """One of the things that a recording opens with, in the first `/chain` message of the file.
 
@@ -400,6 +447,7 @@ MESSAGES: Mapping[str, type[msgspec.Struct]] = {
     "status": Status,
     "probe": Probe,
     "probe_request": ProbeRequest,
+    "candidate": Candidate,
     "chain": Chain,
     "seal": Seal,
 }

@@ -29,8 +29,9 @@ from compensator.service.journal import Journal
 from compensator.service.publisher import Sender, refusal
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import WARM_UP, ModelCandidate, warm_up
+from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import ModelStore, check_model, sha256_of
-from compensator.service.transfer.second_opinion import described, not_judged, refuse_if_worse, second_opinion
+from compensator.service.transfer.second_opinion import described, refuse_if_worse, second_opinion
 
 log = logging.getLogger("compensator")
 

@@ -139,9 +139,9 @@ class Comparison:
         state.first_ns = state.first_ns or now_ns - round(present.sample.period_s * NS)
         state.last_ns = now_ns
         state.probes += [ComparedProbe(now_ns, *pair) for pair in probes]
-        return (self._add_measured(*residuals, number(present.estimate.y_um), now_ns) if is_measured else False) or bool(
-            probes
-        )
+        return (
+            self._add_measured(*residuals, number(present.estimate.y_um), now_ns) if is_measured else False
+        ) or bool(probes)
 
     def set_zero(self) -> None:
         """Begin a new block: Y before and after a zero are not comparable."""
@@ -280,9 +280,8 @@ def _judged(scores: ComparisonData, own: Vector, difference: Vector, deviations:
     elif weighed.deviations <= -deviations and weighed.ratio > 1.0 + WORSE_PART:
         verdict = ComparisonVerdict.WORSE
     y_moved = verdict != ComparisonVerdict.ALIKE and is_larger != (verdict == ComparisonVerdict.WORSE)
-    return changed(
-        scores, verdict=verdict, deviations=weighed.deviations, effective=weighed.effective, y_moved=y_moved
-    )
+    scores = changed(scores, verdict=verdict, y_moved=y_moved, ratio=weighed.ratio)
+    return changed(scores, deviations=weighed.deviations, effective=weighed.effective)
 
 
 def _rms(values: Vector) -> float:

@@ -62,7 +62,8 @@ def second_opinion(
         return not_judged(NotJudged.NO_RECORD, remark=str(error))
     first_ns = found.state.first_ns
     hours = (window.end_ns - first_ns) / (3600 * NS) if first_ns else 0.0
-    return changed(found.verdict(), hours=hours, offset_change_um=None if math.isnan(move_um) else move_um)
+    move = None if math.isnan(move_um) else move_um
+    return changed(found.verdict(), hours=hours, ratio=None, offset_change_um=move)
 
 
 def refuse_if_worse(found: ComparisonData, model: ThermalModel, *, force: bool) -> None:
@@ -171,7 +172,9 @@ def _recorded_zero(step: RecordedStep) -> Zero | None:
 def _compare(found: Comparison, step: RecordedStep, present: Outcome, candidate: Outcome) -> None:
     """Add one sample and its probes."""
     if not is_unusable(present, candidate):
-        found.add(present, candidate, suspected=sensor_suspected(step.offset.reasons if step.offset is not None else ()))
+        found.add(
+            present, candidate, suspected=sensor_suspected(step.offset.reasons if step.offset is not None else ())
+        )
 
 
 def is_unusable(*outcomes: Outcome) -> bool:

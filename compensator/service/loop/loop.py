@@ -1,0 +1,396 @@
+"""The loop: decides when to diagnose, what runs in shadow, and which model comes next.
+
+    idle → diagnosis → shadow → proposed → adopted → watching the model before → idle
+
+At most one other model runs in shadow: before an adoption the candidate, after it the model from before. In both cases
+it replaces the present model once measured Y after its beginning shows clearly that it is better: adopting and going
+back are one rule. No clock, socket or file: a replay of the recorded samples and diagnoses decides the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+
+from compensator.clock import NS
+from compensator.codes import Reason
+from compensator.config import Loop as LoopSettings
+from compensator.errors import ServiceError
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
+from compensator.service.loop.shadow import Role
+from compensator.service.loop.state import Avoided, Compared, LoopState, Running, fresh
+from compensator.service.outcome import Outcome
+from compensator.service.transfer.comparison import BLOCK_MIN, Comparison
+from compensator.service.transfer.second_opinion import described, is_unusable, sensor_suspected
+
+#: A candidate with the effects of the present model must differ from it by so many standard deviations.
+DIFFERS = 4.0
+#: A candidate must be wrong by less than this part of the present model's changes.
+BETTER_PART = 0.95
+#: Least time between two adoptions, and between two diagnoses for a misfit, h.
+ADOPTION_H, MISFIT_AGAIN_H = 24.0, 12.0
+#: What is compared counts for so long, in `shadow_h`, and the least of it, h.
+_REMEMBERED, _REMEMBERED_H = 2.0, 24.0
+#: No decision before no sensor has been suspected for so long, min.
+CLEAN_MIN = BLOCK_MIN
+_HOUR_NS, _DAY_NS = 3600 * NS, 86400 * NS
+_LEFT_OUT = (Reason.OPERATOR_HOLD, Reason.INTERNAL_ERROR, Reason.RESIDUAL_TOO_LARGE)
+_LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartDiagnosis:
+    """A diagnosis is wanted: of what is on record between two times, ns since 1970 UTC."""
+
+    from_utc_ns: int
+    to_utc_ns: int
+    why: str
+
+
+class Loop:
+    """Decides about the models of one machine.
+
+    Parameters
+    ----------
+    settings : config.Loop
+        `[loop]`.
+    period_s : float
+        Length of a sample, s.
+    effects : sequence of str
+        Effects of the present model.
+    state : LoopState, optional
+        State to continue from.
+    """
+
+    def __init__(
+        self, settings: LoopSettings, period_s: float, effects: Sequence[str], state: LoopState | None = None
+    ) -> None:
+        self._settings = settings
+        self._period_s = period_s
+        self.state = state if state is not None else LoopState(effects=list(effects))
+        self.state.effects = list(effects)
+        self._comparison = Comparison(period_s, self.state.comparison)
+
+    @property
+    def wanted(self) -> StartDiagnosis | None:
+        """The diagnosis that is under way, to be begun or begun again; None if there is none."""
+        running = self.state.diagnosis
+        if running is None or running.candidate_sha256:
+            return None
+        return StartDiagnosis(from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why=running.why)
+
+    @property
+    def judged_h(self) -> float:
+        """Time of the usable blocks of measured Y, h."""
+        return self._comparison.judged_h
+
+    # ------------------------------------------------------------------ one sample
+
+    def step(self, present: Outcome, other: Outcome | None) -> list[Note]:
+        """Process a sample.
+
+        Parameters
+        ----------
+        present : Outcome
+            Of the present model, with the compared probes alone.
+        other : Outcome or None
+            That of the shadow; None without one.
+
+        Returns
+        -------
+        list of Note
+            The decisions, each with the figures on which it rests.
+        """
+        state, now_ns, reasons = self.state, present.sample.time_utc_ns, present.offset.reasons
+        minutes, suspected = self._period_s / 60.0, sensor_suspected(reasons)
+        disturbed = suspected or any(reason in _LEFT_OUT for reason in reasons) or is_unusable(present)
+        state.clean_min = 0.0 if disturbed else state.clean_min + minutes
+        misfit = f"{Reason.IMPLAUSIBLE}:model" in reasons
+        state.misfit_min = state.misfit_min + minutes if misfit else 0.0
+        notes: list[Note] = []
+        if other is not None and state.shadow is not None:
+            may_have_changed = self._compare(present, other, suspected=suspected)
+            if not state.exchange:
+                notes += self._decide(now_ns, present, other, judge=may_have_changed)
+        return notes + self._schedule(now_ns)
+
+    def _compare(self, present: Outcome, other: Outcome, *, suspected: bool) -> bool:
+        """Add a sample to the comparison, unless it must not judge; return whether the verdict was made anew."""
+        state, found = self.state, self._comparison
+        if any(note.kind == EventKind.ZERO for note in present.notes):
+            found.set_zero()
+        if suspected:
+            # Before it is suspected a faulty sensor has been wrong for a while: what was compared does not count.
+            if state.comparison.first_ns:
+                self._begin_comparison()
+            return False
+        left_out = (*_LEFT_OUT, Reason.CHANNEL_MISSING)
+        reasons = (*present.offset.reasons, *other.offset.reasons)
+        if is_unusable(present, other) or any(reason.startswith(left_out) for reason in reasons):
+            return False
+        if not found.add(present, other, suspected=False):
+            return False
+        settings = self._settings
+        remembered_h = max(_REMEMBERED * settings.shadow_h, _REMEMBERED_H)
+        oldest_ns = present.sample.time_utc_ns - round(remembered_h * _HOUR_NS)
+        found.forget_before(oldest_ns, 2 * settings.probes)
+        state.verdict = found.verdict(deviations=settings.deviations)
+        return True
+
+    def _begin_comparison(self) -> None:
+        self.state.comparison, self.state.verdict = fresh()
+        self._comparison = Comparison(self._period_s, self.state.comparison)
+
+    # ------------------------------------------------------------------ decisions about the shadow
+
+    def _decide(self, now_ns: int, present: Outcome, other: Outcome, *, judge: bool) -> list[Note]:
+        state, shadow = self.state, self.state.shadow
+        assert shadow is not None
+        if shadow.role == "candidate" and _is_limited(other) and not _is_limited(present):
+            return self._end("limits")
+        if now_ns - shadow.since_utc_ns >= self._settings.watch_h * _HOUR_NS:
+            return self._end("watched" if shadow.role == "before" else "no_difference")
+        if state.clean_min < CLEAN_MIN or not (judge or state.phase == "shadow"):
+            return []
+        verdict = state.verdict.verdict
+        if shadow.role == "before":
+            return self._go_back() if verdict == ComparisonVerdict.BETTER else []
+        if verdict == ComparisonVerdict.WORSE:
+            return self._end("worse")
+        is_better = self._is_enough(now_ns - shadow.since_utc_ns) and _is_clearly_better(state.verdict)
+        if state.phase == "proposed" and verdict != ComparisonVerdict.BETTER:
+            state.phase = "shadow"
+            return [self._note(LoopAction.WITHDRAW, f"the proposal is withdrawn: {described(state.verdict)}")]
+        if state.phase == "shadow" and is_better:
+            return self._accept(now_ns)
+        return []
+
+    def _is_enough(self, since_ns: int) -> bool:
+        """Return whether there is enough to judge a candidate by that has been compared for so long, ns."""
+        found, settings = self.state.verdict, self._settings
+        if since_ns < settings.shadow_h * _HOUR_NS:
+            return False
+        if found.measured_by == "probe":
+            return found.probes >= settings.probes and found.hours >= settings.shadow_h
+        return self.judged_h >= settings.shadow_h
+
+    def _accept(self, now_ns: int) -> list[Note]:
+        """Adopt or propose a candidate."""
+        state = self.state
+        if self._settings.policy == "propose":
+            state.phase = "proposed"
+            text = f"a better model is proposed: {self._named()}; {described(state.verdict)}"
+            return [self._note(LoopAction.PROPOSE, text)]
+        if state.adopted_utc_ns and now_ns - state.adopted_utc_ns < ADOPTION_H * _HOUR_NS:
+            return []
+        state.exchange = "adopt"
+        return [self._note(LoopAction.ADOPT, f"a better model is adopted: {self._named()}; {described(state.verdict)}")]
+
+    def _go_back(self) -> list[Note]:
+        self.state.exchange = "back"
+        text = f"back to the model before, which is better: {self._named()}; {described(self.state.verdict)}"
+        return [self._note(LoopAction.BACK, text)]
+
+    def _end(self, why: str, text: str = "") -> list[Note]:
+        """End the shadow."""
+        state = self.state
+        words = {
+            "limits": "the candidate reaches limits that the present model keeps",
+            "worse": f"the candidate is worse: {described(state.verdict)}",
+            "no_difference": f"the candidate shows no clear difference: {described(state.verdict)}",
+            "watched": f"the adopted model is no longer watched: {described(state.verdict)}",
+            "dismissed": "the candidate is dismissed by an operator",
+        }
+        note = self._note(LoopAction.END, text or words[why], why=why)
+        state.phase, state.shadow, state.exchange = "idle", None, ""
+        self._begin_comparison()
+        return [note]
+
+    def _named(self) -> str:
+        shadow = self.state.shadow
+        assert shadow is not None
+        return f"{shadow.sha256[:12]} with {', '.join(shadow.effects) or 'no added effect'}"
+
+    def _note(self, step: LoopAction, text: str, *, why: str = "") -> Note:
+        state, shadow = self.state, self.state.shadow
+        data = LoopData(
+            step=step,
+            why=why,
+            role=shadow.role if shadow is not None else "",
+            model_sha256=shadow.sha256 if shadow is not None else "",
+            effects=shadow.effects if shadow is not None else [],
+            since_utc_ns=shadow.since_utc_ns if shadow is not None else 0,
+            comparison=state.verdict if shadow is not None else None,
+        )
+        return Note(EventKind.LOOP, text, data.table())
+
+    # ------------------------------------------------------------------ diagnoses
+
+    def _schedule(self, now_ns: int) -> list[Note]:
+        """Begin a diagnosis if it is time."""
+        state, settings = self.state, self._settings
+        at_ns = 60 * settings.at_min * NS
+        night_ns = (now_ns - at_ns) // _DAY_NS * _DAY_NS + at_ns
+        state.night_utc_ns = state.night_utc_ns or night_ns
+        if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN:
+            return []
+        since_last_h = (now_ns - state.diagnosed_utc_ns) / _HOUR_NS
+        if night_ns > state.night_utc_ns:
+            why = "night"
+        elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_h >= MISFIT_AGAIN_H:
+            why = "misfit"
+        else:
+            return []
+        state.night_utc_ns, state.diagnosed_utc_ns = night_ns, now_ns
+        from_ns = now_ns - round(settings.record_h * _HOUR_NS)
+        state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
+        return [self._diagnosis_begins()]
+
+    def _diagnosis_begins(self) -> Note:
+        running = self.state.diagnosis
+        assert running is not None
+        text = f"a diagnosis of the last {(running.to_utc_ns - running.from_utc_ns) / _HOUR_NS:g} h begins"
+        data = LoopData(
+            step=LoopAction.DIAGNOSE, why=running.why, from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns
+        )
+        return Note(
+            EventKind.LOOP, text + (": the model has been suspected" if running.why == "misfit" else ""), data.table()
+        )
+
+    def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
+        """Decide what follows from a diagnosis; a candidate is then warmed up (`shadow_begins`)."""
+        state = self.state
+        running, state.diagnosis = state.diagnosis, None
+        if running is None:
+            return []
+        why = self._why_nothing(found, now_ns)
+        if why:
+            data = LoopData(
+                step=LoopAction.NOTHING, why=why, effects=found.effects, model_sha256=found.candidate_sha256
+            )
+            return [Note(EventKind.LOOP, _nothing_follows(why, found), data.table())]
+        state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256)
+        text = f"a candidate is compared with the present model: {', '.join(found.effects) or 'no added effect'}"
+        data = LoopData(
+            step=LoopAction.SHADOW, role="candidate", model_sha256=found.candidate_sha256, effects=found.effects
+        )
+        return [Note(EventKind.LOOP, text, data.table())]
+
+    def _why_nothing(self, found: DiagnosisData, now_ns: int) -> str:
+        """Return why no candidate follows from a diagnosis; empty if one does."""
+        if found.refused:
+            return "refused"
+        if not found.candidate_sha256:
+            return {"failed": "failed", "adequate": "nothing_found"}.get(found.verdict, "unexplained")
+        if found.same_effects and (found.change_deviations or 0.0) < DIFFERS:
+            return "unchanged"
+        if found.in_shadow and self.state.shadow is not None and self.state.shadow.role == "candidate":
+            return "in_shadow"
+        self.state.avoided = [one for one in self.state.avoided if one.until_utc_ns > now_ns]
+        if any(sorted(one.effects) == sorted(found.effects) for one in self.state.avoided):
+            return "avoided"
+        return ""
+
+    # ------------------------------------------------------------------ between two samples
+
+    def shadow_begins(self, sha256: str, effects: Sequence[str], now_ns: int, role: Role = "candidate") -> None:
+        """Begin to compare another model."""
+        state = self.state
+        state.diagnosis = None
+        state.phase = "shadow" if role == "candidate" else "watching"
+        state.shadow = Compared(sha256=sha256, effects=list(effects), role=role, since_utc_ns=now_ns)
+        state.exchange = ""
+        self._begin_comparison()
+
+    def exchanged(self, now_ns: int, sha256_before: str) -> None:
+        """Go on after the shadow has replaced the present model, whose hash was `sha256_before`."""
+        state, back = self.state, self.state.exchange == "back"
+        assert state.shadow is not None
+        before, state.effects = state.effects, state.shadow.effects
+        if back:
+            self._avoid(before, now_ns)
+            state.phase, state.shadow, state.exchange = "idle", None, ""
+            self._begin_comparison()
+            return
+        state.adopted_utc_ns = now_ns
+        diagnosis = state.diagnosis
+        self.shadow_begins(sha256_before, before, now_ns, "before")
+        state.diagnosis = diagnosis
+
+    def accept(self) -> None:
+        """Adopt the candidate before the next sample: an operator has agreed.
+
+        Raises
+        ------
+        ServiceError
+            If there is none.
+        """
+        shadow = self.state.shadow
+        if shadow is None or shadow.role != "candidate":
+            raise ServiceError("adopt --candidate: there is no candidate now; see `compensator watch`")
+        self.state.exchange = self.state.exchange or "adopt"
+
+    def dismiss(self, now_ns: int) -> list[Note]:
+        """End a candidate: an operator has refused it. Its effects are avoided for some time."""
+        shadow = self.state.shadow
+        if shadow is None or shadow.role != "candidate" or self.state.exchange:
+            return []
+        self._avoid(shadow.effects, now_ns)
+        return self._end("dismissed")
+
+    def model_changed(self, effects: Sequence[str], now_ns: int, *, back: bool = False) -> list[Note]:
+        """Begin anew: an operator has changed the model; a diagnosis under way is of no use."""
+        state = self.state
+        if back:
+            self._avoid(state.effects, now_ns)
+        state.effects, state.diagnosis = list(effects), None
+        return self.give_up("by_hand", "an operator has changed the model") if state.shadow is not None else []
+
+    def give_up(self, why: str, text: str) -> list[Note]:
+        """End the shadow for a cause outside of the loop, or a candidate that could not be warmed up."""
+        self.state.diagnosis = None
+        return self._end(why, text)
+
+    def restarted(self) -> list[Note]:
+        """Go on after the service was away: a diagnosis that was interrupted is begun once more."""
+        state, running = self.state, self.state.diagnosis
+        if running is None:
+            return []
+        if running.attempts > 1:
+            state.diagnosis = None
+            data = LoopData(step=LoopAction.NOTHING, why="interrupted")
+            return [
+                Note(EventKind.LOOP, "a diagnosis was interrupted twice: the next one is made at night", data.table())
+            ]
+        state.diagnosis = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="")
+        return [self._diagnosis_begins()]
+
+    def _avoid(self, effects: Sequence[str], now_ns: int) -> None:
+        until_ns = now_ns + round(self._settings.watch_h * _HOUR_NS)
+        self.state.avoided = [*self.state.avoided, Avoided(effects=list(effects), until_utc_ns=until_ns)]
+
+
+def _is_limited(outcome: Outcome) -> bool:
+    return any(reason.startswith(_LIMITS) for reason in outcome.offset.reasons)
+
+
+def _is_clearly_better(found: ComparisonData) -> bool:
+    if found.verdict != ComparisonVerdict.BETTER or found.present_rms_um is None or found.candidate_rms_um is None:
+        return False
+    return found.ratio is not None and found.ratio <= BETTER_PART
+
+
+def _nothing_follows(why: str, found: DiagnosisData) -> str:
+    effects = ", ".join(found.effects) or "no added effect"
+    words = {
+        "failed": f"the diagnosis failed: {found.needs}",
+        "unexplained": f"the diagnosis explains nothing that can be compensated ({found.verdict}); {found.needs}",
+        "refused": f"the candidate cannot be used: {found.refused}",
+        "nothing_found": "the diagnosis finds nothing that the model lacks",
+        "unchanged": f"the diagnosis finds what the model has: {effects}",
+        "in_shadow": f"the diagnosis finds what is in shadow already: {effects}",
+        "avoided": f"{effects}: the service went back from it, or an operator dismissed it, a short time ago",
+    }
+    return words[why].rstrip("; ")

@@ -1,0 +1,98 @@
+"""What of a record may be diagnosed: the outcomes of the service as a table.
+
+Y is left out where a sensor was suspected or missing, or the offset was held by hand, by an internal error or because
+of the residual; and an hour before a suspicion, in which the fault was there already. Temperatures and other channels
+stay as they were measured: they drive the model throughout.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from compensator.arrays import Vector
+from compensator.clock import NS
+from compensator.codes import Reason
+from compensator.data.table import Table
+from compensator.messages import Offset, Probe, Sample, number
+from compensator.service.outcome import Outcome
+from compensator.service.transfer.second_opinion import sensor_suspected
+
+#: Y is left out for so long before a sensor was suspected, h.
+BEFORE_SUSPICION_H = 1.0
+_LEFT_OUT = (
+    Reason.T_Q_MISSING,
+    Reason.AT_MISSING,
+    Reason.T_Q_AT_EXCHANGED,
+    Reason.OPERATOR_HOLD,
+    Reason.INTERNAL_ERROR,
+    Reason.RESIDUAL_TOO_LARGE,
+)
+
+
+def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
+    """Return outcomes as the table of a diagnosis; the time counts from 1970.
+
+    Where no displacement sensor measured Y, `y_um` is what the probes showed, each in a row of its own time.
+    """
+    return table_of_rows(
+        [(outcome.sample, outcome.offset) for outcome in record],
+        [probe for outcome in record for probe in outcome.probes],
+        name,
+    )
+
+
+def table_of_rows(rows: Sequence[tuple[Sample, Offset | None]], probes: Sequence[Probe], name: str) -> Table:
+    """Return samples with their offsets, and decided probes, as the table of a diagnosis; see `usable_table`."""
+    names = dict.fromkeys(channel for sample, _ in rows for channel in sample.channels)
+    t_s = np.array([sample.time_utc_ns / NS for sample, _ in rows])
+    columns = {channel: np.array([_mean(sample, channel) for sample, _ in rows], dtype=np.float64) for channel in names}
+    left_out = _left_out_s(rows)
+    y = columns.get("y_um", np.full(t_s.size, np.nan))
+    if left_out.size:
+        y = np.where(np.isin(t_s, left_out), np.nan, y)
+    columns["y_um"] = y
+    if not np.isfinite(y).any():
+        t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows))
+    return Table(name=name, t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
+
+
+def _mean(sample: Sample, channel: str) -> float:
+    found = sample.channels.get(channel)
+    return number(found.mean) if found is not None and found.is_good else math.nan
+
+
+def _left_out_s(rows: Sequence[tuple[Sample, Offset | None]]) -> Vector:
+    """Return the times of samples whose Y must not be used, s."""
+    times, left_out = np.array([sample.time_utc_ns / NS for sample, _ in rows]), np.zeros(len(rows), dtype=bool)
+    for i, (_, offset) in enumerate(rows):
+        reasons = offset.reasons if offset is not None else [Reason.INTERNAL_ERROR]
+        if sensor_suspected(reasons):
+            left_out |= (times > times[i] - 3600.0 * BEFORE_SUSPICION_H) & (times <= times[i])
+        left_out[i] |= any(reason.startswith(_LEFT_OUT) for reason in reasons)
+    return times[left_out]
+
+
+def _usable(probes: Sequence[Probe], left_out: Vector, rows: Sequence[tuple[Sample, Offset | None]]) -> list[Probe]:
+    """Return the taken probes of the feature that has most, outside of what is left out."""
+    period_s = rows[0][0].period_s if rows else 0.0
+    found = []
+    for probe in probes:
+        at_s = probe.time_utc_ns / NS
+        if probe.taken and not np.any((left_out - period_s <= at_s) & (at_s <= left_out)):
+            found.append(probe)
+    counts = Counter(probe.feature for probe in found)
+    feature = counts.most_common(1)[0][0] if counts else ""
+    return [probe for probe in found if probe.feature == feature]
+
+
+def _with_probes(t_s: Vector, columns: dict[str, Vector], probes: Sequence[Probe]) -> tuple[Vector, dict[str, Vector]]:
+    blank, times = np.full(len(probes), np.nan), [probe.time_utc_ns / NS for probe in probes]
+    columns = {name: np.concatenate([values, blank]) for name, values in columns.items()}
+    columns["y_um"][t_s.size :] = [number(probe.deformation_um) for probe in probes]
+    t_s = np.concatenate([t_s, times])
+    order = np.argsort(t_s, kind="stable")
+    return t_s[order], {name: values[order] for name, values in columns.items()}

@@ -1,0 +1,208 @@
+"""A machine's service and loop over recorded or simulated samples, without devices or files.
+
+The same compensation, shadow and loop as in the service. A diagnosis is a function that is called when the loop wants
+one; its result counts from the next sample on.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import msgspec
+
+from compensator.clock import NS
+from compensator.config import Config
+from compensator.errors import CompensatorError, DataError
+from compensator.events import EventKind, Note
+from compensator.messages import Candidate, Sample
+from compensator.service.compensation import Compensation, Outcome, model_of, slowest_min
+from compensator.service.loop.core import ModelLoop, exchange_note, warmed_on
+from compensator.service.loop.weighing import FAILED, Diagnosed, effect_names
+from compensator.service.probing import ReceivedProbe
+from compensator.service.transfer.candidate import WARM_UP
+
+__all__ = ["Diagnosed", "LoopRun", "LoopStep"]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopStep:
+    """What a sample gave.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        Of the present model.
+    candidate : Candidate or None
+        Record of the model in shadow; None without one.
+    events : tuple of Note
+        Events with this sample: those of the outcome, diagnoses, decisions and exchanges.
+    model_sha256 : str
+        Hash of the present model's file.
+    """
+
+    outcome: Outcome
+    candidate: Candidate | None
+    events: tuple[Note, ...]
+    model_sha256: str
+
+
+class _Saved(msgspec.Struct, kw_only=True):
+    """State of a run."""
+
+    model: bytes
+    calibrated: bytes
+    compensation: bytes
+    attachments: dict[str, bytes]
+    record: list[Outcome]
+
+
+class LoopRun:
+    """Runs the service and the loop of one machine.
+
+    Parameters
+    ----------
+    config : Config
+        Settings, with `[loop]`.
+    model : bytes
+        File of the calibrated model.
+    diagnose : callable
+        Returns what a diagnosis of the outcomes on record with a model file gives. All outcomes of the time that is
+        diagnosed are handed over; `record.usable_table` leaves out what must not be used. An exception is a diagnosis
+        that failed.
+
+    Raises
+    ------
+    CompensatorError
+        If the model cannot be used, or there is no `[loop]`.
+    """
+
+    def __init__(self, config: Config, model: bytes, diagnose: Callable[[Sequence[Outcome], bytes], Diagnosed]) -> None:
+        self._config = config
+        self._diagnose = diagnose
+        self._calibrated = self._data = model
+        self._compensation = Compensation(config, model_of(config, model, source="model"))
+        self._core = ModelLoop(config, self._compensation.model, {})
+        self._record: deque[Outcome] = deque()
+        self._found: Diagnosed | None = None
+
+    @property
+    def compensation(self) -> Compensation:
+        """The present compensation."""
+        return self._compensation
+
+    @property
+    def phase(self) -> str:
+        """What the shadow is for: `idle`, `shadow`, `proposed`, `watching`."""
+        return self._core.state.phase
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Effects of the present model."""
+        return tuple(effect_names(self._compensation.model))
+
+    def process(self, sample: Sample, probes: Sequence[ReceivedProbe] = ()) -> LoopStep:
+        """Process a sample with the probes that arrived since the last one."""
+        notes = self._between(self._compensation.status.time_utc_ns)
+        self._compensation.receive_probes(probes)
+        outcome = self._compensation.process(sample)
+        followed = self._core.process(outcome)
+        self._keep(outcome)
+        wanted = self._core.loop.wanted
+        if wanted is not None:
+            record = [one for one in self._record if one.sample.time_utc_ns > wanted.from_utc_ns]
+            self._found = self._diagnosed(record)
+        events = (*notes, *outcome.notes, *followed.notes)
+        return LoopStep(outcome, followed.candidate, events, outcome.offset.model_sha256)
+
+    def pause(self, samples: int | None) -> None:
+        """Account for samples that were not measured, as after a restart; see `Compensation.pause`."""
+        self._compensation.pause(samples)
+        self._core.pause(samples)
+
+    def accept(self) -> None:
+        """Adopt the candidate in shadow before the next sample, as an operator can.
+
+        Raises
+        ------
+        ServiceError
+            If there is none.
+        """
+        self._core.loop.accept()
+
+    def dismiss(self) -> tuple[Note, ...]:
+        """End the candidate, as an operator can."""
+        return tuple(self._core.loop.dismiss(self._compensation.status.time_utc_ns))
+
+    # ------------------------------------------------------------------ state
+
+    def state(self) -> bytes:
+        """Return what a kill now would leave: a result of a diagnosis that has not counted yet is lost."""
+        saved = _Saved(
+            model=self._data,
+            calibrated=self._calibrated,
+            compensation=self._compensation.state(),
+            attachments=self._core.attachments(),
+            record=list(self._record),
+        )
+        return msgspec.msgpack.encode(saved)
+
+    def restore(self, state: bytes) -> None:
+        """Start again from a state; `pause` then accounts for the time since.
+
+        Raises
+        ------
+        CompensatorError
+            If it cannot be used; nothing is changed then.
+        """
+        try:
+            saved = msgspec.msgpack.decode(state, type=_Saved)
+        except msgspec.MsgspecError as error:
+            raise DataError(f"state of a run: {error}") from error
+        compensation = Compensation(self._config, model_of(self._config, saved.model, source="state of a run"))
+        compensation.restore(saved.compensation)
+        core = ModelLoop(self._config, compensation.model, saved.attachments)
+        core.loop.restarted()
+        self._compensation, self._core = compensation, core
+        self._data, self._calibrated = saved.model, saved.calibrated
+        self._record, self._found = deque(saved.record), None
+
+    # ------------------------------------------------------------------ the loop
+
+    def _between(self, now_ns: int) -> list[Note]:
+        """Do what follows from the last sample before the next one."""
+        core, notes = self._core, list[Note]()
+        core.drop_ended()
+        if core.state.exchange:
+            notes.append(self._exchange(now_ns))
+        found, self._found = self._found, None
+        if found is not None:
+            weighed = core.weigh(found, calibrated=self._calibrated, present=self._compensation.model)
+            notes.append(Note(EventKind.DIAGNOSIS, found.text, weighed.data.table()))
+            notes += core.receive(weighed.data, now_ns)
+            running = core.state.diagnosis
+            if running is not None and weighed.candidate is not None:
+                model = model_of(self._config, weighed.candidate, source="candidate")
+                core.begin_shadow(warmed_on(self._config, model, list(self._record)), weighed.candidate, now_ns)
+        return notes
+
+    def _exchange(self, now_ns: int) -> Note:
+        old, action, verdict = self._compensation, self._core.state.exchange, self._core.state.verdict
+        self._compensation, self._data = self._core.exchange(old, self._data, now_ns)
+        return exchange_note(action, old, self._compensation, verdict)
+
+    def _diagnosed(self, record: Sequence[Outcome]) -> Diagnosed:
+        try:
+            return self._diagnose(record, self._calibrated)
+        except CompensatorError as error:
+            return Diagnosed(FAILED, (), None, f"the diagnosis failed: {error}", needs=str(error))
+
+    def _keep(self, outcome: Outcome) -> None:
+        """Keep what a diagnosis or a warm-up needs."""
+        assert self._config.loop is not None
+        self._record.append(outcome)
+        warm_up_h = WARM_UP * slowest_min(self._compensation.model) / 60.0
+        oldest_ns = outcome.sample.time_utc_ns - round(max(self._config.loop.record_h, warm_up_h) * 3600 * NS)
+        while self._record[0].sample.time_utc_ns <= oldest_ns:
+            self._record.popleft()

@@ -1,0 +1,94 @@
+"""The shadow: another model on the same live samples, published to nobody.
+
+It passes the same pauses, zeros and probes as the present compensation. Its own limits, holds and offsets do not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from compensator.codes import ProbeCode
+from compensator.config import Config
+from compensator.events import ComparisonData, EventKind
+from compensator.messages import SCHEMA, Candidate, Probe
+from compensator.service.compensation import Compensation, Outcome, model_of
+from compensator.service.probing import ReceivedProbe
+
+Role = Literal["candidate", "before"]
+
+
+@dataclass(slots=True)
+class Shadow:
+    """Another model, with its compensation after the last sample.
+
+    Parameters
+    ----------
+    compensation : Compensation
+        Its compensation.
+    data : bytes
+        Its model file.
+    """
+
+    compensation: Compensation
+    data: bytes
+
+    @classmethod
+    def of(cls, config: Config, data: bytes, state: bytes) -> Shadow:
+        """Return the shadow of a recording, from its model file and state.
+
+        Raises
+        ------
+        CompensatorError
+            If they cannot be used with the configuration.
+        """
+        compensation = Compensation(config, model_of(config, data, source="candidate.toml"))
+        compensation.restore(state)
+        return cls(compensation, data)
+
+    def process(self, outcome: Outcome) -> tuple[Outcome, Outcome]:
+        """Process a sample of the present compensation.
+
+        Returns
+        -------
+        Outcome, Outcome
+            The present one's with the compared probes alone, and the shadow's.
+        """
+        for note in outcome.notes:
+            if note.kind == EventKind.ZERO:
+                self.compensation.zero(note.data["mode"])
+        probes = tuple(probe for probe in outcome.probes if _is_compared(probe))
+        received = [ReceivedProbe.of(probe, is_checked=True) for probe in probes]
+        self.compensation.receive_probes([probe for probe in received if probe is not None])
+        return replace(outcome, probes=probes), self.compensation.process(outcome.sample)
+
+
+def _is_compared(probe: Probe) -> bool:
+    """Return whether a probe passed the checks against what was published, which only the present model can make."""
+    return probe.is_read and (probe.taken or probe.code == ProbeCode.OUTLIER)
+
+
+def candidate_message(
+    present: Outcome, other: Outcome, role: Role, verdict: ComparisonData, judged_h: float, probes: int
+) -> Candidate:
+    """Return the message of a sample."""
+    return Candidate(
+        schema=SCHEMA,
+        machine=present.sample.machine,
+        seq=present.sample.seq,
+        time_utc_ns=present.sample.time_utc_ns,
+        model_sha256=other.offset.model_sha256,
+        role=role,
+        y_pred_um=other.estimate.y_pred_um,
+        y_std_um=other.estimate.y_std_um,
+        residual_um=other.estimate.residual_um,
+        present_residual_um=present.estimate.residual_um,
+        innovations_um=[probe.innovation_um for probe in other.probes],
+        reasons=other.offset.reasons,
+        verdict=verdict.verdict,
+        present_rms_um=verdict.present_rms_um,
+        candidate_rms_um=verdict.candidate_rms_um,
+        deviations=verdict.deviations,
+        hours=judged_h,
+        probes=probes,
+    )

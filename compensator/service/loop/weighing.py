@@ -1,0 +1,187 @@
+"""What follows from the result of a diagnosis: the candidate, its effects, and how it differs from the present model.
+
+A diagnosis starts from the calibrated model, never from an extension, so an effect that has ended is found as one that
+has begun. The candidate is that model with the effects that can be deployed, or, where nothing is found, that model
+itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from msgspec.structs import replace
+
+from compensator.config import Config
+from compensator.errors import CompensatorError, ModelError
+from compensator.events import DiagnosisData
+from compensator.model.effects import Effect
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.compensation import Compensation, model_of
+from compensator.service.loop.loop import DIFFERS
+
+#: Verdict of a diagnosis that ended without a result.
+FAILED = "failed"
+_EXPLAINING = ("explained", "partly_explained")
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosed:
+    """What a diagnosis gave.
+
+    Parameters
+    ----------
+    verdict : str
+        As in `diagnosis.json`, or `failed`.
+    effects : tuple of str
+        Kind and place of what can be deployed, such as `input:coolant_degc`.
+    model : bytes or None
+        File of the extended model; None if there is nothing to deploy.
+    text : str
+        One sentence for people.
+    needs : str
+        What a person has to do.
+    """
+
+    verdict: str
+    effects: tuple[str, ...]
+    model: bytes | None
+    text: str
+    needs: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Weighed:
+    """A diagnosis for the recording, and the candidate's model file; None if there is no candidate."""
+
+    data: DiagnosisData
+    candidate: bytes | None
+
+
+def weigh(
+    found: Diagnosed, config: Config, *, calibrated: bytes, present: ThermalModel, shadow: ThermalModel | None
+) -> Weighed:
+    """Return the candidate that follows from a diagnosis, checked, and its differences.
+
+    Parameters
+    ----------
+    found : Diagnosed
+        Result of the diagnosis of the calibrated model.
+    config : Config
+        Settings of the service.
+    calibrated : bytes
+        Model file of the configuration, or the last that a person adopted.
+    present, shadow : ThermalModel
+        The present model, and the one in shadow.
+    """
+    base = model_of(config, calibrated, source="calibrated model")
+    data = found.model if found.verdict in _EXPLAINING and found.effects else None
+    if not found.effects and found.verdict != FAILED and present.sha256 != base.sha256:
+        data = calibrated
+    plain = DiagnosisData(verdict=found.verdict, effects=list(found.effects), needs=found.needs or found.text)
+    if data is None:
+        return Weighed(plain, None)
+    try:
+        model = _checked(config, data, base)
+    except CompensatorError as error:
+        return Weighed(replace(plain, refused=str(error)), None)
+    same, change = difference(model, present)
+    in_shadow = False
+    if shadow is not None:
+        alike, other_change = difference(model, shadow)
+        in_shadow = model.sha256 == shadow.sha256 or (alike and other_change < DIFFERS)
+    effects = effect_names(model)
+    if same and model.sha256 == base.sha256:
+        change = 0.0
+    weighed = _with(
+        plain,
+        effects=effects,
+        candidate_sha256=model.sha256,
+        candidate=model.name,
+        same_effects=same,
+        change_deviations=min(change, 1e9) if same else None,
+        in_shadow=in_shadow,
+    )
+    return Weighed(weighed, data)
+
+
+def effect_names(model: ThermalModel) -> list[str]:
+    """Return the effects of a model, each by its kind and place."""
+    return [name_of(effect) for effect in model.effects]
+
+
+def name_of(effect: Effect) -> str:
+    """Return kind and place of an effect.
+
+    Examples
+    --------
+    >>> from compensator.model.effects import effect_from
+    >>> name_of(effect_from("gain", {"path": "DTF", "change": 0.1}))
+    'gain:DTF'
+    """
+    channels = dict.fromkeys(effect.channels)
+    return ":".join(filter(None, (effect.kind, effect.path, "+".join(channels))))
+
+
+def difference(model: ThermalModel, other: ThermalModel) -> tuple[bool, float]:
+    """Return whether two models have the same effects, and by how many standard deviations their parameters differ.
+
+    Of the parameters that have a standard error in both; infinite where an effect has none and the parameters differ.
+    """
+    own, others = ({name_of(effect): effect for effect in one.effects} for one in (model, other))
+    if own.keys() != others.keys():
+        return False, math.inf
+    return True, max((_change(effect, others[name]) for name, effect in own.items()), default=0.0)
+
+
+def _change(effect: Effect, other: Effect) -> float:
+    """Return by how many standard deviations the parameter of an effect that differs most does."""
+    tables, largest, compared = (effect.to_table(), other.to_table()), 0.0, False
+    for name in effect.std.keys() & other.std.keys():
+        values = [_numbers(table.get(name)) for table in tables]
+        errors = [_numbers(one.std[name]) for one in (effect, other)]
+        if not values[0] or len({len(each) for each in (*values, *errors)}) > 1:
+            continue
+        for a, b, e, f in zip(*values, *errors, strict=True):
+            std = math.hypot(e, f)
+            largest, compared = max(largest, abs(a - b) / std if std > 0.0 else 0.0), True
+    if compared:
+        return largest
+    plain = [{key: value for key, value in table.items() if key not in ("std", "explanation")} for table in tables]
+    return 0.0 if plain[0] == plain[1] else math.inf
+
+
+def _numbers(value: Any) -> list[float]:
+    """Return the numbers of a parameter: one, or those of a list or of lists."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return [float(value)]
+    if isinstance(value, (Mapping, str)) or not isinstance(value, Iterable):
+        return []
+    return [number for item in value for number in _numbers(item)]
+
+
+def _checked(config: Config, data: bytes, base: ThermalModel) -> ThermalModel:
+    """Return a candidate that is the calibrated model with effects that can be deployed, and nothing else."""
+    model = model_of(config, data, source="candidate")
+    Compensation(config, model)  # refuses an effect of a channel that is not configured
+    for effect in model.effects:
+        if not effect.deployable:
+            raise ModelError(f"candidate: {name_of(effect)} cannot be deployed")
+    if _foundation(model, len(base.effects)) != _foundation(base, len(base.effects)):
+        raise ModelError("candidate: its paths are not those of the calibrated model; a person has to calibrate it")
+    return model
+
+
+def _foundation(model: ThermalModel, effects: int) -> tuple[Any, ...]:
+    """Return what a diagnosis leaves as it is: paths, estimator, validity, and the effects that were there before."""
+    first = [effect.to_table() for effect in model.effects[:effects]]
+    paths = (model.ttf, model.dtf, model.tdtf, model.alternatives)
+    return (model.kind, model.period_s, model.inputs, *paths, model.estimator, model.validity, first)
+
+
+def _with(data: DiagnosisData, **changes: Any) -> DiagnosisData:
+    from msgspec.structs import replace
+
+    return replace(data, **changes)

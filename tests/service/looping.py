@@ -1,0 +1,113 @@
+"""A machine for the loop without devices: an undeclared effect of the coolant that begins and ends."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from compensator.config import Config
+from compensator.events import Note
+from compensator.messages import Sample
+from compensator.model.effects import effect_from
+from compensator.model.model_file import parse_model
+from compensator.model.model_writer import dump_model
+from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
+from compensator.service.loop.weighing import effect_names
+from compensator.service.outcome import Outcome
+from tests.service.records import QUILL, sample
+from tests.service.simulated import config
+from tests.service.test_restart import QUILL as QUILL_FILE
+
+DAY = 1440
+LIMITS = {
+    "offset_max_um": 200.0,
+    "offset_rate_max_um_per_min": 8.0,
+    "validity": {"t_q_degc": [0.0, 80.0], "at_degc": [0.0, 40.0]},
+}
+
+
+def settings(**changes: Any) -> Config:
+    """The usual configuration, with a loop that adopts."""
+    return config(**{"loop": {"policy": "adopt"}, "limits": LIMITS, **changes})
+
+
+def extended(gain: float = 3.0, std: float = 0.05, *, tau_min: float = 60.0) -> bytes:
+    """The published model with the effect of the coolant."""
+    table = {"channel": "coolant_degc", "curve": "linear", "tau_min": [tau_min], "gain": [gain], "delay_min": 5.0}
+    effect = dataclasses.replace(effect_from("input", table), std={"gain": [std], "tau_min": [1.0]})
+    model = parse_model(QUILL_FILE, source="test")
+    return dump_model(dataclasses.replace(model, effects=(effect,), provenance={})).encode()
+
+
+def shown(model: bytes | None, verdict: str = "explained") -> Diagnosed:
+    """A diagnosis that has found a model."""
+    effects = tuple(effect_names(parse_model(model, source="test"))) if model is not None else ()
+    return Diagnosed(verdict, effects, model, "a diagnosis", needs="")
+
+
+def machine(
+    samples: int,
+    acts: Callable[[int], float] = lambda i: 1.0,
+    *,
+    seed: int = 1,
+    noise_um: float = 0.4,
+    more: Callable[[int], float] = lambda i: 0.0,
+    change: Callable[[int, dict[str, float]], None] = lambda i, values: None,
+) -> Iterator[Sample]:
+    """Samples of a working machine whose coolant acts on Y by 3 µm/K, as much as `acts` says."""
+    rng = np.random.default_rng(seed)
+    assert QUILL.ttf is not None and QUILL.tdtf is not None
+    t = np.arange(samples)
+    heat = np.where((t // 60) % 3 == 1, 80.0, 0.0) * (0.5 + 0.5 * ((t // 180) % 2))
+    at = 20.0 + 0.8 * np.sin(t / 200.0)
+    t_q = at + QUILL.ttf.sampled.response(heat) + 0.02 * rng.normal(size=samples)
+    coolant = 22.0 + 1.5 * np.sin(t / 90.0) + 0.8 * np.sin(t / 37.0)
+    lagged, state, keep = np.zeros(samples), 0.0, math.exp(-1.0 / 60.0)
+    for i in range(samples):
+        state = keep * state + (1.0 - keep) * (coolant[max(i - 5, 0)] - coolant[0])
+        lagged[i] = state
+    y = QUILL.dtf.sampled.response(heat) + QUILL.tdtf.sampled.response(at - at[0]) + noise_um * rng.normal(size=samples)
+    for i in range(samples):
+        values = {
+            "t_q_degc": float(t_q[i]),
+            "at_degc": float(at[i]),
+            "y_um": float(y[i] + 3.0 * acts(i) * lagged[i] + more(i)),
+            "coolant_degc": float(coolant[i]),
+        }
+        change(i, values)
+        yield sample(i, values)
+
+
+class Night:
+    """Stands in for the diagnosis: gives what it is told, and keeps what it was asked."""
+
+    def __init__(self, *found: Diagnosed | Exception) -> None:
+        self.found = list(found)
+        self.asked: list[tuple[int, bytes]] = []
+
+    def __call__(self, record: Sequence[Outcome], model: bytes) -> Diagnosed:
+        self.asked.append((len(record), model))
+        found = self.found.pop(0) if len(self.found) > 1 else self.found[0]
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+
+def run(loop: LoopRun, samples: Iterator[Sample], count: int = 10**9) -> list[LoopStep]:
+    """Run some samples through a loop."""
+    return [loop.process(one) for _, one in zip(range(count), samples, strict=False)]
+
+
+def decisions(steps: Sequence[LoopStep]) -> list[tuple[int, str, str]]:
+    """Return each decision: number of the sample, step and reason."""
+    notes: list[tuple[int, Note]] = [(step.outcome.sample.seq, note) for step in steps for note in step.events]
+    return [(seq, note.data["step"], note.data.get("why", "")) for seq, note in notes if note.kind == "loop"]
+
+
+def errors(steps: Sequence[LoopStep]) -> np.ndarray:
+    """Return measured Y plus the offset at each sample, µm."""
+    return np.array([step.outcome.estimate.y_um + step.outcome.offset.y_offset_um for step in steps])
