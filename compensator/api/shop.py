@@ -18,7 +18,7 @@ from compensator.api.loop import diagnosis_in_process
 from compensator.clock import NS
 from compensator.config import Config, Loop
 from compensator.errors import CompensatorError, DataError
-from compensator.events import CommandName, EventKind, LoopStep, Note, command_of
+from compensator.events import CommandName, EventKind, LoopAction, Note, command_of
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
 from compensator.recording.container import Container
 from compensator.recording.reading import in_order, recordings_in
@@ -152,7 +152,7 @@ class _Summary:
         self._times = [0, 0]
         self._left: deque[tuple[int, float]] = deque()
         self._probed: deque[tuple[int, float]] = deque()
-        self._counts = dict.fromkeys(LoopStep, 0)
+        self._counts = dict.fromkeys(LoopAction, 0)
         self._diagnoses = 0
         self._found: tuple[str, ...] = ()
         self._effects: tuple[str, ...] = ()
@@ -186,15 +186,15 @@ class _Summary:
                 self._add_decision(data)
 
     def _add_decision(self, data: Any) -> None:
-        step, effects = LoopStep(data["step"]), tuple(data.get("effects", ()))
+        step, effects = LoopAction(data["step"]), tuple(data.get("effects", ()))
         self._counts[step] += 1
-        if step == LoopStep.SHADOW:
+        if step == LoopAction.SHADOW:
             self._found = effects
-        if step == LoopStep.PROPOSE:
+        if step == LoopAction.PROPOSE:
             self._proposed = effects
-        elif step in (LoopStep.WITHDRAW, LoopStep.ADOPT, LoopStep.END):
+        elif step in (LoopAction.WITHDRAW, LoopAction.ADOPT, LoopAction.END):
             self._proposed = ()
-        if step in (LoopStep.ADOPT, LoopStep.BACK):
+        if step in (LoopAction.ADOPT, LoopAction.BACK):
             self._effects = effects
 
     @property
@@ -228,8 +228,8 @@ class _Summary:
             found=self._found,
             proposed=self._proposed,
             diagnoses=self._diagnoses,
-            adopted=self._counts[LoopStep.ADOPT],
-            gone_back=self._counts[LoopStep.BACK],
+            adopted=self._counts[LoopAction.ADOPT],
+            gone_back=self._counts[LoopAction.BACK],
             needs=needs,
             steps=tuple(self._steps),
         )

@@ -74,16 +74,19 @@ def probe_of(shown_um: float, offset: Offset | None, time_utc_ns: int) -> Receiv
     return ReceivedProbe(request=request, received_utc_ns=time_utc_ns)
 
 
-def run_alone(config: Config, model: ThermalModel, samples: Sequence[tuple[Sample, float]]) -> list[Outcome]:
+def run_alone(config: Config, model: ThermalModel, samples: Sequence[tuple[Sample, float, bool]]) -> list[Outcome]:
     """Run a model over samples without a loop.
 
     Parameters
     ----------
-    samples : sequence of (Sample, float)
-        Each with what a probe before it shows, µm; NaN without one.
+    samples : sequence of (Sample, float, bool)
+        Each with what a probe before it shows, µm, NaN without one, and whether a person sets a new zero before it.
     """
     compensation, outcomes = Compensation(config, model), list[Outcome]()
-    for sample, shown_um in samples:
+    for sample, shown_um, is_zero in samples:
+        if is_zero:
+            compensation.resume()
+            compensation.zero("warm")
         if outcomes:
             compensation.pause(sample.seq - outcomes[-1].sample.seq - 1)
         if math.isfinite(shown_um):

@@ -59,8 +59,8 @@ def fleet_table(rows: Sequence[FleetRow]) -> Table:
         for row in rows
     ]
     note = (
-        "Error: measured Y with the offset applied, or what touch probes found, in the last 24 h; with the model alone → "
-        "with the loop."
+        "Error: measured Y with the offset applied, or what touch probes found, in the last 24 h; with the model alone "
+        "→ with the loop."
     )
     return Table(title="Machines", head=head, rows=cells, note=note)
 

@@ -15,8 +15,8 @@ from compensator.events import (
     ComparisonData,
     DiagnosisData,
     EventKind,
+    LoopAction,
     LoopData,
-    LoopStep,
     command_of,
     data_of,
 )
@@ -34,13 +34,13 @@ _BY_LOOP, _BY_OPERATOR = "the loop", "an operator"
 _NS = 1e-9
 #: Steps in words; those of every night are counted.
 WORDS: Mapping[str, str] = {
-    LoopStep.SHADOW: "candidate begins in shadow",
-    LoopStep.PROPOSE: "proposed",
-    LoopStep.WITHDRAW: "proposal withdrawn",
-    LoopStep.ADOPT: "adopted",
-    LoopStep.BACK: "gone back",
-    LoopStep.END: "comparison ended",
-    LoopStep.NOTHING: "nothing follows",
+    LoopAction.SHADOW: "candidate begins in shadow",
+    LoopAction.PROPOSE: "proposed",
+    LoopAction.WITHDRAW: "proposal withdrawn",
+    LoopAction.ADOPT: "adopted",
+    LoopAction.BACK: "gone back",
+    LoopAction.END: "comparison ended",
+    LoopAction.NOTHING: "nothing follows",
     "refused": "refused",
 }
 
@@ -54,7 +54,7 @@ class Step:
     at_s : float
         When, s since 1970 UTC.
     what : str
-        A `LoopStep`, or `refused`.
+        A `LoopAction`, or `refused`.
     text : str
         The event in one line.
     model_sha256 : str
@@ -130,7 +130,7 @@ class Story:
             effects=tuple(found.effects),
             comparison=found.comparison,
         )
-        self._decided = step if found.step in (LoopStep.ADOPT, LoopStep.BACK) else self._decided
+        self._decided = step if found.step in (LoopAction.ADOPT, LoopAction.BACK) else self._decided
         self._append(step)
 
     def _add_exchange(self, event: Event) -> None:
@@ -146,6 +146,7 @@ class Story:
                 what=str(data.get("action", CommandName.ADOPT)) if data.get("ok") is True else "refused",
                 text=event.text,
                 model_sha256=str(data.get("new_sha256", "")),
+                effects=tuple(map(str, data.get("effects", ()))),
                 by=self._sender or _BY_OPERATOR,
                 comparison=comparison.comparison if comparison is not None else None,
             )
@@ -154,14 +155,14 @@ class Story:
 
     def _append(self, step: Step) -> None:
         self.counts[step.what] += 1
-        if step.what != LoopStep.DIAGNOSE:
+        if step.what != LoopAction.DIAGNOSE:
             self.steps = [*self.steps[1 - STEPS :], step]
 
 
 class _Compared(LoopData, frozen=True, kw_only=True):
     """The part of an exchange's data that a decision has, too."""
 
-    step: LoopStep = LoopStep.ADOPT
+    step: LoopAction = LoopAction.ADOPT
 
 
 def figures_of(story: Story) -> dict[str, object]:
@@ -171,10 +172,10 @@ def figures_of(story: Story) -> dict[str, object]:
     return {
         "models_story": {
             "diagnoses": sum(story.diagnoses.values()),
-            "in_shadow": story.counts[LoopStep.SHADOW],
-            "proposed": story.counts[LoopStep.PROPOSE],
-            "adopted": story.counts[LoopStep.ADOPT],
-            "gone_back": story.counts[LoopStep.BACK],
+            "in_shadow": story.counts[LoopAction.SHADOW],
+            "proposed": story.counts[LoopAction.PROPOSE],
+            "adopted": story.counts[LoopAction.ADOPT],
+            "gone_back": story.counts[LoopAction.BACK],
             "needs": story.needs,
         }
     }
@@ -187,10 +188,10 @@ def in_words(story: Story) -> str:
     counts, made = story.counts, sum(story.diagnoses.values())
     parts = [f"{made} {'diagnosis' if made == 1 else 'diagnoses'}"] if made else []
     names = (
-        (LoopStep.SHADOW, "in shadow"),
-        (LoopStep.PROPOSE, "proposed"),
-        (LoopStep.ADOPT, "adopted"),
-        (LoopStep.BACK, "gone back"),
+        (LoopAction.SHADOW, "in shadow"),
+        (LoopAction.PROPOSE, "proposed"),
+        (LoopAction.ADOPT, "adopted"),
+        (LoopAction.BACK, "gone back"),
     )
     parts += [f"{counts[step]} {words}" for step, words in names if counts[step]]
     return f"Models: {', '.join(parts)}."
@@ -223,7 +224,7 @@ def story_section(
     blocks.append(_picture(story, left_by_day, x_limits))
     if len(in_force) > 1:
         blocks.append(_strips(story, in_force, names, x_limits))
-    blocks += _tables(story)
+    blocks += story_tables(story)
     return Section(title="The machine's models", blocks=blocks)
 
 
@@ -236,7 +237,7 @@ def _picture(story: Story, left_by_day: Mapping[float, float], x_limits: tuple[f
     x, y = np.array(days), np.array([left_by_day[day] for day in days])
     top = float(np.nanmax(y)) if y.size and bool(np.isfinite(y).any()) else 1.0
     marks = []
-    for what, marker, height in ((LoopStep.ADOPT, "o", 1.08), (LoopStep.BACK, "x", 1.16)):
+    for what, marker, height in ((LoopAction.ADOPT, "o", 1.08), (LoopAction.BACK, "x", 1.16)):
         at = np.array([step.at_s for step in story.steps if step.what == what])
         if at.size:
             marks.append(Marks(WORDS[what], at, np.full(at.size, height * top), marker=marker))  # type: ignore[arg-type]
@@ -280,9 +281,10 @@ def _model(sha: str, names: Mapping[str, str], effects: Mapping[str, Sequence[st
     return f"{sha[:6]} {added or names.get(sha, '')}".strip()
 
 
-def _tables(story: Story) -> list[Block]:
+def story_tables(story: Story) -> list[Block]:
+    """Return every decision with its figures, and all steps in words."""
     head = ["time, UTC", "what", "model, effects", "present → other, µm rms", "measured", "deviations", "by"]
-    told = [step for step in story.steps if step.what != LoopStep.NOTHING]
+    told = [step for step in story.steps if step.what != LoopAction.NOTHING]
     blocks: list[Block] = []
     if told:
         note = "µm rms of measured − predicted over what was compared; deviations: by how many the other is better."

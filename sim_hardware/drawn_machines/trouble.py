@@ -95,6 +95,17 @@ def draw_troubles(rng: np.random.Generator, days: int, *, probed: bool) -> tuple
     return tuple(sorted(found, key=lambda trouble: trouble.from_min))
 
 
+def draw_visits(rng: np.random.Generator, troubles: Sequence[Trouble]) -> tuple[int, ...]:
+    """Draw when a person has seen to a trouble, min; a new zero acknowledges what has moved or was exchanged."""
+    found = []
+    for trouble in troubles:
+        if trouble.kind in ("creep", "slip"):
+            found.append(trouble.from_min + int(rng.uniform(240.0, 600.0)))
+        if trouble.kind in ("creep", "exchange", "jump", "stuck"):
+            found.append(trouble.to_min + int(rng.uniform(20.0, 120.0)))
+    return tuple(sorted(found))
+
+
 def draw_pauses(rng: np.random.Generator, days: int) -> tuple[tuple[int, int], ...]:
     """Draw up to three times in which the service does not run: first minute, and the first one after it."""
     begins = rng.uniform(0.3, days - 0.1, size=int(rng.integers(0, 4))) * DAY_MIN

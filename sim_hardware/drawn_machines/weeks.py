@@ -24,6 +24,7 @@ from sim_hardware.drawn_machines.trouble import (
     Trouble,
     draw_pauses,
     draw_troubles,
+    draw_visits,
     moved_um,
     spoiled,
 )
@@ -99,6 +100,8 @@ class MachineWeek:
         Undeclared effects.
     troubles : tuple of Trouble
         What must never become part of a model.
+    visits : tuple of int
+        When a person sees to a trouble and sets a new zero, min.
     probes : tuple of TouchProbe
         Empty with a displacement sensor.
     probe_std_um : float
@@ -118,6 +121,7 @@ class MachineWeek:
     running: Mask
     spells: tuple[Spell, ...]
     troubles: tuple[Trouble, ...]
+    visits: tuple[int, ...]
     probes: tuple[TouchProbe, ...]
     probe_std_um: float
 
@@ -218,6 +222,7 @@ class _Draw(Draw):
             running=running,
             spells=tuple(spells),
             troubles=troubles,
+            visits=tuple(minute for minute in draw_visits(rng, troubles) if minute < n),
             probes=probes,
             probe_std_um=std_um,
         )

@@ -11,7 +11,9 @@ found           within 48 h of an effect's beginning a diagnosis has a right nam
 adopted         within 48 h of its beginning another model is adopted.
 removed %       of the mean square that the effects add to the error from 48 h after the beginning to the effect's end:
                 100 (base² − loop²) / (base² − best²); only where they add at least 5 % to the mean square there.
-fair            the sensors were whole for at least 36 of the 48 h: no decision is made while one is suspected.
+fair            for at least 36 of the 48 h nothing else was wrong, or a person had not yet seen to it: no decision is
+                made while a sensor is suspected.
+                Errors are those of the times in which both temperatures were right, and had been for 6 h.
 worse           from an adoption to the next change of the model, or to the end, the error is more than 5 % and 0.05 µm
                 above that of the model before.
 reproduced      a second run, which gets the recorded results of the diagnoses, makes the same decisions with the same
@@ -52,6 +54,8 @@ SETS = {"development": DEVELOPMENT_WEEKS, "sealed": SEALED_WEEKS}
 MIDNIGHT_NS = 1_767_571_200 * NS
 PERIOD_S, MINUTE_NS = 60.0, 60 * NS
 WITHIN_MIN, FAIR_MIN = 48 * 60, 36 * 60
+#: For so long after a fault of a temperature the state of the model is wrong, and after a zero the offset is limited.
+AFTER_FAULT_MIN, LIMITED_MIN = 360, 15
 #: A state is kept this often, samples: a recording begins with one and is read from there.
 STATE_EVERY = 60
 #: Samples that a killed service misses.
@@ -103,11 +107,14 @@ def _channel(name):
 
 
 def samples_of(week, columns):
-    """Return a sample for each minute in which the service runs, with what a probe before it shows, NaN without one."""
+    """Return for each minute in which the service runs: sample, what a probe before it shows, whether a zero is set."""
     start_ns = MIDNIGHT_NS + round(week.start_h * 60) * MINUTE_NS
     shown = np.full(week.minutes, math.nan)
     for probe in week.probes:
         shown[probe.minute] = week.true_um[probe.minute - 1] - week.true_um[0] + probe.error_um
+    visited = np.zeros(week.minutes, dtype=bool)
+    for minute in week.visits:
+        visited[minute + int(np.argmax(week.running[minute:]))] = True
     names = list(columns)
     table = np.column_stack([columns[name] for name in names])
     return [
@@ -116,6 +123,7 @@ def samples_of(week, columns):
                 week.family, i, start_ns + i * MINUTE_NS, dict(zip(names, table[i], strict=True)), period_s=PERIOD_S
             ),
             float(shown[i]),
+            bool(visited[i]),
         )
         for i in np.flatnonzero(week.running).tolist()
     ]
@@ -153,12 +161,12 @@ class Service:
         self.steps = []
         self._kept, self._state = 0, self.run.state()
 
-    def process(self, sample, probe):
+    def process(self, sample, probe, is_visit):
         waits = self.steps and any(is_begin(note) for note in self.steps[-1][2].events)
         if len(self.steps) - self._kept >= STATE_EVERY and not waits:
             self._kept, self._state = len(self.steps), self.run.state()
-        step = advance(self.run, self.steps[-1][0].seq if self.steps else None, sample, probe)
-        self.steps.append((sample, probe, step))
+        step = advance(self.run, self.steps[-1][0].seq if self.steps else None, sample, probe, is_visit)
+        self.steps.append((sample, probe, step, is_visit))
         return step
 
     def restart(self):
@@ -167,8 +175,8 @@ class Service:
         self.run.restore(self._state)
         last = self.steps[self._kept - 1][0].seq if self._kept else None
         same = True
-        for sample, probe, step in self.steps[self._kept :]:
-            again = advance(self.run, last, sample, probe)
+        for sample, probe, step, is_visit in self.steps[self._kept :]:
+            again = advance(self.run, last, sample, probe, is_visit)
             same = same and seen(again) == seen(step) and again.outcome.offset == step.outcome.offset
             last = sample.seq
         return same
@@ -178,10 +186,13 @@ class Service:
         return self.steps[-1][2].outcome.offset if self.steps else None
 
 
-def advance(run, last, sample, probe):
-    """Process a sample after the pause before it."""
+def advance(run, last, sample, probe, is_visit):
+    """Process a sample after the pause before it, and after a person has acknowledged a trouble."""
     if last is not None and sample.seq > last + 1:
         run.pause(sample.seq - last - 1)
+    if is_visit:
+        run.compensation.resume()
+        run.compensation.zero("warm")
     return run.process(sample, [probe] if probe is not None else [])
 
 
@@ -198,7 +209,7 @@ def seen(step):
 def looped(config, model, samples, diagnoses, *, kills=True):
     """Return the service after the week, and how many of its restarts came out the same, of how many."""
     service, restarts, killed_adoption, skip_to = Service(config, model, diagnoses), [], not kills, -1
-    for sample, shown_um in samples:
+    for sample, shown_um, is_visit in samples:
         if sample.seq < skip_to:
             continue
         probe = None
@@ -206,7 +217,7 @@ def looped(config, model, samples, diagnoses, *, kills=True):
             probe = probe_of(shown_um, service.last, sample.time_utc_ns - MINUTE_NS // 2)
         before = service.steps[-1][2].model_sha256 if service.steps else None
         try:
-            step = service.process(sample, probe)
+            step = service.process(sample, probe, is_visit)
         except Killed:
             restarts.append(service.restart())
             skip_to = sample.seq + KILLED_MIN
@@ -218,13 +229,35 @@ def looped(config, model, samples, diagnoses, *, kills=True):
 
 
 def error_of(outcomes, true_um):
-    """Return the error by minute, µm, shape (n,); NaN where the service did not run."""
-    error = np.full(true_um.size, math.nan)
-    first = outcomes[0].sample.seq
+    """Return the error by minute since the last zero, µm, shape (n,); NaN where the service did not run."""
+    error, zero_um = np.full(true_um.size, math.nan), 0.0
     for outcome in outcomes:
         i = outcome.sample.seq
-        error[i] = true_um[i] - true_um[first] + number(outcome.offset.y_offset_um)
+        if any(note.kind == EventKind.ZERO for note in outcome.notes):
+            zero_um = true_um[i]
+        error[i] = true_um[i] - zero_um + number(outcome.offset.y_offset_um)
     return error
+
+
+def whole(week):
+    """Return at which minutes every sensor is whole and has been for some hours: elsewhere faults make the error."""
+    found = np.ones(week.minutes, dtype=bool)
+    for trouble in week.troubles:
+        if trouble.channel != "y_um":
+            found[trouble.from_min : trouble.to_min + AFTER_FAULT_MIN] = False
+    for minute in week.visits:
+        found[minute : minute + LIMITED_MIN] = False
+    return found
+
+
+def undisturbed(week):
+    """Return at which minutes nothing is wrong beside the machine, or has been seen to."""
+    found = np.ones(week.minutes, dtype=bool)
+    for trouble in week.troubles:
+        after = [minute for minute in week.visits if minute >= trouble.to_min]
+        end = after[0] if after and trouble.kind not in ("break", "period", "hand") else trouble.to_min
+        found[trouble.from_min : end] = False
+    return found
 
 
 def rms(error):
@@ -249,10 +282,10 @@ def _figures(week):
     samples, healthy = samples_of(week, week.columns), samples_of(week, week.healthy)
     diagnoses = Diagnoses(diagnosis_in_process(config), kill_at=(2,))
     service, restarts = looped(config, file, samples, diagnoses)
-    steps = [step for _, _, step in service.steps]
+    steps = [step for _, _, step, _ in service.steps]
     again, last, same = LoopRun(config, file, _recorded(diagnoses)), None, True
-    for sample, probe, step in service.steps:
-        same = same and seen(advance(again, last, sample, probe)) == seen(step)
+    for sample, probe, step, is_visit in service.steps:
+        same = same and seen(advance(again, last, sample, probe, is_visit)) == seen(step)
         last = sample.seq
     errors = {
         "loop": error_of([step.outcome for step in steps], week.true_um),
@@ -263,6 +296,8 @@ def _figures(week):
     for sha in used:
         errors[sha] = error_of(run_alone(config, parse_model(files[sha], source=sha), samples), week.true_um)
     base_sha = used[0]
+    for error in errors.values():
+        error[~whole(week)] = math.nan
     return {
         "whole": {"base": rms(errors[base_sha]), "loop": rms(errors["loop"]), "best": rms(errors["best"])},
         "troubles": [asdict(trouble) for trouble in week.troubles],
@@ -326,10 +361,6 @@ def _spell(week, spell, diagnoses, steps, errors, base_sha):
         for i in range(1, len(steps))
         if steps[i].model_sha256 != steps[i - 1].model_sha256 and begin <= steps[i].outcome.sample.seq <= until
     ]
-    bad = np.zeros(week.minutes, dtype=bool)
-    for trouble in week.troubles:
-        if trouble.channel != "y_um":
-            bad[trouble.from_min : trouble.to_min] = True
     after = slice(until, spell.to_min)
     base, loop, best = (rms(errors[name][after]) for name in (base_sha, "loop", "best"))
     added = base**2 - best**2
@@ -337,7 +368,7 @@ def _spell(week, spell, diagnoses, steps, errors, base_sha):
     return asdict(spell) | {
         "found_h": (named[0] - begin) / 60.0 if named else None,
         "adopted_h": (changed[0] - begin) / 60.0 if changed else None,
-        "fair": int(np.sum(~bad[begin:until])) >= FAIR_MIN,
+        "fair": int(np.sum(undisturbed(week)[begin:until])) >= FAIR_MIN,
         "base_um": base,
         "loop_um": loop,
         "best_um": best,

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, LoopData, LoopStep
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, LoopAction, LoopData
 from compensator.recording.reading import recordings
 from compensator.report.gathering import read_history
 from compensator.report.history import History
@@ -28,14 +28,14 @@ FIGURES = ComparisonData(
 )
 #: Minute of each event, kind, text, data.
 TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
-    (100, "loop", "a diagnosis of the last 36 h begins", LoopData(step=LoopStep.DIAGNOSE, why="night").table()),
+    (100, "loop", "a diagnosis of the last 36 h begins", LoopData(step=LoopAction.DIAGNOSE, why="night").table()),
     (101, "diagnosis", "found", DiagnosisData(verdict="explained", effects=["input:coolant_degc"]).table()),
     (
         101,
         "loop",
         "a candidate is compared",
         LoopData(
-            step=LoopStep.SHADOW, role="candidate", model_sha256=CANDIDATE, effects=["input:coolant_degc"]
+            step=LoopAction.SHADOW, role="candidate", model_sha256=CANDIDATE, effects=["input:coolant_degc"]
         ).table(),
     ),
     (
@@ -43,7 +43,7 @@ TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
         "loop",
         "a better model is adopted",
         LoopData(
-            step=LoopStep.ADOPT, model_sha256=CANDIDATE, effects=["input:coolant_degc"], comparison=FIGURES
+            step=LoopAction.ADOPT, model_sha256=CANDIDATE, effects=["input:coolant_degc"], comparison=FIGURES
         ).table(),
     ),
     (901, "adopt", "model c replaces b", {"ok": True, "action": "adopt", "new_sha256": CANDIDATE, "by": "loop"}),
@@ -60,8 +60,8 @@ TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
         "nothing",
         DiagnosisData(verdict="unexplained", needs="check the mount of the displacement sensor").table(),
     ),
-    (1900, "loop", "nothing follows", LoopData(step=LoopStep.NOTHING, why="unexplained").table()),
-    (2000, "loop", "back to the model before", LoopData(step=LoopStep.BACK, model_sha256=BEFORE).table()),
+    (1900, "loop", "nothing follows", LoopData(step=LoopAction.NOTHING, why="unexplained").table()),
+    (2000, "loop", "back to the model before", LoopData(step=LoopAction.BACK, model_sha256=BEFORE).table()),
 )
 
 
