@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from sim_hardware.physics.effects.base import Action, Array, Places, UndeclaredEffect
+from sim_hardware.physics.effects.base import Action, Array, Places, UndeclaredEffect, overriding
 from sim_hardware.physics.plant import Inputs
 
 #: Hooks that do not say when they are called.
-_WITHOUT_TIME = ("alter", "forced_factor", "growth_um")
+_WITHOUT_TIME = ("forced_factor", "growth_um")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,9 +35,11 @@ class During(UndeclaredEffect):
 
     def __post_init__(self) -> None:
         inner = self.effect.reveal()
-        for name in _WITHOUT_TIME:
-            if getattr(type(inner), name) is not getattr(UndeclaredEffect, name):
-                raise ValueError(f"{inner!r} changes {name}, which has no beginning and no end")
+        changed = [name for name in _WITHOUT_TIME if overriding([inner.begin()], name)]
+        if type(inner).alter is not UndeclaredEffect.alter:
+            changed.append("alter")
+        if changed:
+            raise ValueError(f"{inner!r} changes {changed[0]}, which has no beginning and no end")
 
     @property
     def thermal(self) -> bool:  # type: ignore[override]
