@@ -67,6 +67,12 @@ USERS = {
         ),
         Command("back", "return to the previous model", "back --config machine.toml", "commands.adopt:back"),
         Command(
+            "dismiss",
+            "refuse the model that the service proposes",
+            "dismiss --config machine.toml",
+            "commands.adopt:dismiss",
+        ),
+        Command(
             "loop",
             "what diagnosis, comparison and adoption make of a shop's recordings",
             "loop recordings/vmc-07 recordings/vmc-08 --page shop.html",

@@ -173,6 +173,51 @@ class Event(Message, frozen=True, kw_only=True):
     data: dict[str, Any] = {}
 
 
+class LoopStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """How the loop is: what runs in shadow, and how it compares with the present model.
+
+    Parameters
+    ----------
+    phase : {"idle", "shadow", "proposed", "watching"}
+        What the shadow is for: nothing, a candidate, a proposed one, or the model from before the last adoption.
+    diagnosing : bool
+        Whether a diagnosis, or the warm-up of its candidate, is in progress.
+    model_sha256 : str
+        Hash of the file of the model in shadow; empty without one.
+    effects : list of str
+        Its effects.
+    since_utc_ns : int
+        When its comparison began, ns since 1970 UTC.
+    y_pred_um : float or None
+        Its predicted deformation, µm.
+    verdict, text : str
+        Verdict so far: `better`, `alike`, `worse` or `not_judged`; and in words.
+    present_rms_um, candidate_rms_um, deviations : float or None
+        Its figures, see `Candidate`.
+    hours : float
+        Hours of usable blocks of measured Y.
+    probes : int
+        Number of compared probes.
+    adopted_utc_ns : int
+        Time of the last adoption by the loop; 0 before.
+    """
+
+    phase: Literal["idle", "shadow", "proposed", "watching"]
+    diagnosing: bool
+    model_sha256: str
+    effects: list[str]
+    since_utc_ns: int
+    y_pred_um: float | None
+    verdict: str
+    text: str
+    present_rms_um: float | None
+    candidate_rms_um: float | None
+    deviations: float | None
+    hours: float
+    probes: int
+    adopted_utc_ns: int
+
+
 class Status(Message, frozen=True, kw_only=True):
     """How the service is, `thermal/status`.
 
@@ -193,6 +238,8 @@ class Status(Message, frozen=True, kw_only=True):
         The standard deviation that asks for it, µm.
     wanted_tolerance_um : float or None
         The tolerance with which it is compared, µm.
+    loop : LoopStatus, optional
+        How the loop is; only with `[loop]` in the configuration.
     """
 
     state: State
@@ -210,6 +257,7 @@ class Status(Message, frozen=True, kw_only=True):
     wanted_why: str | UnsetType = UNSET
     wanted_std_um: float | UnsetType | None = UNSET
     wanted_tolerance_um: float | UnsetType | None = UNSET
+    loop: LoopStatus | UnsetType = UNSET
 
 
 # No control characters, line ends or marks of the direction; `$` would accept a line end after the last character, and

@@ -1,100 +1,86 @@
-"""A diagnosis in this process for the loop: from the service's outcomes to what can be deployed."""
+"""The diagnosis of the loop: from a record that may be used to a candidate."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+
+import numpy as np
 
 from compensator.api.diagnosis import DiagnosisResult, diagnose
 from compensator.config import Config
-from compensator.diagnose.advice_words import advice_lines
-from compensator.errors import CompensatorError
+from compensator.data.frames import hash_of
+from compensator.data.measurement import Measurement, Origin
+from compensator.data.table import Table
+from compensator.errors import DataError
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
-from compensator.service.loop.record import usable_table
-from compensator.service.loop.weighing import FAILED, Diagnosed
+from compensator.service.loop.record import is_probed, usable_table
+from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
 
 
 def diagnosis_in_process(config: Config) -> Callable[[Sequence[Outcome], bytes], Diagnosed]:
-    """Return a function that diagnoses outcomes in this process, as `LoopRun` calls it.
+    """Return the function by which a `LoopRun` of this machine diagnoses in its own process."""
+    return partial(diagnosis_of_record, probe_std_um=config.probe.std_um if config.probe is not None else None)
+
+
+def diagnosis_of_record(record: Sequence[Outcome], model: bytes, *, probe_std_um: float | None = None) -> Diagnosed:
+    """Return what a diagnosis of a record gives; stands in for the process of the service.
 
     Parameters
     ----------
-    config : Config
-        Settings of the machine: the standard deviation of its probes.
-    """
-    std_um = config.probe.std_um if config.probe is not None else None
-
-    def of(outcomes: Sequence[Outcome], model: bytes) -> Diagnosed:
-        return diagnosed(outcomes, model, y_std_um=std_um)
-
-    return of
-
-
-def diagnosed(outcomes: Sequence[Outcome], model: bytes, *, y_std_um: float | None = None) -> Diagnosed:
-    """Diagnose outcomes as `compensator diagnose` does recordings.
-
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-        Samples in order; what must not be used is left out (`usable_table`).
+    record : sequence of Outcome
+        Outcomes of the service in the time that is diagnosed.
     model : bytes
-        File of the base model.
-    y_std_um : float, optional
-        Standard deviation of a touch probe, µm; where no displacement sensor measured Y.
+        File of the calibrated model.
+    probe_std_um : float, optional
+        Standard deviation of one probe, µm.
 
-    Returns
-    -------
-    Diagnosed
-        With the verdict `failed` where there is too little data, or the data cannot be used.
+    Raises
+    ------
+    CompensatorError
+        If there is too little data.
     """
-    try:
-        table = usable_table(outcomes)
-        columns = {"t_s": table.t_s - (table.t_s[0] if table.t_s.size else 0.0), **table.columns}
-        is_probed = not any("y_um" in outcome.sample.channels for outcome in outcomes)
-        base = parse_model(model, source="model of the loop")
-        found = diagnose(base, columns, y_std_um=y_std_um if is_probed else None)
-    except CompensatorError as error:
-        return Diagnosed(verdict=FAILED, effects=(), model=None, text=str(error), needs=str(error))
-    return diagnosed_of(found)
+    return summarised(diagnosis_of_table(usable_table(record), model, probe_std_um=probe_std_um))
 
 
-def diagnosed_of(found: DiagnosisResult) -> Diagnosed:
-    """Return what a loop uses of a diagnosis."""
-    names = [_name(effect) for effect in found.effects if effect.deployable]
+def diagnosis_of_table(table: Table, model: bytes, *, probe_std_um: float | None = None) -> DiagnosisResult:
+    """Diagnose a table of `service.loop.record`.
+
+    Raises
+    ------
+    CompensatorError
+        If there is too little data.
+    """
+    if not np.isfinite(table.columns["y_um"]).any():
+        raise DataError(f"{table.name}: no measured Y that may be used")
+    columns = {name: values for name, values in table.columns.items() if np.isfinite(values).any()}
+    table = Table(name=table.name, t_s=table.t_s, columns=columns, rows=table.rows)
+    origin = Origin(name=table.name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
+    measured = Measurement(table=table, label=table.name, origins=(origin,))
+    y_std_um = probe_std_um if is_probed(table) else None
+    return diagnose(parse_model(model, source="calibrated model"), [measured], y_std_um=y_std_um)
+
+
+def summarised(found: DiagnosisResult) -> Diagnosed:
+    """Return the result of a diagnosis as the loop needs it."""
+    deployed = tuple(name_of(effect) for effect in found.model.effects)
+    effects = deployed[len(deployed) - _added(found) :] if _added(found) else ()
+    left = [effect for effect in found.effects if not effect.deployable and not effect.replaced]
+    needs = [f"{effect.kind}: {effect.explanation}" for effect in left]
+    advice = found.diagnosis.advice
+    if advice is not None and advice.sensor:
+        needs.append(advice.sensor)
+    text = f"diagnosis: {found.verdict}, {', '.join(effects) or 'nothing to deploy'}"
+    before, after = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um
+    text += f"; held-out error {before:.2f} µm rms before, {after:.2f} after"
+    model = dump_model(found.model).encode() if effects else None
+    return Diagnosed(found.verdict, effects, model, text, " ".join(needs))
+
+
+def _added(found: DiagnosisResult) -> int:
+    """Return how many effects the extended model has more than the base."""
     remainder = found.diagnosis.remainder
-    if remainder is not None and remainder.deployed:
-        names.append(":".join(("regression", *remainder.channels)))
-    others = [_name(effect) for effect in found.effects if not effect.deployable]
-    text = f"{found.verdict.replace('_', ' ')}: {', '.join(names) or 'nothing that can be deployed'}"
-    if others:
-        text += f"; not for a model: {', '.join(others)}"
-    return Diagnosed(
-        verdict=found.verdict,
-        effects=tuple(names),
-        model=dump_model(found.model).encode() if names else None,
-        text=f"{text}.",
-        needs=_needs(found),
-    )
-
-
-def _name(effect: Any) -> str:
-    return ":".join(filter(None, effect.place))
-
-
-#: What a person has to do where the measurement of Y, and not the machine, has changed.
-_OF_MEASUREMENT = {
-    "drift": "check the mount of the displacement sensor or of the probed feature: it drifts",
-    "step": "check the mount of the displacement sensor or of the probed feature: it has slipped",
-    "periodic": "measured Y has a period that no channel shows: check its sensor, or log what cycles",
-}
-
-
-def _needs(found: DiagnosisResult) -> str:
-    """Return what a person has to do, empty where nothing."""
-    for effect in found.effects:
-        if effect.kind in _OF_MEASUREMENT:
-            return _OF_MEASUREMENT[effect.kind]
-    lines = advice_lines(found.diagnosis.advice)
-    return lines[-1] if lines and found.verdict in ("unexplained", "partly_explained") else ""
+    named = sum(effect.deployable for effect in found.effects)
+    return min(named + (remainder is not None and remainder.deployed), len(found.model.effects))

@@ -16,6 +16,8 @@ from compensator.messages import Event, Offset, degraded, encode
 from compensator.recording.container import Contents
 from compensator.recording.reading import RawRecord
 from compensator.service.compensation import Compensation, Outcome
+from compensator.service.loop.core import Followed
+from compensator.service.loop.replaying import decisions_in, recorded_loop
 from compensator.service.replay import RecordedStep, apply, setup_of, step_of
 
 #: Reasons that the disk gives: only the offset itself shows that it was published before it was on disk.
@@ -50,6 +52,7 @@ class ReplayCheck:
             except CompensatorError as error:
                 raise DataError(f"{result.file}: state.json: {error}") from error
         result.model = self.compensation.model.sha256
+        self._loop = recorded_loop(contents, self.compensation, result.file)
         #: A sample of which the estimate or the offset is missing: a torn end, or a difference.
         self._incomplete: Difference | None = None
 
@@ -73,9 +76,11 @@ class ReplayCheck:
         step = step_of(records, self._contents, self._result.file)
         for event in step.events:
             self._follow(event)
+        decided = self._loop.apply_inputs(step) if self._loop is not None else []
         outcome = apply(self.compensation, step)
         if isinstance(outcome, Outcome):
-            self._compare(step, outcome)
+            followed = self._loop.process(outcome) if self._loop is not None else Followed(None, ())
+            self._compare(step, outcome, Followed(followed.candidate, (*decided, *followed.notes)))
         elif outcome is not None:
             expected = self._as_published(outcome, step.records["offset"].data)
             self._matches("offset", expected, step.records["offset"])
@@ -94,7 +99,7 @@ class ReplayCheck:
                 result.early_seqs.add(data.published_early)
             result.removed += data.removed[:_REMOVED]
 
-    def _compare(self, step: RecordedStep, outcome: Outcome) -> None:
+    def _compare(self, step: RecordedStep, outcome: Outcome, followed: Followed) -> None:
         """Compare the messages of a sample, up to the first difference."""
         result, sample, records = self._result, outcome.sample, step.records
         if result.samples:
@@ -108,7 +113,16 @@ class ReplayCheck:
         offset = outcome.offset
         if "offset" in records:
             offset = self._as_published(offset, records["offset"].data)
-        for topic, message in (("sample", sample), ("estimate", outcome.estimate), ("offset", offset)):
+        messages = {"sample": sample, "estimate": outcome.estimate, "candidate": followed.candidate, "offset": offset}
+        if "candidate" in records and followed.candidate is None:
+            recorded = Field(
+                name="message", recorded=records["candidate"].data.decode("utf-8", "replace"), recomputed=None
+            )
+            self._count(self._difference("candidate", sample, (recorded,)))
+            return
+        for topic, message in messages.items():
+            if message is None:
+                continue
             record = records.get(topic)
             if record is None:
                 nothing = Field(name="message", recorded=None, recomputed=msgspec.to_builtins(message))
@@ -116,9 +130,14 @@ class ReplayCheck:
                 return
             if not self._matches(topic, message, record):
                 return
-        for note in outcome.notes:
+        for note in (*outcome.notes, *followed.notes):
             if not any(is_recorded(note, event) for event in step.events):
                 self._count(self._difference("event", sample, (_missing_note(note, step.events),)))
+        for event in decisions_in(step) if self._loop is not None else ():
+            if not any(is_recorded(note, event) for note in followed.notes):
+                self._count(
+                    self._difference("event", sample, (Field(name=event.kind, recorded=event.data, recomputed=None),))
+                )
 
     def _probes_match(self, step: RecordedStep, outcome: Outcome) -> bool:
         """Compare the verdicts on the probes of a sample, up to the first difference."""

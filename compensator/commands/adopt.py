@@ -1,4 +1,4 @@
-"""`compensator adopt` and `back`: change the model of the service, whether it is running or not."""
+"""`compensator adopt` and `back`: change the model of the service, whether it is running or not; `dismiss`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from compensator.clock import SystemClock
 from compensator.commands import Answer
 from compensator.commands.order import answered, operator_of
-from compensator.errors import ServiceError
+from compensator.errors import ServiceError, UsageError
 from compensator.events import CommandName, ComparisonData
 from compensator.model.model_file import read_model_bytes
 from compensator.service.command_client import NotReached, ask
@@ -28,7 +28,11 @@ def adopt(arguments: argparse.Namespace) -> Answer:
     CompensatorError
         If the configuration or the model cannot be used, or the service refuses.
     """
+    if (arguments.model is None) == (not arguments.candidate):
+        raise UsageError("expected either MODEL, or --candidate for the model that the service proposes")
     setup = load(arguments.config)
+    if arguments.candidate:
+        return _decide(CommandName.ADOPT, {"candidate": True, "force": arguments.force}, setup, arguments)
     data = read_model_bytes(arguments.model)
     model = check_model(setup.config, data, source=arguments.model)
     wanted = {"sha256": model.sha256, "model": data.decode(), "force": arguments.force}
@@ -59,6 +63,24 @@ def back(arguments: argparse.Namespace) -> Answer:
     found = second_opinion(setup.recordings, setup.config, setup.model, model)
     setup.store.back(name=model.name, time_utc_ns=SystemClock().utc_ns())
     return _stored(f"back to model {model.name} ({model.sha256[:12]})", model.sha256, found)
+
+
+def dismiss(arguments: argparse.Namespace) -> Answer:
+    """Refuse the candidate of the running service.
+
+    Raises
+    ------
+    CompensatorError
+        If the configuration cannot be used, or the service is not reached or refuses.
+    """
+    return _decide(CommandName.DISMISS, {}, load(arguments.config), arguments)
+
+
+def _decide(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Namespace) -> Answer:
+    """Decide about the candidate of the running service: only that has one."""
+    operator = operator_of(arguments)
+    zenoh = setup.config.zenoh
+    return answered(ask(zenoh, name, json.dumps(wanted).encode(), timeout_s=arguments.timeout, operator=operator))
 
 
 def _ask(name: str, wanted: dict[str, Any], setup: Setup, arguments: argparse.Namespace) -> dict[str, Any] | None:

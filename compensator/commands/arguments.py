@@ -175,8 +175,17 @@ def report(parser: argparse.ArgumentParser) -> None:
 
 def adopt(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `adopt`."""
-    parser.add_argument("model", metavar="MODEL", help="a model file, or quill")
+    parser.add_argument("model", nargs="?", metavar="MODEL", help="a model file, or quill")
+    parser.add_argument("--candidate", action="store_true", help="adopt the model that the service proposes ([loop])")
     back(parser)
+
+
+def dismiss(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `dismiss`."""
+    run(parser)
+    add = parser.add_argument
+    add("--zenoh", type=Path, metavar="FILE", help=_OPERATOR)
+    add("--timeout", type=float, default=5.0, metavar="S", help="how long to wait for the service's reply, s (5)")
 
 
 def back(parser: argparse.ArgumentParser) -> None:

@@ -24,6 +24,11 @@ TOPICS = ("sample", "estimate", "offset", "event", "seal", "chain")
 TOPICS_WITH_PROBES = (*TOPICS, "probe")
 
 
+def topics_of(*, probes: bool, loop: bool) -> tuple[str, ...]:
+    """Return the topics of a machine's recording: with probes, and with another model in shadow."""
+    return (*(TOPICS_WITH_PROBES if probes else TOPICS), *(("candidate",) if loop else ()))
+
+
 @dataclass(slots=True)
 class _Sink:
     """Buffer of the MCAP writer since the last sync, written to the file at once."""

@@ -75,7 +75,13 @@ class McapRecorder:
         self.path: Path | None = None
 
     def write(
-        self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"", sync: bool = True
+        self,
+        records: Iterable[tuple[str, bytes]],
+        time_utc_ns: int,
+        *,
+        state: bytes = b"",
+        opening: Mapping[str, bytes] | None = None,
+        sync: bool = True,
     ) -> None:
         """Write records and sync them to disk before returning.
 
@@ -87,6 +93,8 @@ class McapRecorder:
             Time of the records, ns since 1970 UTC.
         state : bytes
             State of the compensation before these records; attached as `state.json` if they start a new file.
+        opening : mapping of str to bytes, optional
+            More that is attached then, by name.
         sync : bool
             If false, they are synced together with the next records.
 
@@ -99,7 +107,7 @@ class McapRecorder:
         try:
             if self._live is None or day != self._day:
                 self._finish("day")
-                self._open(time_utc_ns, day, state)
+                self._open(time_utc_ns, day, {"state.json": state} | dict(opening or {}))
             assert self._live is not None
             self._live.append(records, time_utc_ns)
             if self._signer is not None and time_utc_ns - self._live.sealed_ns >= SEAL_EVERY_NS:
@@ -161,7 +169,7 @@ class McapRecorder:
         if live is not None and not live.give_up():
             self._uncut = live.path, live.synced
 
-    def _open(self, time_utc_ns: int, day: str, state: bytes) -> None:
+    def _open(self, time_utc_ns: int, day: str, opening: Mapping[str, bytes]) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         if self._uncut is not None:
             # The records after the last sync are written again.
@@ -190,10 +198,8 @@ class McapRecorder:
             "previous_chain": before.hex(),
         }
         attachments = [
-            _attached(name, "application/toml", data, time_utc_ns) for name, data in self.attachments.items()
+            _attached(name, data, time_utc_ns) for name, data in (*self.attachments.items(), *opening.items()) if data
         ]
-        if state:
-            attachments.append(_attached("state.json", "application/json", state, time_utc_ns))
         live.begin(metadata, attachments)
         live.sync()
         self._day = day
@@ -204,5 +210,6 @@ class McapRecorder:
                 self._finisher.enqueue(path, time_utc_ns)
 
 
-def _attached(name: str, media_type: str, data: bytes, time_ns: int) -> Attachment:
+def _attached(name: str, data: bytes, time_ns: int) -> Attachment:
+    media_type = f"application/{name.rpartition('.')[2]}"
     return Attachment(name, media_type, time_ns, time_ns, data)

@@ -16,6 +16,7 @@ from compensator.events import CommandName, EventKind
 from compensator.messages import Probe
 from compensator.service.compensation import Compensation
 from compensator.service.event_log import EventLog
+from compensator.service.loop.live import LiveLoop
 from compensator.service.probing import ReceivedProbe, read_probe
 from compensator.service.probing.received import ProbeRefused, unused_probe
 from compensator.service.publisher import COMMANDS, Reply, Sender, refusal
@@ -51,6 +52,8 @@ class Commands:
         Name of the machine.
     unproven : bool
         Whether unauthenticated senders are accepted.
+    loop : LiveLoop, optional
+        Executes `dismiss`, and `adopt` of its candidate.
     """
 
     def __init__(
@@ -62,6 +65,7 @@ class Commands:
         running: Callable[[], Compensation],
         machine: str,
         unproven: bool,
+        loop: LiveLoop | None = None,
     ) -> None:
         self._events = events
         self._adoption = adoption
@@ -69,6 +73,7 @@ class Commands:
         self._running = running
         self._machine = machine
         self._unproven = unproven
+        self._models = loop
         #: Probes for the next sample in the order of their arrival, those of them that passed the checks, records of
         #: what cannot be decided with it, and how many more were refused.
         self._probes: list[ReceivedProbe] = []
@@ -99,9 +104,12 @@ class Commands:
             arguments = self._checked(name, payload)
             if loop is None or self._waiting.full():
                 raise ServiceError("the service cannot accept a command now")
-            if name in (CommandName.ADOPT, CommandName.BACK):
+            if name in (CommandName.ADOPT, CommandName.BACK, CommandName.DISMISS):
                 request = ModelRequest.of(name, arguments)
                 reply: Future[dict[str, Any]] = Future()
+                if name == CommandName.DISMISS or request.candidate:
+                    loop.call_soon_threadsafe(self._decide_candidate, name, request, sender, reply)
+                    return reply
                 loop.call_soon_threadsafe(self._adoption.begin, name, request, reply, sender)
                 return reply
         except ServiceError as error:
@@ -118,6 +126,28 @@ class Commands:
             name, arguments, sender = self._waiting.get_nowait()
             self._events.note(EventKind.COMMAND, name, arguments | {"command": name} | sender.data())
             execute(compensation, name, arguments)
+            if self._models is not None and name == CommandName.DISMISS:
+                self._models.dismiss(compensation)
+            elif self._models is not None and name == CommandName.ADOPT:
+                self._models.accept()
+
+    def _decide_candidate(
+        self, name: str, request: ModelRequest, sender: Sender, reply: Future[dict[str, Any]]
+    ) -> None:
+        """Answer a command about the candidate of the loop; it acts with the next sample. In the loop only."""
+        try:
+            if self._models is None:
+                raise ServiceError("the configuration has no loop; expected [loop] with a policy")
+            if self._loop is None:
+                raise ServiceError("the service is ending")
+            text = self._models.offer(force=request.force or name == CommandName.DISMISS)
+        except ServiceError as error:
+            self._note_refusal(name, f"{name}: {error}", sender)
+            reply.set_result(refusal(f"{name}: {error}"))
+            return
+        self._enqueue(name, {"candidate": True, "force": request.force}, sender)
+        text = text if name == CommandName.ADOPT else f"dismissed: {text.replace(' is adopted;', ';')}"
+        reply.set_result({"ok": True, "text": f"{text}; acts at the next sample"})
 
     def drain_probes(self) -> tuple[list[ReceivedProbe], list[Probe]]:
         """Return the probes that arrived since the last call, and records of those that are not decided."""
@@ -200,7 +230,8 @@ class Commands:
         mode = arguments.get("mode", "auto")
         if name not in COMMANDS or (name == CommandName.ZERO and mode not in ("auto", "rest", "warm")):
             raise ServiceError(
-                f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back"
+                f"{name} {mode!r}: expected zero with mode auto, rest or warm, hold, resume, adopt with a model, back, "
+                "dismiss"
             )
         return arguments
 

@@ -11,16 +11,19 @@ from compensator.clock import Clock, SystemClock
 from compensator.errors import ConfigError
 from compensator.events import EventKind, Note
 from compensator.recording.finishing import Retention
-from compensator.recording.live_file import TOPICS, TOPICS_WITH_PROBES
+from compensator.recording.live_file import topics_of
 from compensator.recording.reading import first_sequence
 from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Outcome
 from compensator.service.daemon import Daemon
 from compensator.service.loading import Setup
+from compensator.service.loop.live import LoopParts
+from compensator.service.loop.process import Diagnose, DiagnosisProcess
+from compensator.service.loop.resuming import resume_loop
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.presence import sole_user
 from compensator.service.publisher import Publisher, Reply, Sender
-from compensator.service.transfer.restart import resume
+from compensator.service.transfer.restart import Resumed, resume
 from drivers.errors import DriverError
 from drivers.reading import Reading
 
@@ -42,6 +45,15 @@ async def read_once(fleet: drivers.Fleet) -> dict[str, dict[int, Reading] | Driv
     return answers
 
 
+def loop_parts(setup: Setup, resumed: Resumed, diagnose: Diagnose | None = None) -> LoopParts | None:
+    """Return the parts of the loop, which continues from the last recording; None without `[loop]`."""
+    core = resume_loop(setup.loaded, resumed)
+    if core is None:
+        return None
+    made_by = diagnose or DiagnosisProcess(setup.config, setup.recordings, setup.store.folder / "diagnoses")
+    return LoopParts(core=core, model=setup.model_bytes, store=setup.store, diagnose=made_by)
+
+
 async def run_service(
     setup: Setup,
     *,
@@ -52,6 +64,7 @@ async def run_service(
     on_poll: Callable[[], None] | None = None,
     on_publish: Callable[[str, bytes], None] | None = None,
     publishes: Callable[[], bool] = lambda: True,
+    diagnose: Diagnose | None = None,
 ) -> Daemon:
     """Run the service of a configuration until it is stopped.
 
@@ -71,6 +84,8 @@ async def run_service(
         Called with name and JSON of each message after it was published.
     publishes : callable, optional
         Whether messages are published now, or only recorded, as those of a simulated past.
+    diagnose : callable, optional
+        Makes the diagnoses of the loop; by default a process of their own.
     """
     loaded, config, folder = setup.loaded, setup.config, setup.recordings
     machine, clock = config.machine.name, clock or SystemClock()
@@ -81,7 +96,7 @@ async def run_service(
             {"config.toml": loaded.data, "model.toml": setup.model_bytes},
             retention=Retention(keep_days=config.recording.keep_days, keep_mb=config.recording.keep_mb),
             signer=setup.signer,
-            topics=TOPICS if config.probe is None else TOPICS_WITH_PROBES,
+            topics=topics_of(probes=config.probe is not None, loop=config.loop is not None and config.loop.is_on),
         )
 
         def command(name: str, payload: bytes, sender: Sender) -> Reply:
@@ -103,6 +118,7 @@ async def run_service(
         checkpoint = OffsetCheckpoint(folder, machine)
         checkpointed = checkpoint.read(config.limits.offset_max_um)
         resumed = resume(loaded, setup.model, checkpointed)
+        loop = loop_parts(setup, resumed, diagnose)
         first = first_sequence(folder, machine, clock.utc_ns(), setup.model.period_s)
         checks = Note(EventKind.PLAUSIBILITY, resumed.compensation.plausibility.describe(), {})
         daemon = Daemon(
@@ -117,6 +133,7 @@ async def run_service(
             store=setup.store,
             notes=(*resumed.notes, checks),
             checkpoint=checkpoint,
+            loop=loop,
         )
         try:
             with publisher:

@@ -24,6 +24,7 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.disk_writer import DiskWriter, Entry, Recorder
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
+from compensator.service.loop.live import LiveLoop, LoopParts
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.probing import ReceivedProbe
 from compensator.service.probing.received import undecided_probe
@@ -91,6 +92,8 @@ class Daemon:
         Events from before the start.
     checkpoint : OffsetCheckpoint, optional
         Keeps an offset that is published before it is on disk.
+    loop : LoopParts, optional
+        Looks for better models; None without `[loop]`.
     """
 
     def __init__(
@@ -107,6 +110,7 @@ class Daemon:
         store: ModelStore | None = None,
         notes: Sequence[Note] = (),
         checkpoint: OffsetCheckpoint | None = None,
+        loop: LoopParts | None = None,
     ) -> None:
         self._config = config
         self._compensation = compensation
@@ -123,8 +127,18 @@ class Daemon:
             checkpoint=checkpoint,
         )
         self._sampler = Sampler(config, devices, clock, self._events.note)
+        self._loop: LiveLoop | None = None
+        if loop is not None:
+            self._loop = LiveLoop(config, loop, recordings, events=self._events, journal=self._journal, clock=clock)
         self._adoption = Adoption(
-            config, recordings, store, self._events, self._journal, clock=clock, running=lambda: self._compensation
+            config,
+            recordings,
+            store,
+            self._events,
+            self._journal,
+            clock=clock,
+            running=lambda: self._compensation,
+            loop=self._loop,
         )
         self._commands = Commands(
             self._events,
@@ -133,6 +147,7 @@ class Daemon:
             running=lambda: self._compensation,
             machine=config.machine.name,
             unproven=config.zenoh.accepts_unproven(),
+            loop=self._loop,
         )
         #: Probes of the sample that is being processed.
         self._deciding: list[ReceivedProbe] = []
@@ -221,9 +236,16 @@ class Daemon:
         machine, sequence = self._config.machine.name, self._events.sequence
         held = self._compensation.held(machine, sequence, label_ns)
         probes, self._deciding = [undecided_probe(machine, sequence, probe) for probe in self._deciding], []
-        offset = await self._journal.record(label_ns, self._compensation.state(), probes=probes, offset=held)
+        offset = await self._journal.record(
+            label_ns, self._compensation.state(), opening=self._opening(), probes=probes, offset=held
+        )
         self._publish("offset", encode(offset or held))
         self._events.sequence += 1
+
+    @property
+    def is_diagnosing(self) -> bool:
+        """Whether a diagnosis, or what follows from it, is in progress beside the samples: simulated time may wait."""
+        return self._loop is not None and self._loop.is_working
 
     def stop(self) -> None:
         """End the run after the current poll; the recording is finished."""
@@ -234,13 +256,20 @@ class Daemon:
         self._commands.close()
         await self._await_pending()
         await self._adoption.end()
+        if self._loop is not None:
+            await self._loop.end()
         probes, unread = self._commands.drain_probes()
         machine, sequence = self._config.machine.name, self._events.sequence
         undecided = [undecided_probe(machine, sequence, probe, ends=True) for probe in probes]
         unread = [replace_fields(probe, seq=sequence) for probe in unread]
         if unread or undecided:
-            await self._journal.record(self._clock.utc_ns(), self._compensation.state(), probes=[*unread, *undecided])
-        await self._journal.close(self._compensation.state())
+            await self._journal.record(
+                self._clock.utc_ns(),
+                self._compensation.state(),
+                opening=self._opening(),
+                probes=[*unread, *undecided],
+            )
+        await self._journal.close(self._compensation.state(), self._opening())
         await self._sampler.close()
 
     # ------------------------------------------------------------------ one sample
@@ -251,9 +280,13 @@ class Daemon:
         began = time.perf_counter()
         self._pass_pause(label_ns)
         self._compensation = self._adoption.swap()
-        state, failed_midway = self._compensation.state(), self._failed_midway
+        if self._loop is not None:
+            self._compensation = self._loop.before_sample(self._compensation)
+        state, opening, failed_midway = self._compensation.state(), self._opening(), self._failed_midway
         self._failed_midway = True
         self._commands.apply(self._compensation)
+        if self._loop is not None:
+            self._loop.hand_over(self._compensation)
         raw = Sample(
             schema=SCHEMA,
             machine=self._config.machine.name,
@@ -270,11 +303,19 @@ class Daemon:
             self._journal.start_new_file()
         for note in outcome.notes:
             self._events.note(*note)
+        candidate = self._loop.process(outcome) if self._loop is not None else None
         self._note_state(self._journal.expected(outcome.offset))
         sample, estimate = encode(outcome.sample), encode(outcome.estimate)
         probes = [*(replace_fields(probe, seq=raw.seq) for probe in unread), *outcome.probes]
         entry = self._journal.enqueue(
-            label_ns, state, sample=sample, estimate=estimate, probes=probes, offset=outcome.offset
+            label_ns,
+            state,
+            sample=sample,
+            estimate=estimate,
+            candidate=encode(candidate) if candidate is not None else b"",
+            opening=opening,
+            probes=probes,
+            offset=outcome.offset,
         )
         decided = _Decided(outcome=outcome, entry=entry, began=began)
         if await self._journal.wait_briefly(entry):
@@ -306,7 +347,18 @@ class Daemon:
         self._publish("status", encode(self._status(outcome)))
         self._events.sequence += 1
         self._adoption.follow(outcome)
+        if self._loop is not None:
+            self._loop.after_sample(outcome)
         self._unreported.append(outcome)
+
+    def _opening(self) -> Mapping[str, bytes]:
+        """Return what a recording begins with beside the state of the compensation."""
+        return self._loop.opening() if self._loop is not None else {}
+
+    def _pause(self, samples: int | None) -> None:
+        self._compensation.pause(samples)
+        if self._loop is not None:
+            self._loop.pause(samples)
 
     def _pass_pause(self, label_ns: int) -> None:
         """Account for the time without measurements before the first sample."""
@@ -321,9 +373,9 @@ class Daemon:
         text = f"{missing} sample(s) are missing between the last recording and now; "
         if label_ns <= last_ns:
             text = "the wall clock is before the end of the last recording: how long the service was away is unknown"
-            self._compensation.pause(None)
+            self._pause(None)
         else:
-            self._compensation.pause(missing)
+            self._pause(missing)
             text += (
                 f"{minutes:.0f} min are bridged"
                 if minutes <= bridged
@@ -356,6 +408,9 @@ class Daemon:
             devices=self._sampler.device_states(),
             effects=[effect.label for effect in model.effects],
         )
+        loop = self._loop.status() if self._loop is not None else None
+        if loop is not None:
+            status = replace_fields(status, loop=loop)
         wanted = self._compensation.wanted
         if wanted is None:
             return status
@@ -386,7 +441,7 @@ class Daemon:
         Parameters
         ----------
         name : str
-            `zero`, `hold`, `resume`, `adopt`, `back` or `probe`.
+            `zero`, `hold`, `resume`, `adopt`, `back`, `dismiss` or `probe`.
         payload : bytes
             Empty or a JSON object. `zero` has `mode`: `auto`, `rest` or `warm`; `adopt` has `model`, the text of a
             model file, or `sha256`, that of one adopted before, or both; `adopt` and `back` have `force`. That of

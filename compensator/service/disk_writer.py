@@ -33,7 +33,13 @@ class Recorder(Protocol):
         """The file that is being written."""
 
     def write(
-        self, records: Iterable[tuple[str, bytes]], time_utc_ns: int, *, state: bytes = b"", sync: bool = True
+        self,
+        records: Iterable[tuple[str, bytes]],
+        time_utc_ns: int,
+        *,
+        state: bytes = b"",
+        opening: Mapping[str, bytes] | None = None,
+        sync: bool = True,
     ) -> None:
         """Write records, and sync them to disk unless `sync` is false."""
 
@@ -59,8 +65,10 @@ class Entry:
         State of the compensation before it.
     events : list of Event
         Events since the previous sample.
-    sample, estimate : bytes
+    sample, estimate, candidate : bytes
         JSON; empty if there is none.
+    opening : mapping of str to bytes
+        What is attached beside the state if it opens a file.
     probes : list of bytes
         JSON of the probes that were decided with the sample.
     offset : Offset, optional
@@ -76,6 +84,8 @@ class Entry:
     events: list[Event] = field(default_factory=list)
     sample: bytes = b""
     estimate: bytes = b""
+    candidate: bytes = b""
+    opening: Mapping[str, bytes] = field(default_factory=dict)
     probes: list[bytes] = field(default_factory=list)
     offset: Offset | None = None
     new_file: bool = False
@@ -90,7 +100,8 @@ class Entry:
         """Return topic and JSON of all records; the offset as published, if it was published already."""
         records = [("event", encode(event)) for event in self.events]
         records += [("probe", data) for data in self.probes]
-        records += [(topic, data) for topic, data in (("sample", self.sample), ("estimate", self.estimate)) if data]
+        parts = (("sample", self.sample), ("estimate", self.estimate), ("candidate", self.candidate))
+        records += [(topic, data) for topic, data in parts if data]
         if self.offset is not None:
             records.append(("offset", encode(degraded(self.offset, self.reason) if self.reason else self.offset)))
         return records
@@ -216,4 +227,6 @@ class DiskWriter:
         if first.new_file:
             self._recorder.start_new(None if first.model is None else {"model.toml": first.model})
         for entry in batch:
-            self._recorder.write(entry.records(), entry.time_utc_ns, state=entry.state, sync=entry is batch[-1])
+            self._recorder.write(
+                entry.records(), entry.time_utc_ns, state=entry.state, opening=entry.opening, sync=entry is batch[-1]
+            )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from compensator.clock import Clock
 from compensator.codes import Reason, Remark, ServiceWarning
@@ -80,12 +80,15 @@ class Journal:
         *,
         sample: bytes = b"",
         estimate: bytes = b"",
+        candidate: bytes = b"",
+        opening: Mapping[str, bytes] | None = None,
         probes: Sequence[Probe] = (),
         offset: Offset | None = None,
     ) -> Entry:
         """Queue a sample with the events since the previous one.
 
-        `state` is that of the compensation before the sample; `sample` and `estimate` are JSON, empty if there is none.
+        `state` is that of the compensation before the sample, `opening` what else a file that starts with it begins
+        with; `sample`, `estimate` and `candidate` are JSON, empty if there is none.
         """
         entry = Entry(
             time_utc_ns=time_utc_ns,
@@ -93,6 +96,8 @@ class Journal:
             events=self._events.drain(),
             sample=sample,
             estimate=estimate,
+            candidate=candidate,
+            opening=opening or {},
             probes=[encode(probe) for probe in probes],
             offset=offset,
             new_file=self._new_file,
@@ -128,10 +133,16 @@ class Journal:
         return degraded(entry.offset, entry.reason) if entry.offset is not None and entry.reason else entry.offset
 
     async def record(
-        self, time_utc_ns: int, state: bytes, *, probes: Sequence[Probe] = (), offset: Offset | None = None
+        self,
+        time_utc_ns: int,
+        state: bytes,
+        *,
+        opening: Mapping[str, bytes] | None = None,
+        probes: Sequence[Probe] = (),
+        offset: Offset | None = None,
     ) -> Offset | None:
         """Write the queued events, probes and an offset without a sample to disk; return the offset to be published."""
-        entry = self.enqueue(time_utc_ns, state, probes=probes, offset=offset)
+        entry = self.enqueue(time_utc_ns, state, opening=opening, probes=probes, offset=offset)
         await self.wait_briefly(entry)
         return self.resolve(entry)
 
@@ -162,10 +173,10 @@ class Journal:
             self._events.note(EventKind.RECORDING, text, RecordingData(code=RecordingCode.DISK_BACK, lost=lost).table())
         self._reason, self._error = reason, error or self._error
 
-    async def close(self, state: bytes) -> None:
+    async def close(self, state: bytes, opening: Mapping[str, bytes] | None = None) -> None:
         """Note that the service ends, and finish the recording without a time limit."""
         self._events.note(EventKind.STOP, "the service ends")
-        await self.record(self._clock.utc_ns(), state)
+        await self.record(self._clock.utc_ns(), state, opening=opening)
         closing = self._writer.close()
         while not (await asyncio.wait([closing], timeout=CLOSING_S))[0]:
             figures = f"The disk has not accepted the rest of the recording for {CLOSING_S:g} s."

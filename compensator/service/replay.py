@@ -52,7 +52,7 @@ class RecordedStep:
     run : dict of str to str
         Metadata of the file.
     records : dict of str to RawRecord
-        `sample`, `estimate` and `offset`, as far as present; a torn end lacks some.
+        `sample`, `estimate`, `candidate` and `offset`, as far as present; a torn end lacks some.
     events : list of Event
         Events. Those with smaller numbers were delayed by a full disk and are already in the state of the file.
     sample : Sample or None
@@ -181,7 +181,7 @@ def _attachment(contents: Contents, name: str, file: str) -> bytes:
 
 
 def execute(compensation: Compensation, name: str, arguments: dict[str, Any]) -> None:
-    """Execute a command, live or recorded; `adopt`, `back` and `probe` are handled elsewhere, not here."""
+    """Execute a command, live or recorded; those about models and `probe` are handled elsewhere, not here."""
     if name == CommandName.ZERO:
         mode = arguments.get("mode", "auto")
         compensation.zero(mode if mode in ("auto", "rest", "warm") else "auto")

@@ -7,8 +7,10 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any, NamedTuple
 
+from msgspec import UnsetType
+
 from compensator.clock import NS
-from compensator.messages import EstimateMessage, Offset, Sample
+from compensator.messages import EstimateMessage, Offset, Sample, Status
 
 #: Length of the history and of one point, ns.
 SPAN_NS = 24 * 3600 * NS
@@ -72,6 +74,12 @@ class MachineHistory:
             point |= {name: getattr(message, name) for name in _OFFSET}
             point["reasons"] = " ".join(message.reasons)
 
+    def add_candidate(self, status: Status) -> None:
+        """Add the prediction of the model in shadow, which comes with the status of a sample."""
+        point = self._points.get(status.time_utc_ns // STEP_NS)
+        if not isinstance(status.loop, UnsetType) and point is not None and point["seq"] == status.seq:
+            point["candidate_um"] = status.loop.y_pred_um
+
     def prune(self, now_ns: int) -> None:
         """Remove points older than a day."""
         oldest = (now_ns - SPAN_NS) // STEP_NS
@@ -119,6 +127,8 @@ class MachineHistory:
         found: dict[str, list[Any]] = {"t_s": [round(point["time_utc_ns"] / NS, 3) for point in points]}
         for name in COLUMNS:
             found[name] = [_short(point.get(name)) for point in points]
+        if any("candidate_um" in point for point in self._points.values()):
+            found["candidate_um"] = [_short(point.get("candidate_um")) for point in points]
         found["effects"] = [[_short(value) for value in point.get("effects", ())] for point in points]
         return found
 

@@ -130,7 +130,7 @@ async function showOne(prefix, count) {
   pictures(machine, past.history, found.now_s);
   list("reasons", machine.reasons.map((reason) => [wordLink(reason.code), `: ${reason.means} `, make("b", {}, "Action: "), reason.do]), "warning");
   list("warnings", machine.warnings.map((text, i) => [text, " ", wordLink(machine.warning_codes[i])]), "warning");
-  faulty(machine); now(machine); probe(machine.probe); events(machine.events); intervals(found.intervals); channels(machine); points(past.history);
+  faulty(machine); now(machine); probe(machine.probe); loop(machine.loop); events(machine.events); intervals(found.intervals); channels(machine); points(past.history);
 }
 
 function joined(before, news, now_s) {
@@ -138,7 +138,7 @@ function joined(before, news, now_s) {
   const cut = before.t_s.findIndex((t) => t >= news.t_s[0] - 60), keep = cut < 0 ? before.t_s.length : cut;
   const oldest = now_s - DAY_S, first = before.t_s.findIndex((t) => t >= oldest);
   const from = first < 0 ? keep : Math.min(first, keep);
-  return Object.fromEntries(Object.keys(news).map((name) => [name, [...before[name].slice(from, keep), ...news[name]]]));
+  return Object.fromEntries(Object.keys(news).map((name) => [name, [...(before[name] ?? before.t_s.map(() => null)).slice(from, keep), ...news[name]]]));
 }
 
 function sentence(machine) {
@@ -197,6 +197,23 @@ function probe(found) {
   element.className = found.wanted ? "note tone is-warn" : "note";
 }
 
+function loop(found) {
+  $("loop").hidden = !found;
+  if (!found) return;
+  setText($("loop-line"), found.line);
+  $("loop-line").className = found.phase === "proposed" ? "note tone is-warn" : "note";
+  $("loop-commands").hidden = found.phase !== "proposed";
+  setText($("loop-commands"), found.commands.join("\n"));
+  $("loop-picture").hidden = found.phase === "idle";
+}
+
+function shadow(frame, machine, history) {
+  if (!machine.loop || !history.candidate_um) return [];
+  const name = machine.loop.phase === "watching" ? "model before" : "candidate";
+  const other = history.residual_um.map((r, i) => [r, history.y_pred_um[i], history.candidate_um[i]].every(known) ? r + history.y_pred_um[i] - history.candidate_um[i] : null);
+  return [chart(frame, "Residual of both models", "µm", [{name: "present model", y: history.residual_um}, {name, y: other}])];
+}
+
 function tiles(element, pairs) {
   const key = JSON.stringify(pairs);
   if (element.dataset.key === key) return;
@@ -252,6 +269,7 @@ function pictures(machine, history, end) {
     : Array.from({length: count}, (_, i) => line(effects[i] ?? `effect ${i + 1}`, history.effects.map((one) => one[i] ?? null)));
   const probes = machine.probe ? [line("probes", history.y_pred_um.map((y, i) => [y, history.y_base_um[i], history.y_dtf_um[i], history.y_tdtf_um[i], ...history.effects[i]].every(known)
     ? y + history.y_base_um[i] - history.y_dtf_um[i] - history.y_tdtf_um[i] - history.effects[i].reduce((a, b) => a + b, 0) : null))] : [];
+  $("loop-picture").replaceChildren(...shadow(frame, machine, history));
   $("pictures").replaceChildren(
     chart(frame, "Offset, added to the commanded Y, with its standard deviation", "µm", [line("offset", history.y_offset_um, history.y_offset_std_um)], history.state),
     chart(frame, "Predicted deformation by path", "µm", [line("DTF (heat)", history.y_dtf_um), line("TDTF (air)", history.y_tdtf_um), ...several, ...probes]),

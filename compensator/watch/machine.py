@@ -15,7 +15,7 @@ from compensator.events import EventKind
 from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
 from compensator.watch.history import MachineHistory, usable
 from compensator.watch.sequence import Sequence
-from compensator.watch.words import TONES, ExplainedCode, Tone, age, explained, to_do
+from compensator.watch.words import LOOP_COMMANDS, TONES, ExplainedCode, Tone, age, explained, loop_text, to_do
 
 #: Kinds of messages by the part of their key after `thermal/`.
 KINDS = {"y/offset": "offset", "sample": "sample", "estimate": "estimate", "status": "status", "event": "event"}
@@ -142,6 +142,7 @@ class WatchedMachine:
             return True
         if isinstance(message, Status):
             self.numbers.started(message.started_utc_ns)
+            self.history.add_candidate(message)
         else:
             self.history.add(message)
         return self._keep(message)
@@ -281,6 +282,9 @@ class WatchedMachine:
             "last_malformed": self.last_malformed,
             "events": [self._event(event) for event in reversed(self.events)],
         }
+        loop = self._loop(status) if self._fresh(status, now_ns) else None
+        if loop is not None:
+            found["loop"] = loop
         found["probe"] = self._probe(status) if self._fresh(status, now_ns) else None
         return found | {name: getattr(status, name, None) for name in _STATUS}
 
@@ -299,6 +303,15 @@ class WatchedMachine:
             "std_um": status.wanted_std_um,
             "tolerance_um": status.wanted_tolerance_um,
         }
+
+    @staticmethod
+    def _loop(status: Status | None) -> dict[str, Any] | None:
+        """Return how the loop is, with its line and its commands; None for a machine without one."""
+        if status is None or isinstance(status.loop, UnsetType):
+            return None
+        found = msgspec.structs.asdict(status.loop)
+        commands = LOOP_COMMANDS if status.loop.phase in ("shadow", "proposed") else ()
+        return found | {"line": loop_text(found), "commands": list(commands)}
 
     def _fresh(self, message: Any, now_ns: int) -> bool:
         """Return whether a message is still valid by its own time."""

@@ -208,6 +208,7 @@ def detail(
         Text(""),
         numbers,
         *([Text(probe_text(machine["probe"]))] if machine["probe"] is not None else []),
+        *(Text(line) for line in _loop_lines(machine)),
         *([] if short else [Text(_about(machine), style="dim")]),
         *drawn(history, width - 4, short=short),
     ]
@@ -215,6 +216,15 @@ def detail(
     return Panel(
         Group(*parts), title=f"{machine['machine']}  ({machine['prefix']})", border_style=STYLES[machine["tone"]]
     )
+
+
+def _loop_lines(machine: dict[str, Any]) -> list[str]:
+    """Return what the service does about its model, and what a person can answer to a proposal."""
+    loop = machine.get("loop")
+    if loop is None:
+        return []
+    asked = loop["commands"] if loop["phase"] == "proposed" else []
+    return [loop["line"], *(f"  {command}" for command in asked)]
 
 
 def _verdict(machine: dict[str, Any]) -> Text:
@@ -315,6 +325,7 @@ def line(machine: dict[str, Any]) -> str:
         f"residual {signed(machine['residual_um'])} µm",
         *(reason["code"] for reason in machine["reasons"]),
         *(["probe wanted"] if machine["probe"] is not None and machine["probe"]["wanted"] else []),
+        *(["better model proposed"] if machine.get("loop", {}).get("phase") == "proposed" else []),
         *machine["warnings"],
     ]
     return "  ".join(words)

@@ -105,6 +105,29 @@ def probe_text(probe: dict[str, Any]) -> str:
     return f"No probe wanted ({figures}). {PROBE_FOR}"
 
 
+#: What a person can answer to a candidate; the first is the yes.
+LOOP_COMMANDS = ("compensator adopt --candidate --config machine.toml", "compensator dismiss --config machine.toml")
+
+
+def loop_text(loop: Mapping[str, Any]) -> str:
+    """Return in one line what the service does about its model.
+
+    Parameters
+    ----------
+    loop : mapping
+        `loop` of a status.
+    """
+    effects = ", ".join(loop["effects"]) or "no added effect"
+    words = {
+        "idle": "Model: nothing better is known.",
+        "shadow": f"Model: a candidate with {effects} runs beside the present one. {loop['text']}.",
+        "proposed": f"Model: a better one is proposed, with {effects}. {loop['text']}.",
+        "watching": f"Model: the one before ({effects}) goes on beside the adopted one. {loop['text']}.",
+    }
+    text = words[loop["phase"]]
+    return f"{text} A diagnosis is in progress." if loop["diagnosing"] else text
+
+
 def here(time_ns: int) -> datetime:
     """Return a time in this computer's zone; recordings and messages stay in UTC.
 

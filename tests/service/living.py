@@ -18,11 +18,15 @@ from compensator.clock import VirtualClock
 from compensator.config import Config, LoadedConfig
 from compensator.messages import Event, encode, number
 from compensator.model.model_file import parse_model, read_model_bytes
-from compensator.recording.live_file import TOPICS, TOPICS_WITH_PROBES
+from compensator.recording.live_file import topics_of
 from compensator.recording.reading import first_sequence, recordings
 from compensator.recording.recorder import McapRecorder
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.daemon import Daemon
+from compensator.service.loop.live import LoopParts
+from compensator.service.loop.loop import StartDiagnosis
+from compensator.service.loop.resuming import resume_loop
+from compensator.service.loop.weighing import Diagnosed
 from compensator.service.offset_checkpoint import OffsetCheckpoint
 from compensator.service.replay import apply, opening_of, steps_of
 from compensator.service.transfer.model_store import ModelStore, check_model
@@ -57,11 +61,16 @@ class Machine:
 
         #: Promises of commands; while one is open simulated time does not run away from the thread that works on it.
         self.promised: list[Future[Any]] = []
+        #: Whether simulated time waits for diagnoses and what follows from them.
+        self.waits_for_diagnoses = True
+        self.at_poll: Callable[[], Any] = lambda: None
 
         async def advance(t_s: float) -> None:
             self.world.advance_to(t_s)
             self.promised = [promise for promise in self.promised if not promise.done()]
             if self.promised:
+                await asyncio.sleep(PATIENCE_S)
+            while self.waits_for_diagnoses and self.daemon is not None and self.daemon.is_diagnosing:
                 await asyncio.sleep(PATIENCE_S)
 
         self.clock = VirtualClock(START_NS, advance)
@@ -81,6 +90,10 @@ class Machine:
             self.promised.append(reply)
         return reply
 
+    async def diagnose(self, wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+        """Stand in for the process of a diagnosis."""
+        raise NotImplementedError
+
     async def run(self, samples: int, until: Callable[[Outcome], bool] = lambda outcome: False) -> None:
         """Start the service, run it, end it cleanly."""
         data = self.store.in_use()
@@ -92,8 +105,12 @@ class Machine:
             self.recordings,
             MACHINE,
             {"config.toml": self.config_bytes, "model.toml": data},
-            topics=TOPICS if self.config.probe is None else TOPICS_WITH_PROBES,
+            topics=topics_of(probes=self.config.probe is not None, loop=self.config.loop is not None),
         )
+        core = resume_loop(loaded, resumed)
+        loop = None
+        if core is not None:
+            loop = LoopParts(core=core, model=data, store=self.store, diagnose=self.diagnose)
         daemon = self.daemon = Daemon(
             config=self.config,
             compensation=resumed.compensation,
@@ -106,6 +123,7 @@ class Machine:
             store=self.store,
             notes=resumed.notes,
             checkpoint=note,
+            loop=loop,
         )
 
         def step(outcome: Outcome) -> None:
@@ -114,7 +132,7 @@ class Machine:
             if until(outcome):
                 daemon.stop()
 
-        await daemon.run(samples=samples, on_sample=step)
+        await daemon.run(samples=samples, on_sample=step, on_poll=lambda: self.at_poll())
 
     async def run_and_kill(self, samples: int, *, torn: int = 0) -> None:
         """Run the service and leave on disk what a kill after the last sample leaves, less some bytes."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+import pytest
 
 from compensator.events import EventKind
-from compensator.service.loop.run import LoopRun
+from compensator.service.loop.record import usable_table
+from compensator.service.loop.run import Diagnosed, LoopRun
 from compensator.service.transfer.model_store import sha256_of
+from compensator.service.transfer.second_opinion import sensor_suspected
 from tests.service.looping import DAY, Night, decisions, errors, extended, machine, run, settings, shown
 from tests.service.test_restart import QUILL
 
@@ -34,3 +39,201 @@ def test_an_effect_is_found_at_night_shadowed_and_adopted_without_a_jump() -> No
     # The second night finds what is there already.
     assert ("nothing", "unchanged") in [decision[1:] for decision in found[3:]]
     assert all(model == QUILL for _, model in night.asked)
+
+
+def test_a_candidate_that_is_worse_is_never_adopted() -> None:
+    """The diagnosis has found the coolant, and today it does not act."""
+    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    steps = run(loop, machine(2 * DAY, acts=lambda i: float(i < NIGHT)))
+    found = [decision[1:] for decision in decisions(steps)]
+    assert ("end", "worse") in found and "adopt" not in [step for step, _ in found]
+    assert loop.effects == ()
+
+
+def test_a_candidate_without_a_clear_difference_ends_after_its_time() -> None:
+    tables = {"loop": {"policy": "adopt", "shadow_h": 6.0, "watch_h": 24.0}}
+    loop = LoopRun(settings(**tables), QUILL, Night(shown(extended(0.02, 0.001)), shown(None, "adequate")))
+    steps = run(loop, machine(3 * DAY, acts=lambda i: 0.0))
+    found = [decision[1:] for decision in decisions(steps)]
+    assert ("end", "no_difference") in found and "adopt" not in [step for step, _ in found]
+
+
+def test_when_the_effect_ends_the_service_goes_back_by_itself() -> None:
+    night = Night(shown(extended()), shown(extended()))
+    loop = LoopRun(settings(), QUILL, night)
+    ends = 2 * DAY
+    steps = run(loop, machine(3 * DAY, acts=lambda i: float(i < ends)))
+    found = [(seq, step) for seq, step, _ in decisions(steps) if step in ("adopt", "back")]
+    assert [step for _, step in found] == ["adopt", "back"]
+    assert ends < found[1][0] < ends + DAY and loop.effects == () and loop.phase == "idle"
+    # It is not adopted again while it is remembered.
+    assert decisions(steps)[-1][1:] == ("nothing", "avoided")
+
+
+def test_a_diagnosis_that_finds_nothing_brings_the_calibrated_model_into_shadow() -> None:
+    night = Night(shown(extended()), shown(None, "adequate"))
+    loop = LoopRun(settings(), QUILL, night)
+    ends = 32 * 60
+    steps = run(loop, machine(3 * DAY, acts=lambda i: float(i < ends)))
+    found = decisions(steps)
+    assert next(step for _, step, _ in found if step in ("adopt", "back")) == "adopt"
+    assert loop.effects == ()
+
+
+@pytest.mark.parametrize("verdict", ["unexplained", "failed"])
+def test_nothing_follows_from_a_diagnosis_that_explains_nothing(verdict: str) -> None:
+    loop = LoopRun(settings(), QUILL, Night(Diagnosed(verdict, (), None, "text", "look at the sensor")))
+    steps = run(loop, machine(DAY + 1))
+    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "night"), ("nothing", verdict)]
+    assert not any(step.candidate for step in steps)
+
+
+@pytest.mark.parametrize(
+    ("model", "why"),
+    [
+        (b"rubbish", "refused"),
+        (QUILL.replace(b"period_s = 60", b"period_s = 30"), "refused"),
+        (extended().replace(b"coolant_degc", b"no_such_channel"), "refused"),
+        (extended().replace(b"0.0002567", b"0.0005"), "refused"),
+    ],
+    ids=["rubbish", "nothing new", "unknown channel", "other paths"],
+)
+def test_rubbish_is_refused(model: bytes, why: str) -> None:
+    found = Diagnosed("explained", ("input:coolant_degc",), model, "text")
+    loop = LoopRun(settings(), QUILL, Night(found))
+    steps = run(loop, machine(DAY + 1))
+    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "night"), ("nothing", why)]
+
+
+def test_an_effect_of_the_measurement_is_never_part_of_a_candidate() -> None:
+    drift = b'\n[[effect]]\nkind = "drift"\nrate_um_per_h = 0.2\n'
+    loop = LoopRun(settings(), QUILL, Night(Diagnosed("explained", ("drift",), QUILL + drift, "text")))
+    steps = run(loop, machine(DAY + 1))
+    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "night"), ("nothing", "refused")]
+
+
+CHECKED = {"plausibility": {"false_alarm_days": 30.0, "residual_std_um": 0.6, "residual_correlation_min": 30.0}}
+
+
+def test_a_sensor_fault_in_the_middle_of_a_shadow_begins_the_comparison_anew() -> None:
+    """T_Q drifts under both models; the candidate has an effect that is there."""
+
+    def drifting(i: int, values: dict[str, float]) -> None:
+        if NIGHT + 240 <= i < NIGHT + 600:
+            values["t_q_degc"] += 0.01 * (i - NIGHT - 240)
+
+    loop = LoopRun(settings(**CHECKED), extended(), Night(shown(None, "adequate")))
+    steps = run(loop, machine(2 * DAY, change=drifting))
+    suspected = [s for s in steps if any(r.startswith("implausible") for r in s.outcome.offset.reasons)]
+    assert suspected, "the fault was not seen"
+    assert decisions(steps)[0][0] == NIGHT
+
+
+def test_a_creeping_mount_does_not_make_a_better_model() -> None:
+    """From the night on Y creeps by 1 µm/h; the candidate explains it by the coolant, which does not act."""
+    creep = lambda i: max(i - NIGHT, 0) / 60.0  # noqa: E731
+    loop = LoopRun(settings(), QUILL, Night(shown(extended(1.0))))
+    steps = run(loop, machine(2 * DAY, acts=lambda i: 0.0, more=creep))
+    assert "adopt" not in [step for _, step, _ in decisions(steps)]
+
+
+def test_a_hand_on_the_machine_is_not_compared() -> None:
+    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    source = machine(3 * DAY)
+    run(loop, source, NIGHT + 60)
+    before = run(loop, source, 1)[0].candidate
+    loop.compensation.hold()
+    held = run(loop, source, 600)
+    assert before is not None and held[-1].candidate is not None
+    assert held[-1].candidate.hours <= before.hours + 0.5
+    assert "adopt" not in [step for _, step, _ in decisions(held)]
+    loop.compensation.resume()
+    assert "adopt" in [step for _, step, _ in decisions(run(loop, source, 900))]
+
+
+def test_a_missing_channel_of_the_candidate_does_not_judge_it() -> None:
+    def missing(i: int, values: dict[str, float]) -> None:
+        if i > NIGHT + 30:
+            values["coolant_degc"] = math.nan
+
+    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
+    steps = run(loop, machine(2 * DAY, change=missing))
+    assert "adopt" not in [step for _, step, _ in decisions(steps)]
+    last = [step.candidate for step in steps if step.candidate is not None][-1]
+    assert last.hours <= 1.0 and "channel_missing:coolant_degc" in last.reasons
+
+
+def test_no_diagnosis_while_a_sensor_is_suspected() -> None:
+    night = Night(shown(extended()))
+    loop = LoopRun(settings(**CHECKED), QUILL, night)
+
+    def drifting(i: int, values: dict[str, float]) -> None:
+        values["y_um"] += 0.02 * max(i - NIGHT + 600, 0)
+
+    steps = run(loop, machine(DAY + 60, acts=lambda i: 0.0, change=drifting))
+    at_night = steps[NIGHT].outcome.offset.reasons
+    assert any(reason.startswith("implausible") for reason in at_night)
+    if "implausible:model" not in at_night:
+        assert not night.asked
+
+
+def test_a_run_continues_from_its_state_with_the_same_bits() -> None:
+    def whole() -> LoopRun:
+        return LoopRun(settings(), QUILL, Night(shown(extended())))
+
+    one, other = whole(), whole()
+    source, again = machine(NIGHT + 900), machine(NIGHT + 900)
+    run(one, source, NIGHT + 300)
+    run(other, again, NIGHT + 300)
+    resumed = whole()
+    resumed.restore(other.state())
+    for a, b in zip(run(one, source), run(resumed, again), strict=True):
+        assert (a.outcome.offset, a.candidate, a.events) == (b.outcome.offset, b.candidate, b.events)
+    assert one.effects == resumed.effects == ("input:coolant_degc",)
+
+
+def test_a_kill_in_the_middle_of_a_diagnosis_makes_it_again() -> None:
+    night = Night(shown(extended()))
+    loop = LoopRun(settings(), QUILL, night)
+    source = machine(DAY + 60)
+    run(loop, source, NIGHT + 1)
+    assert len(night.asked) == 1
+    again = LoopRun(settings(), QUILL, night)
+    again.restore(loop.state())
+    steps = run(again, source, 3)
+    assert len(night.asked) == 2 and steps[-1].candidate is not None
+
+
+def test_between_two_adoptions_is_a_day() -> None:
+    night = Night(shown(extended(1.5)), shown(extended(3.0)))
+    tables = {"loop": {"policy": "adopt", "shadow_h": 6.0}}
+    loop = LoopRun(settings(**tables), QUILL, night)
+    steps = run(loop, machine(3 * DAY))
+    adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
+    assert len(adopted) == 2 and adopted[1] - adopted[0] >= DAY
+
+
+def test_a_proposal_is_withdrawn_when_it_is_no_longer_better() -> None:
+    tables = {"loop": {"policy": "propose", "shadow_h": 6.0}}
+    loop = LoopRun(settings(**tables), QUILL, Night(shown(extended())))
+    ends = NIGHT + 480
+    steps = run(loop, machine(NIGHT + 2 * DAY, acts=lambda i: float(i < ends)))
+    found = [decision[1:] for decision in decisions(steps)]
+    assert found[:3] == [("diagnose", "night"), ("shadow", ""), ("propose", "")]
+    assert ("withdraw", "") in found or ("end", "worse") in found
+    assert loop.effects == () and {step.model_sha256 for step in steps} == {sha256_of(QUILL)}
+
+
+def test_the_table_of_a_diagnosis_leaves_out_what_must_not_be_used() -> None:
+    loop = LoopRun(settings(**CHECKED), QUILL, Night(shown(None, "adequate")))
+    source = machine(900, acts=lambda i: 0.0, more=lambda i: 0.05 * max(i - 500, 0))
+    steps = run(loop, source, 300)
+    loop.compensation.hold()
+    steps += run(loop, source, 60)
+    loop.compensation.resume()
+    steps += run(loop, source)
+    table = usable_table([step.outcome for step in steps])
+    y = table.columns["y_um"]
+    assert np.isnan(y[300:360]).all() and np.isfinite(y[100:300]).all() and np.isfinite(table.columns["t_q_degc"]).all()
+    alarm = next(i for i, s in enumerate(steps) if sensor_suspected(s.outcome.offset.reasons))
+    assert np.isnan(y[alarm - 59 : alarm + 1]).all()

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
+from msgspec.structs import replace as replace_fields
 
 from compensator.config import Config
 from compensator.errors import DataError
@@ -17,7 +18,7 @@ from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Shadow, candidate_message
 from compensator.service.loop.state import LoopState, decode_loop
-from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh
+from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
 from compensator.service.status import Zero
 from compensator.service.transfer.second_opinion import described
 
@@ -55,6 +56,8 @@ class ModelLoop:
         if config.loop is None:
             raise DataError("the configuration has no table [loop]")
         self._config = config
+        #: The present model.
+        self.present = present
         data = attachments.get(LOOP_STATE)
         state = decode_loop(data) if data is not None else None
         self.loop = Loop(config.loop, present.period_s, effect_names(present), state)
@@ -96,15 +99,22 @@ class ModelLoop:
 
     # ------------------------------------------------------------------ between two samples
 
-    def weigh(self, found: Diagnosed, *, calibrated: bytes, present: ThermalModel) -> Weighed:
+    def weigh(self, found: Diagnosed, *, calibrated: bytes) -> Weighed:
         """Return what follows from a diagnosis; `receive` decides by it."""
         shadow = self.shadow.compensation.model if self.shadow is not None and self.state.shadow is not None else None
-        weighed = weigh(found, self._config, calibrated=calibrated, present=present, shadow=shadow)
+        weighed = weigh(found, self._config, calibrated=calibrated, present=self.present, shadow=shadow)
+        return self._of_its_time(weighed)
+
+    def plain(self, found: Diagnosed) -> Weighed:
+        """Return a diagnosis from which nothing follows."""
+        return self._of_its_time(Weighed(without_candidate(found), None))
+
+    def _of_its_time(self, weighed: Weighed) -> Weighed:
         running = self.state.diagnosis
         if running is None:
             return weighed
-        times = {"from_utc_ns": running.from_utc_ns, "to_utc_ns": running.to_utc_ns}
-        return replace(weighed, data=msgspec.structs.replace(weighed.data, **times))
+        data = replace_fields(weighed.data, from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns)
+        return replace(weighed, data=data)
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis."""
@@ -138,6 +148,7 @@ class ModelLoop:
         handover = present.status.handover
         new.compensation.continue_from(replace(handover, model_changed=present.status.zero is not None))
         self.loop.exchanged(now_ns, present.model.sha256)
+        self.present = new.compensation.model
         self.shadow = Shadow(present, data) if self.state.shadow is not None else None
         return new.compensation, new.data
 

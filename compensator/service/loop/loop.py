@@ -360,11 +360,12 @@ class Loop:
             return []
         if running.attempts > 1:
             state.diagnosis = None
-            data = LoopData(step=LoopAction.NOTHING, why="interrupted")
+            data = LoopData(step=LoopAction.END, why="interrupted")
             return [
                 Note(EventKind.LOOP, "a diagnosis was interrupted twice: the next one is made at night", data.table())
             ]
-        state.diagnosis = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="")
+        again = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="", why="again")
+        state.diagnosis = again
         return [self._diagnosis_begins()]
 
     def _avoid(self, effects: Sequence[str], now_ns: int) -> None:

@@ -45,6 +45,12 @@ def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
     )
 
 
+def is_probed(table: Table) -> bool:
+    """Return whether Y of a table was probed: its values stand in rows of their own, without a temperature."""
+    measured = np.isfinite(table.columns["y_um"])
+    return bool(measured.any()) and not bool(np.isfinite(table.columns["t_q_degc"][measured]).any())
+
+
 def table_of_rows(rows: Sequence[tuple[Sample, Offset | None]], probes: Sequence[Probe], name: str) -> Table:
     """Return samples with their offsets, and decided probes, as the table of a diagnosis; see `usable_table`."""
     names = dict.fromkeys(channel for sample, _ in rows for channel in sample.channels)

@@ -178,7 +178,7 @@ class LoopRun:
             notes.append(self._exchange(now_ns))
         found, self._found = self._found, None
         if found is not None:
-            weighed = core.weigh(found, calibrated=self._calibrated, present=self._compensation.model)
+            weighed = core.weigh(found, calibrated=self._calibrated)
             notes.append(Note(EventKind.DIAGNOSIS, found.text, weighed.data.table()))
             notes += core.receive(weighed.data, now_ns)
             running = core.state.diagnosis

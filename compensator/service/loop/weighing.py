@@ -59,6 +59,10 @@ class Weighed:
     data: DiagnosisData
     candidate: bytes | None
 
+    def lasting(self, seconds: float) -> Weighed:
+        """Return it with the time that the diagnosis took."""
+        return Weighed(replace(self.data, seconds=seconds), self.candidate)
+
 
 def weigh(
     found: Diagnosed, config: Config, *, calibrated: bytes, present: ThermalModel, shadow: ThermalModel | None
@@ -80,7 +84,7 @@ def weigh(
     data = found.model if found.verdict in _EXPLAINING and found.effects else None
     if not found.effects and found.verdict != FAILED and present.sha256 != base.sha256:
         data = calibrated
-    plain = DiagnosisData(verdict=found.verdict, effects=list(found.effects), needs=found.needs or found.text)
+    plain = without_candidate(found)
     if data is None:
         return Weighed(plain, None)
     try:
@@ -105,6 +109,11 @@ def weigh(
         in_shadow=in_shadow,
     )
     return Weighed(weighed, data)
+
+
+def without_candidate(found: Diagnosed) -> DiagnosisData:
+    """Return the data of a diagnosis from which no candidate follows."""
+    return DiagnosisData(verdict=found.verdict, effects=list(found.effects), needs=found.needs or found.text)
 
 
 def effect_names(model: ThermalModel) -> list[str]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -26,20 +25,19 @@ from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome, slowest_min
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
+from compensator.service.loop.live import LiveLoop
 from compensator.service.publisher import Sender, refusal
 from compensator.service.status import Zero
 from compensator.service.transfer.candidate import WARM_UP, ModelCandidate, warm_up
 from compensator.service.transfer.comparison import not_judged
 from compensator.service.transfer.model_store import ModelStore, check_model, sha256_of
 from compensator.service.transfer.second_opinion import described, refuse_if_worse, second_opinion
+from compensator.service.transfer.turns import give_way
 
 log = logging.getLogger("compensator")
 
 #: Longest payload of a command that contains a model, bytes.
 LONGEST_MODEL = 1_000_000
-#: Number of samples of a warm-up after which the thread sleeps briefly, so that it never delays a sample.
-SAMPLES_PER_TURN = 10
-MOMENT_S = 0.001
 _ADVICE = "wait, zero the machine at rest, or use --force"
 
 
@@ -54,11 +52,14 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         The model file; empty if it is already in the store.
     force : bool
         Adopt it even if the recordings do not determine its state, or it is clearly worse than the present one.
+    candidate : bool
+        Adopt the candidate of the loop.
     """
 
     sha256: str = ""
     model: str = ""
     force: bool = False
+    candidate: bool = False
 
     @classmethod
     def of(cls, action: str, arguments: dict[str, Any]) -> ModelRequest:
@@ -74,7 +75,7 @@ class ModelRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         except msgspec.ValidationError as error:
             expected = "sha256 and model (texts), force (true or false)"
             raise ServiceError(f"{action}: {error}; expected {expected}") from error
-        if action == CommandName.ADOPT and not (request.sha256 or request.model):
+        if action == CommandName.ADOPT and not (request.sha256 or request.model or request.candidate):
             raise ServiceError("adopt: expected model, the text of a model file, or sha256, that of one adopted before")
         if request.model and request.sha256 not in ("", found := sha256_of(request.model.encode())):
             raise ServiceError(f"adopt: the model's sha256 is {found}, not {request.sha256}")
@@ -118,6 +119,8 @@ class Adoption:
         For events, the recording of another model, and the history of models.
     running : callable
         Returns the running compensation.
+    loop : LiveLoop, optional
+        The loop, which begins anew after a change of the model.
     """
 
     def __init__(
@@ -130,6 +133,7 @@ class Adoption:
         *,
         clock: Clock,
         running: Callable[[], Compensation],
+        loop: LiveLoop | None = None,
     ) -> None:
         self._config = config
         self._recordings = recordings
@@ -138,14 +142,16 @@ class Adoption:
         self._journal = journal
         self._clock = clock
         self._running = running
+        self._loop = loop
         self._order: _Order | None = None
         self._ended = False
 
     def begin(self, action: str, request: ModelRequest, reply: Future[dict[str, Any]], sender: Sender) -> None:
         """Begin to prepare a model; the reply comes once it is ready or refused. In the loop only."""
-        if self._store is None or self._ended or self._order is not None:
+        exchanging = self._loop is not None and self._loop.is_exchanging
+        if self._store is None or self._ended or self._order is not None or exchanging:
             why = f"{action}: this service cannot change its model now"
-            if self._order is not None:
+            if self._order is not None or exchanging:
                 why = f"{action}: another model is being prepared; retry after the next sample"
             self._events.note(EventKind.COMMAND_REFUSED, why, {"name": action, "ok": False} | sender.data())
             reply.set_result(refusal(why))
@@ -178,6 +184,8 @@ class Adoption:
         after = new.status
         difference = after.target_um - before.target_um
         self._journal.start_new_file(order.ready.data)
+        if self._loop is not None:
+            self._loop.model_changed(new, order.ready.data, back=order.action == CommandName.BACK)
         named = [f"{one.model.name} ({one.model.sha256[:12]})" for one in (new, old)]
         self._events.note(
             EventKind.ADOPT,
@@ -266,13 +274,13 @@ class Adoption:
     def _compared(self, running: ThermalModel, model: ThermalModel, zero: Zero | None) -> ComparisonData:
         if zero is None:
             return not_judged(NotJudged.NO_ZERO)
-        return second_opinion(self._recordings, self._config, running, model, between_samples=_give_way())
+        return second_opinion(self._recordings, self._config, running, model, between_samples=give_way())
 
     def _candidate(self, model: ThermalModel, zero: Zero | None, force: bool) -> ModelCandidate:
         if zero is None:
             return ModelCandidate(compensation=Compensation(self._config, model))
         try:
-            candidate = warm_up(self._recordings, self._config, model, between_samples=_give_way())
+            candidate = warm_up(self._recordings, self._config, model, between_samples=give_way())
         except DataError as error:
             if not force:
                 raise ServiceError(f"model {model.name}: no warm-up: {error}; {_ADVICE}") from error
@@ -293,16 +301,3 @@ def _model_file(store: ModelStore, order: _Order) -> bytes:
     if order.action == CommandName.BACK:
         return store.before()
     return order.request.model.encode() if order.request.model else store.load(order.request.sha256)
-
-
-def _give_way() -> Callable[[], None]:
-    """Return a function that lets the thread of the service run first, every few samples."""
-    count = 0
-
-    def pause() -> None:
-        nonlocal count
-        count += 1
-        if count % SAMPLES_PER_TURN == 0:
-            time.sleep(MOMENT_S)
-
-    return pause

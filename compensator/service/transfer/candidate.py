@@ -72,7 +72,12 @@ class ModelCandidate:
 
 
 def warm_up(
-    folder: Path, config: Config, model: ThermalModel, *, between_samples: Callable[[], None] = lambda: None
+    folder: Path,
+    config: Config,
+    model: ThermalModel,
+    *,
+    between_samples: Callable[[], None] = lambda: None,
+    probes: bool = False,
 ) -> ModelCandidate:
     """Run a new compensation up to the end of the recordings, with the zero that is current there.
 
@@ -89,6 +94,8 @@ def warm_up(
         The new model.
     between_samples : callable
         Called after each sample, so that a thread can yield to the service.
+    probes : bool
+        Whether recorded probes correct its prediction.
 
     Raises
     ------
@@ -98,7 +105,7 @@ def warm_up(
     compensation = Compensation(config, model)
     compensation.begin(None)
     window = window_of(folder, config.machine.name, slowest_min(model), between_samples)
-    zero, run = window.zero, RecordedRun(config, compensation)
+    zero, run = window.zero, RecordedRun(config, compensation, probes=probes)
     if window.at_rest is not None:
         run.process(window.at_rest)
     elif zero.is_absolute and model.inputs == "changes":

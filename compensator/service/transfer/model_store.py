@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from compensator.atomic_write import replace_file
 from compensator.config import Config
@@ -23,12 +24,13 @@ _FILE = "adopted.json"
 
 
 class Adopted(msgspec.Struct, frozen=True, kw_only=True):
-    """A change of the model: hash and name of the model used from then on, time, and the command."""
+    """A change of the model: hash and name of the model from then on, time, command, and whether the loop did it."""
 
     sha256: str
     name: str
     time_utc_ns: int
     action: Literal["adopt", "back"] = "adopt"
+    by: Literal["loop"] | UnsetType = UNSET
 
 
 class _Contents(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
@@ -73,6 +75,16 @@ class ModelStore:
             raise ServiceError("back: the configured model is in use; no previous model was adopted")
         return self.load(adopted[-2].sha256) if len(adopted) > 1 else self.configured
 
+    def calibrated(self) -> bytes:
+        """Return the model file that a person adopted last, or else the configured one."""
+        by_person = [one for one in self._read().in_use if one.by is UNSET]
+        return self.load(by_person[-1].sha256) if by_person else self.configured
+
+    def has_before(self, sha256: str) -> bool:
+        """Return whether `back` would return to the model of a hash."""
+        in_use = self._read().in_use
+        return bool(in_use) and sha256 == (in_use[-2].sha256 if len(in_use) > 1 else self._configured_sha256)
+
     def load(self, sha256: str) -> bytes:
         """Return a model file of the store."""
         if re.fullmatch("[0-9a-f]{64}", sha256) is None:
@@ -86,22 +98,24 @@ class ModelStore:
             raise ServiceError(f"{path}: sha256 {sha256_of(data)}, expected that of its name; the file was changed")
         return data
 
-    def adopt(self, data: bytes, *, name: str, time_utc_ns: int) -> None:
+    def adopt(self, data: bytes, *, name: str, time_utc_ns: int, by_loop: bool = False) -> None:
         """Store a model and use it from now on."""
         contents = self._read()
-        entry = Adopted(sha256=sha256_of(data), name=name, time_utc_ns=time_utc_ns)
+        by: Literal["loop"] | UnsetType = "loop" if by_loop else UNSET
+        entry = Adopted(sha256=sha256_of(data), name=name, time_utc_ns=time_utc_ns, by=by)
         contents.in_use.append(entry)
         contents.history.append(entry)
         self._store(f"{entry.sha256}.toml", data)
         self._write(contents)
 
-    def back(self, *, name: str, time_utc_ns: int) -> None:
+    def back(self, *, name: str, time_utc_ns: int, by_loop: bool = False) -> None:
         """Return to the previous model; the file of the present one remains."""
         contents = self._read()
+        by: Literal["loop"] | UnsetType = "loop" if by_loop else UNSET
         if contents.in_use:
             contents.in_use.pop()
         sha256 = contents.in_use[-1].sha256 if contents.in_use else self._configured_sha256
-        contents.history.append(Adopted(sha256=sha256, name=name, time_utc_ns=time_utc_ns, action="back"))
+        contents.history.append(Adopted(sha256=sha256, name=name, time_utc_ns=time_utc_ns, action="back", by=by))
         self._write(contents)
 
     # ------------------------------------------------------------------ files

@@ -1,0 +1,79 @@
+"""`python -m compensator.commands.loop_diagnosis FOLDER`: a diagnosis that the service starts as a process of its own.
+
+It reads `job.json` and `calibrated.toml` in the folder and writes `diagnosis.json`, `model.toml`, `report.html`, and at
+last `result.json`. It limits itself before it reads anything, and ends with the service that started it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import signal
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from compensator.blas import one_thread_from_start
+
+one_thread_from_start()
+
+from compensator.service.loop.job import CALIBRATED, JOB, RESULT, Job, Result, read_job  # noqa: E402
+
+#: Largest file that it may write, bytes.
+_LARGEST_FILE = 100_000_000
+#: `prctl` option of Linux: the signal that a process gets when its parent ends.
+_PR_SET_PDEATHSIG = 1
+
+
+def main() -> int:
+    """Diagnose what a job names."""
+    folder = Path(sys.argv[1])
+    job = read_job(folder / JOB)
+    _limit(job)
+    from compensator.errors import CompensatorError
+
+    try:
+        result = _diagnose(job, folder)
+    except CompensatorError as error:
+        result = Result(verdict="failed", text=f"the diagnosis failed: {error}", needs=str(error))
+    result.write(folder / RESULT)
+    return 0
+
+
+def _diagnose(job: Job, folder: Path) -> Result:
+    from compensator.api.loop import diagnosis_of_table, summarised
+    from compensator.service.loop.job import read_record
+    from compensator.service.loop.record import table_of_rows
+
+    rows, probes = read_record(job)
+    table = table_of_rows(rows, probes, job.machine)
+    found = diagnosis_of_table(table, (folder / CALIBRATED).read_bytes(), probe_std_um=job.probe_std_um)
+    found.save_all(folder)
+    short = summarised(found)
+    return Result(verdict=short.verdict, effects=list(short.effects), text=short.text, needs=short.needs)
+
+
+def _limit(job: Job) -> None:
+    """Take the lowest priority and the limits of the job; end with the parent."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != job.parent:  # it ended before
+        raise SystemExit(1)
+    with suppress(OSError):
+        os.nice(19)
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    limits = (
+        (resource.RLIMIT_AS, round(job.memory_mb * 1e6)),
+        (resource.RLIMIT_CPU, round(job.time_limit_min * 60.0)),
+        (resource.RLIMIT_FSIZE, _LARGEST_FILE),
+        (resource.RLIMIT_CORE, 0),
+    )
+    for limit, value in limits:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(limit, (value, value))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

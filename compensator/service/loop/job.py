@@ -1,0 +1,99 @@
+"""What the service and the process of its diagnosis hand each other: files in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from compensator.atomic_write import replace_file
+from compensator.errors import DataError
+from compensator.messages import Offset, Probe, Sample
+from compensator.recording.reading import messages, recordings
+
+#: Files in the folder of a diagnosis: the job with the calibrated model; and the result, written last.
+JOB, CALIBRATED, RESULT = "job.json", "calibrated.toml", "result.json"
+
+
+class Job(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is diagnosed, within which limits.
+
+    Parameters
+    ----------
+    recordings, machine : str
+        Folder of the recordings and name of the machine.
+    from_utc_ns, to_utc_ns : int
+        Time that is diagnosed, ns since 1970 UTC.
+    probe_std_um : float or None
+        Standard deviation of one probe, µm.
+    memory_mb, time_limit_min : float
+        Limits of memory and computing time.
+    parent : int
+        Process that it ends with.
+    """
+
+    recordings: str
+    machine: str
+    from_utc_ns: int
+    to_utc_ns: int
+    probe_std_um: float | None
+    memory_mb: float
+    time_limit_min: float
+    parent: int
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What came out; see `weighing.Diagnosed`. The model is in a file of its own."""
+
+    verdict: str
+    effects: list[str] = []
+    text: str = ""
+    needs: str = ""
+
+    def write(self, path: Path) -> None:
+        """Write it atomically."""
+        replace_file(path, msgspec.json.encode(self))
+
+
+def read_job(path: Path) -> Job:
+    """Read a job.
+
+    Raises
+    ------
+    DataError
+        If it is none.
+    """
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Job)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def read_record(job: Job) -> tuple[list[tuple[Sample, Offset | None]], list[Probe]]:
+    """Return the samples of a job with their offsets, and its probes."""
+    samples: dict[int, Sample] = {}
+    offsets: dict[int, Offset] = {}
+    probes: list[Probe] = []
+    for path in _files(job):
+        for message in messages(path, ("sample", "offset", "probe")):
+            if not job.from_utc_ns < message.time_utc_ns <= job.to_utc_ns:
+                continue
+            if isinstance(message, Sample):
+                samples[message.seq] = message
+            elif isinstance(message, Offset):
+                offsets[message.seq] = message
+            else:
+                probes.append(message)
+    return [(samples[seq], offsets.get(seq)) for seq in sorted(samples)], probes
+
+
+def _files(job: Job) -> list[Path]:
+    """Return the recordings that may contain something of the time: not those that were finished before it."""
+    found = recordings(Path(job.recordings), job.machine)
+    newer = [i for i, path in enumerate(found) if _first_ns(path) <= job.from_utc_ns]
+    return found[newer[-1] if newer else 0 :]
+
+
+def _first_ns(path: Path) -> int:
+    first = next(iter(messages(path, ("sample",))), None)
+    return first.time_utc_ns if first is not None else 2**63

@@ -1,0 +1,361 @@
+"""The loop in the running service: diagnoses, warm-ups and stored models as tasks beside the samples.
+
+Everything that reaches the loop from outside does so between two samples and is recorded as an event, so that a replay
+can hand it over again. A defect of the loop ends the shadow, never a sample.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from compensator.clock import NS, Clock
+from compensator.config import Config
+from compensator.errors import CompensatorError, ServiceError
+from compensator.events import EventKind, LoopAction, LoopData, Note
+from compensator.messages import Candidate, LoopStatus
+from compensator.service.compensation import Compensation, Outcome, model_of
+from compensator.service.event_log import EventLog
+from compensator.service.journal import Journal
+from compensator.service.loop.core import Followed, ModelLoop, exchange_note
+from compensator.service.loop.process import Diagnose, failed
+from compensator.service.loop.replaying import FAILED_OUTSIDE
+from compensator.service.loop.shadow import Shadow
+from compensator.service.loop.weighing import Weighed, effect_names
+from compensator.service.transfer.candidate import warm_up
+from compensator.service.transfer.model_store import ModelStore
+from compensator.service.transfer.second_opinion import described
+from compensator.service.transfer.turns import give_way
+
+log = logging.getLogger("compensator")
+
+
+@dataclass(slots=True)
+class _Found:
+    """A diagnosis that has ended, and its candidate's compensation once it is warmed up."""
+
+    weighed: Weighed
+    text: str
+    compensation: Compensation | None = None
+    since: list[Outcome] = field(default_factory=list)
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopParts:
+    """What the loop of a service is made of.
+
+    Parameters
+    ----------
+    core : ModelLoop
+        In its state after the last sample.
+    model : bytes
+        File of the present model.
+    store : ModelStore
+        Adopted models.
+    diagnose : callable
+        Makes a diagnosis.
+    """
+
+    core: ModelLoop
+    model: bytes
+    store: ModelStore
+    diagnose: Diagnose
+
+
+class LiveLoop:
+    """The loop of the running service; used in the service's loop only.
+
+    Parameters
+    ----------
+    config : Config
+        Settings, with `[loop]`.
+    parts : LoopParts
+        What it is made of.
+    recordings : pathlib.Path
+        Folder of the recordings, on which a candidate is warmed up.
+    events, journal, clock
+        Of the service.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        parts: LoopParts,
+        recordings: Path,
+        *,
+        events: EventLog,
+        journal: Journal,
+        clock: Clock,
+    ) -> None:
+        self._config, self._model = config, parts.model
+        self._recordings, self._store = recordings, parts.store
+        self._diagnose = parts.diagnose
+        self._events, self._journal, self._clock = events, journal, clock
+        #: None after an internal error of the loop: it stays off until the next start.
+        self._core: ModelLoop | None = parts.core
+        self._candidate: Candidate | None = None
+        #: The diagnosis or warm-up in progress, and what it gave; a model that is being stored, and why it was not.
+        self._task: asyncio.Task[None] | None = None
+        self._found: _Found | None = None
+        self._warming: _Found | None = None
+        self._storing: asyncio.Task[None] | None = None
+        self._stored, self._not_stored = False, ""
+
+    @property
+    def is_exchanging(self) -> bool:
+        """Whether a decided exchange has not happened yet: another change of the model has to wait."""
+        return self._core is not None and bool(self._core.state.exchange)
+
+    @property
+    def is_working(self) -> bool:
+        """Whether a diagnosis, a warm-up or the storing of a model is in progress."""
+        return self._task is not None or self._storing is not None
+
+    def opening(self) -> Mapping[str, bytes]:
+        """Return what a recording that starts with the next sample begins with."""
+        return self._core.attachments() if self._core is not None else {}
+
+    # ------------------------------------------------------------------ between two samples
+
+    def before_sample(self, present: Compensation) -> Compensation:
+        """Return the compensation for the next sample, after an exchange if one is due."""
+        core = self._core
+        if core is None:
+            return present
+        if core.drop_ended():
+            self._journal.start_new_file()
+        warmed = self._warming
+        if warmed is not None and warmed.compensation is not None and core.state.diagnosis is not None:
+            self._begin_shadow(core, warmed, warmed.compensation)
+        if not (core.state.exchange and self._stored):
+            return present
+        verdict, action, self._stored = core.state.verdict, core.state.exchange, False
+        new, self._model = core.exchange(present, self._model, present.status.time_utc_ns)
+        self._journal.start_new_file(self._model)
+        self._events.note(*exchange_note(action, present, new, verdict))
+        return new
+
+    def _begin_shadow(self, core: ModelLoop, warmed: _Found, compensation: Compensation) -> None:
+        self._warming = None
+        assert warmed.weighed.candidate is not None
+        shadow = Shadow(compensation, warmed.weighed.candidate)
+        for outcome in warmed.since:
+            missing = outcome.sample.seq - compensation.status.seq - 1
+            if missing < 0:
+                continue
+            if compensation.status.seq >= 0:
+                compensation.pause(missing)
+            shadow.process(outcome)
+        core.begin_shadow(compensation, warmed.weighed.candidate, compensation.status.time_utc_ns)
+        self._journal.start_new_file()
+
+    def hand_over(self, present: Compensation) -> None:
+        """Hand over what has reached the loop since the last sample; the events are recorded with the next one."""
+        core, now_ns = self._core, present.status.time_utc_ns
+        if core is None:
+            return
+        found, self._found = self._found, None
+        if found is not None and core.state.diagnosis is not None:
+            self._events.note(EventKind.DIAGNOSIS, found.text, found.weighed.data.table())
+            self._note(core.receive(found.weighed.data, now_ns))
+            if core.state.diagnosis is not None and found.weighed.candidate is not None:
+                self._warming = found
+                self._task = asyncio.create_task(self._warm_up(found, found.weighed.candidate))
+        why = self._not_stored or (self._warming.why if self._warming is not None else "")
+        if why:
+            self._not_stored, self._warming = "", None
+            self._give_up(core, why)
+
+    def dismiss(self, present: Compensation) -> None:
+        """End the candidate: an operator's command that acts with the next sample."""
+        if self._core is not None:
+            self._note(self._core.loop.dismiss(present.status.time_utc_ns))
+
+    def accept(self) -> None:
+        """Adopt the candidate: an operator's command that acts with the next sample."""
+        if self._core is not None:
+            try:
+                self._core.loop.accept()
+            except ServiceError as error:  # it has ended since the command was received
+                log.info("%s", error)
+
+    def offer(self, *, force: bool) -> str:
+        """Return what an operator would adopt, in words.
+
+        Raises
+        ------
+        ServiceError
+            If there is no candidate, or it is not proposed and `force` is not given.
+        """
+        state = self._core.state if self._core is not None else None
+        if state is None or state.shadow is None or state.shadow.role != "candidate" or state.exchange:
+            raise ServiceError("there is no candidate now; see `compensator watch`")
+        words = f"{state.shadow.sha256[:12]} ({', '.join(state.shadow.effects) or 'no added effect'})"
+        if state.phase != "proposed" and not force:
+            raise ServiceError(
+                f"candidate {words} is not proposed yet: {described(state.verdict)}; wait, or use --force"
+            )
+        return f"candidate {words} is adopted; {described(state.verdict)}"
+
+    def model_changed(self, present: Compensation, model: bytes, *, back: bool) -> None:
+        """Begin anew after an operator has changed the model."""
+        core, self._model = self._core, model
+        if core is None:
+            return
+        self._cancel()
+        core.present = present.model
+        self._note(core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns, back=back))
+        core.drop_ended()
+
+    def pause(self, samples: int | None) -> None:
+        """Account for samples that were not measured."""
+        if self._core is not None:
+            self._core.pause(samples)
+
+    # ------------------------------------------------------------------ one sample
+
+    def process(self, outcome: Outcome) -> Candidate | None:
+        """Process a sample after the present compensation; return the record of the shadow."""
+        core = self._core
+        if core is None:
+            return None
+        try:
+            followed = core.process(outcome)
+        except Exception as error:
+            # The shadow is no part of what is published: its defect must neither hold the offset nor stop the service.
+            log.exception("internal error of the model in shadow")
+            followed = self._without_shadow(core, outcome, f"internal error: {type(error).__name__}: {error}")
+        self._note(followed.notes)
+        self._candidate = followed.candidate
+        return followed.candidate
+
+    def _without_shadow(self, core: ModelLoop, outcome: Outcome, why: str) -> Followed:
+        """End the shadow, or the loop if that fails too."""
+        try:
+            self._give_up(core, why)
+            return Followed(None, tuple(core.loop.step(outcome, None)))
+        except Exception:
+            log.exception("internal error of the loop; it is off until the next start")
+            self._cancel()
+            self._core = None
+            self._journal.start_new_file()
+            return Followed(None, ())
+
+    def after_sample(self, outcome: Outcome) -> None:
+        """Begin what was decided with a sample that is published."""
+        core = self._core
+        if self._warming is not None:
+            self._warming.since.append(outcome)
+        if core is None:
+            return
+        wanted = core.loop.wanted
+        if wanted is not None and self._task is None and self._found is None:
+            self._task = asyncio.create_task(self._make_diagnosis(core))
+        if core.state.exchange and self._storing is None and not self._stored:
+            self._storing = asyncio.create_task(self._store_model(core))
+
+    def status(self) -> LoopStatus | None:
+        """Return how the loop is, for `thermal/status`; None if it is off."""
+        if self._core is None:
+            return None
+        state, found = self._core.state, self._candidate
+        shadow = state.shadow
+        return LoopStatus(
+            phase=state.phase,
+            diagnosing=state.diagnosis is not None,
+            model_sha256=shadow.sha256 if shadow is not None else "",
+            effects=shadow.effects if shadow is not None else [],
+            since_utc_ns=shadow.since_utc_ns if shadow is not None else 0,
+            y_pred_um=found.y_pred_um if found is not None and shadow is not None else None,
+            verdict=state.verdict.verdict,
+            text=described(state.verdict) if shadow is not None else "",
+            present_rms_um=state.verdict.present_rms_um,
+            candidate_rms_um=state.verdict.candidate_rms_um,
+            deviations=state.verdict.deviations,
+            hours=self._core.loop.judged_h,
+            probes=len(state.comparison.probes),
+            adopted_utc_ns=state.adopted_utc_ns,
+        )
+
+    async def end(self) -> None:
+        """End what is in progress: a diagnosis is begun again at the next start, a stored model is used then."""
+        task, storing = self._task, self._storing
+        if storing is not None:
+            await asyncio.gather(storing, return_exceptions=True)
+        self._cancel()
+        if task is not None:
+            await asyncio.gather(task, return_exceptions=True)
+
+    # ------------------------------------------------------------------ tasks
+
+    async def _make_diagnosis(self, core: ModelLoop) -> None:
+        wanted = core.loop.wanted
+        assert wanted is not None
+        began_ns = self._clock.utc_ns()
+        try:
+            calibrated = await asyncio.to_thread(self._store.calibrated)
+            found = await self._diagnose(wanted, calibrated)
+            weighed = await asyncio.to_thread(core.weigh, found, calibrated=calibrated)
+        except CompensatorError as error:
+            found = failed(str(error))
+            weighed = core.plain(found)
+        except asyncio.CancelledError:
+            raise
+        except Exception as error:
+            log.exception("internal error of a diagnosis")
+            found = failed(f"internal error: {type(error).__name__}: {error}")
+            weighed = core.plain(found)
+        seconds = (self._clock.utc_ns() - began_ns) / NS
+        self._found, self._task = _Found(weighed.lasting(seconds), found.text), None
+
+    async def _warm_up(self, found: _Found, data: bytes) -> None:
+        def warmed() -> Compensation:
+            model = model_of(self._config, data, source="candidate")
+            return warm_up(self._recordings, self._config, model, between_samples=give_way(), probes=True).compensation
+
+        try:
+            found.compensation = await asyncio.to_thread(warmed)
+        except CompensatorError as error:
+            found.why = f"the candidate cannot be warmed up: {error}"
+        self._task = None
+
+    async def _store_model(self, core: ModelLoop) -> None:
+        """Store the model in shadow for the next start; then it is used from the next sample on."""
+        action, shadow = core.state.exchange, core.shadow
+        assert shadow is not None
+        model, now_ns = shadow.compensation.model, self._clock.utc_ns()
+
+        def store() -> None:
+            if action == "back" and self._store.has_before(model.sha256):
+                self._store.back(name=model.name, time_utc_ns=now_ns, by_loop=True)
+            else:
+                self._store.adopt(shadow.data, name=model.name, time_utc_ns=now_ns, by_loop=True)
+
+        try:
+            await asyncio.to_thread(store)
+            self._stored = True
+        except ServiceError as error:
+            self._not_stored = str(error)
+        self._storing = None
+
+    def _cancel(self) -> None:
+        for task in (self._task, self._storing):
+            if task is not None:
+                task.cancel()
+        self._task = self._storing = self._found = self._warming = None
+        self._stored, self._not_stored = False, ""
+
+    def _give_up(self, core: ModelLoop, why: str) -> None:
+        if core.state.shadow is None and core.state.diagnosis is None:
+            data = LoopData(step=LoopAction.END, why=FAILED_OUTSIDE)
+            self._events.note(EventKind.LOOP, why, data.table())
+            return
+        self._note(core.loop.give_up(FAILED_OUTSIDE, why))
+
+    def _note(self, notes: list[Note] | tuple[Note, ...]) -> None:
+        for note in notes:
+            self._events.note(*note)

@@ -1,0 +1,104 @@
+"""The loop in a replay: what reached it from outside is recorded as events, and everything else follows again."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+from compensator.errors import CompensatorError, DataError, ServiceError
+from compensator.events import CommandName, DiagnosisData, EventKind, LoopAction, LoopData, Note, command_of, data_of
+from compensator.messages import Event
+from compensator.recording.container import Contents
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.loop.core import LOOP_STATE, Followed, ModelLoop
+from compensator.service.replay import RecordedStep, setup_of
+
+#: Reason of an end that comes from outside of the loop: an internal error, or a disk that refuses the model.
+FAILED_OUTSIDE = "failed"
+#: Decisions that a replay must make again.
+_DECIDED = (
+    LoopAction.DIAGNOSE,
+    LoopAction.SHADOW,
+    LoopAction.NOTHING,
+    LoopAction.PROPOSE,
+    LoopAction.WITHDRAW,
+    LoopAction.ADOPT,
+    LoopAction.BACK,
+)
+
+
+class RecordedLoop:
+    """The loop of one recording.
+
+    Parameters
+    ----------
+    core : ModelLoop
+        In its state at the start of the file.
+    compensation : Compensation
+        The present compensation, replayed beside it.
+    """
+
+    def __init__(self, core: ModelLoop, compensation: Compensation) -> None:
+        self.core = core
+        self._compensation = compensation
+
+    def apply_inputs(self, step: RecordedStep) -> list[Note]:
+        """Hand over what reached the loop before the sample of a group; return the decisions that followed."""
+        now_ns, notes = self._compensation.status.time_utc_ns, list[Note]()
+        held = step.offset if step.sample is None else None
+        seq = step.sample.seq if step.sample is not None else held.seq if held is not None else None
+        for event in step.events:
+            if event.seq == seq:
+                notes += hand_over(self.core, event, now_ns)
+        return notes
+
+    def process(self, outcome: Outcome) -> Followed:
+        """Process the sample of the group."""
+        return self.core.process(outcome)
+
+
+def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
+    """Hand a recorded event over to the loop, if it came from outside; return the decisions that followed."""
+    if event.kind == EventKind.COMMAND:
+        name = command_of(event)
+        if name == CommandName.DISMISS:
+            return core.loop.dismiss(now_ns)
+        if name == CommandName.ADOPT and event.data.get("candidate") is True:
+            with suppress(ServiceError):
+                core.loop.accept()
+    elif event.kind == EventKind.DIAGNOSIS:
+        found = data_of(event, DiagnosisData)
+        return core.receive(found, now_ns) if found is not None else []
+    elif event.kind == EventKind.LOOP:
+        data = data_of(event, LoopData)
+        if data is not None and data.step == LoopAction.END and data.why == FAILED_OUTSIDE:
+            core.loop.give_up(FAILED_OUTSIDE, event.text)
+    return []
+
+
+def recorded_loop(contents: Contents, compensation: Compensation, file: str) -> RecordedLoop | None:
+    """Return the loop of a recording; None if it has none.
+
+    Raises
+    ------
+    CompensatorError
+        If its state or the model in shadow cannot be used.
+    """
+    found = {name: part.data for name, part in contents.attachments.items()}
+    if LOOP_STATE not in found:
+        return None
+    try:
+        config, _ = setup_of(contents, file)
+        return RecordedLoop(ModelLoop(config, compensation.model, found), compensation)
+    except CompensatorError as error:
+        raise DataError(f"{file}: {error}") from error
+
+
+def decisions_in(step: RecordedStep) -> list[Event]:
+    """Return the recorded decisions of the sample of a group, which a replay must make again."""
+    seq = step.sample.seq if step.sample is not None else None
+    found = []
+    for event in step.events:
+        data = data_of(event, LoopData) if event.kind == EventKind.LOOP and event.seq == seq else None
+        if data is not None and data.step in _DECIDED and data.why != "again":
+            found.append(event)
+    return found

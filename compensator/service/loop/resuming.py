@@ -1,0 +1,102 @@
+"""The loop at the start of the service: continues from the end of the last recording.
+
+The last file is replayed with its own configuration and model, as the compensation is. After a kill between storing a
+model and the sample with it, the exchange is completed here. If a person has changed configuration or model, the shadow
+ends; what was adopted and gone back from stays known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from compensator.config import Config, LoadedConfig
+from compensator.errors import CompensatorError
+from compensator.events import Note
+from compensator.recording.container import Container
+from compensator.recording.reading import recordings
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.loop.core import LOOP_STATE, ModelLoop, exchange_note
+from compensator.service.loop.replaying import RecordedLoop, recorded_loop
+from compensator.service.loop.weighing import effect_names
+from compensator.service.replay import apply, opening_of, setup_of, steps_in
+from compensator.service.transfer.restart import Resumed
+
+
+@dataclass(slots=True)
+class _Replayed:
+    """The last recording with a loop, at its end."""
+
+    loop: RecordedLoop
+    compensation: Compensation
+    config: bytes
+    model: bytes
+    file: str
+
+
+def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
+    """Return the loop in its state at the end of the last recording, None without `[loop]`.
+
+    After an interrupted exchange `resumed` gets the compensation that continues from the one before; events are added
+    to its notes.
+    """
+    config = loaded.config
+    if config.loop is None or not config.loop.is_on:
+        return None
+    present = resumed.compensation
+    try:
+        last = _replayed(config, loaded.resolve(config.recording.folder))
+    except CompensatorError as error:
+        resumed.note(f"the loop begins anew: {error}")
+        last = None
+    if last is None:
+        return ModelLoop(config, present.model, {})
+    core = last.loop.core
+    if last.config == loaded.data:
+        if last.compensation.model.sha256 == present.model.sha256:
+            resumed.notes += core.loop.restarted()
+            return core
+        if core.state.exchange and core.shadow is not None and _sha256(core) == present.model.sha256:
+            resumed.notes.append(_complete(resumed, last))
+            return core
+    core.drop_ended()
+    notes: list[Note] = core.loop.model_changed(effect_names(present.model), present.status.time_utc_ns)
+    resumed.notes += notes
+    core.drop_ended()
+    return ModelLoop(config, present.model, core.attachments())
+
+
+def _complete(resumed: Resumed, last: _Replayed) -> Note:
+    """Complete an exchange whose model is stored already."""
+    core, old = last.loop.core, last.compensation
+    verdict, action = core.state.verdict, core.state.exchange
+    new, _ = core.exchange(old, last.model, old.status.time_utc_ns)
+    resumed.compensation = new
+    return exchange_note(action, old, new, verdict)
+
+
+def _sha256(core: ModelLoop) -> str:
+    return core.shadow.compensation.model.sha256 if core.shadow is not None else ""
+
+
+def _replayed(config: Config, folder: Path) -> _Replayed | None:
+    """Replay the last recording, if it has a loop."""
+    for path in reversed(recordings(folder, config.machine.name)):
+        opening = opening_of(path)
+        if "state.json" not in opening:
+            continue
+        if LOOP_STATE not in opening:
+            return None
+        with Container(path) as container:
+            contents = container.survey(whole=False)
+            compensation = Compensation(*setup_of(contents, path.name))
+            compensation.restore(opening["state.json"])
+            loop = recorded_loop(contents, compensation, path.name)
+            assert loop is not None
+            for step in steps_in(container):
+                loop.apply_inputs(step)
+                outcome = apply(compensation, step)
+                if isinstance(outcome, Outcome):
+                    loop.process(outcome)
+        return _Replayed(loop, compensation, opening["config.toml"], opening["model.toml"], path.name)
+    return None

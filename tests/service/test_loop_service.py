@@ -1,0 +1,271 @@
+"""The loop in the service: recorded, replayed, killed and started again, and in the hands of an operator."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import shutil
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compensator.audit.series import audit
+from compensator.config import parse_config
+from compensator.messages import Candidate
+from compensator.recording.reading import messages, recordings
+from compensator.service.loop.loop import StartDiagnosis
+from compensator.service.loop.weighing import Diagnosed
+from compensator.service.replay import opening_of
+from compensator.service.transfer.model_store import sha256_of
+from tests.audit.made import CONFIG
+from tests.service.living import MACHINE, Machine, largest_step
+from tests.service.looping import extended, shown
+from tests.service.test_restart import QUILL
+
+LOOP = b"""
+[loop]
+policy = "POLICY"
+shadow_h = 6.0
+"""
+
+
+class Looping(Machine):
+    """A machine whose coolant acts on Y, with a loop whose diagnosis is told what it finds."""
+
+    def __init__(
+        self, folder: Path, *found: Diagnosed, policy: str = "adopt", acts: Callable[[int], float] = lambda i: 1.0
+    ) -> None:
+        data = CONFIG.replace(b"poll_interval_s = 10.0", b"poll_interval_s = 30.0")
+        data += LOOP.replace(b"POLICY", policy.encode())
+        super().__init__(folder, parse_config(data, source="test"))
+        self.config_bytes, self.acts, self.found = data, acts, list(found)
+        self.asked: list[StartDiagnosis] = []
+        self.state_um = 0.0
+        rng = np.random.default_rng(7)
+        self.device.sources[3] = self.coolant_degc
+        self.device.sources[2] = lambda: self.world.truth("y_um") + self.effect_um() + 0.4 * float(rng.normal())
+        self.lag: dict[int, float] = {}
+
+    def minute(self) -> int:
+        return round((self.clock.utc_ns() - self.began_ns) / 30e9)
+
+    @property
+    def began_ns(self) -> int:
+        self._began = getattr(self, "_began", self.clock.utc_ns())
+        return self._began
+
+    def coolant_degc(self, i: int | None = None) -> float:
+        t = (self.minute() if i is None else i) / 2.0
+        return 22.0 + 1.5 * math.sin(t / 90.0) + 0.8 * math.sin(t / 37.0)
+
+    def effect_um(self) -> float:
+        """Return the effect of the coolant now: first order of 60 min, 5 min late."""
+        now = self.minute()
+        keep = math.exp(-0.5 / 60.0)
+        if not self.lag:
+            self.lag[0] = 0.0
+        for i in range(max(self.lag) + 1, now + 1):
+            driven = self.coolant_degc(max(i - 10, 0)) - self.coolant_degc(0)
+            self.lag[i] = keep * self.lag[i - 1] + (1.0 - keep) * driven
+        return 3.0 * self.acts(now // 2) * self.lag[now]
+
+    async def diagnose(self, wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+        assert calibrated == QUILL
+        self.asked.append(wanted)
+        return self.found.pop(0) if len(self.found) > 1 else self.found[0]
+
+    def steps(self) -> list[tuple[str, str]]:
+        """Return each recorded decision."""
+        events = [event for path in recordings(self.recordings, MACHINE) for event in messages(path, ("event",))]
+        return [(event.data["step"], event.data.get("why", "")) for event in events if event.kind == "loop"]
+
+    def candidates(self) -> list[Candidate]:
+        return [one for path in recordings(self.recordings, MACHINE) for one in messages(path, ("candidate",))]
+
+
+def checked(machine: Looping) -> None:
+    """Replay everything: each message and each decision comes again."""
+    audited = audit(recordings(machine.recordings, MACHINE))
+    assert audited.clean, [file.difference for file in audited.files] + [f.line() for f in audited.findings]
+    assert audited.samples == len(machine.outcomes)
+
+
+async def test_the_service_adopts_what_shows_itself_better_and_every_decision_is_replayed(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    await machine.run(60)
+    steps = machine.steps()
+    assert steps == [("diagnose", "night"), ("shadow", ""), ("adopt", "")]
+    assert machine.store.in_use() == extended() and machine.store.calibrated() == QUILL
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    checked(machine)
+    found = machine.candidates()
+    # Recorded with each sample of its comparison, and published to nobody.
+    assert [one.seq for one in found[:5]] == list(range(found[0].seq, found[0].seq + 5))
+    assert {one.role for one in found} == {"candidate", "before"}
+    assert not any(name == "candidate" for name, _ in machine.published)
+    files = recordings(machine.recordings, MACHINE)
+    openings = [opening_of(path) for path in files]
+    models = [(opening["model.toml"], opening.get("candidate.toml")) for opening in openings]
+    assert list(dict.fromkeys(models)) == [(QUILL, None), (QUILL, extended()), (extended(), QUILL)]
+    event = machine.events("adopt")[-1]
+    assert event.data["by"] == "loop" and event.data["comparison"]["verdict"] == "better"
+
+
+class Asked:
+    """Sends a command when it is called, and keeps its answer."""
+
+    def __init__(self, machine: Looping, name: str, **arguments: Any) -> None:
+        self._machine, self._name, self._arguments = machine, name, arguments
+        self.reply: Any = None
+
+    def __call__(self) -> None:
+        self.reply = self._machine.command(self._name, json.dumps(self._arguments).encode())
+
+    @property
+    def answer(self) -> dict[str, Any]:
+        answer: dict[str, Any] = self.reply.result(timeout=0) if isinstance(self.reply, Future) else self.reply
+        return answer
+
+
+def in_phase(machine: Looping, phase: str, then: Callable[[], None] = lambda: None) -> Callable[[Any], bool]:
+    """Tell when the loop is in a phase, and do something then."""
+
+    def arrived(_: Any) -> bool:
+        status = next(json.loads(sent) for name, sent in reversed(machine.published) if name == "status")
+        if status["loop"]["phase"] == phase:
+            then()
+            return True
+        return False
+
+    return arrived
+
+
+async def test_a_proposal_waits_for_a_person_and_is_adopted_by_one_command(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()), policy="propose")
+    early = machine.at_sample[1260] = Asked(machine, "adopt", candidate=True)
+    await machine.run(1800, until=in_phase(machine, "proposed"))
+    assert not early.answer["ok"] and "not proposed yet" in early.answer["text"]
+    assert machine.store.in_use() == QUILL and machine.steps()[-1] == ("propose", "")
+    yes = machine.at_sample[len(machine.outcomes) + 30] = Asked(machine, "adopt", candidate=True)
+    await machine.run(120, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    assert yes.answer["ok"] and "µm rms, this one" in yes.answer["text"], yes.answer
+    assert machine.store.in_use() == extended() and machine.store.calibrated() == QUILL
+    await machine.run(30)
+    checked(machine)
+
+
+async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    no = machine.at_sample[1260] = Asked(machine, "dismiss")
+    await machine.run(1440 + 1260)
+    assert no.answer["ok"], no.answer
+    again = machine.at_sample[len(machine.outcomes) + 1] = Asked(machine, "dismiss")
+    await machine.run(20)
+    assert machine.steps()[2:5] in ([("end", "dismissed"), ("diagnose", "night"), ("nothing", "avoided")],), (
+        machine.steps()
+    )
+    assert not again.answer["ok"] and "no candidate" in again.answer["text"]
+    assert machine.store.in_use() == QUILL
+    checked(machine)
+
+
+async def test_a_model_that_a_person_adopts_ends_the_shadow_and_is_the_calibrated_one_from_then_on(
+    tmp_path: Path,
+) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    other = extended(2.9)
+    adopt = Asked(machine, "adopt", model=other.decode(), sha256=sha256_of(other))
+    machine.at_sample[1300] = adopt
+    await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(other))
+    assert adopt.answer["ok"], adopt.answer
+    await machine.run(30)
+    assert machine.steps() == [("diagnose", "night"), ("shadow", ""), ("end", "by_hand")]
+    assert machine.store.calibrated() == other
+    assert "candidate.toml" not in opening_of(recordings(machine.recordings, MACHINE)[-1])
+    checked(machine)
+
+
+async def test_a_kill_in_a_shadow_loses_nothing_of_the_comparison(tmp_path: Path) -> None:
+    machine = Looping(tmp_path / "killed", shown(extended()))
+    await machine.run(1250)
+    await machine.run_and_kill(100)
+    await machine.run(600, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    always = Looping(tmp_path / "always", shown(extended()))
+    await always.run(1950, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+    assert machine.steps() == always.steps() == [("diagnose", "night"), ("shadow", ""), ("adopt", "")]
+    ends = [one.outcomes[-1].sample.time_utc_ns for one in (machine, always)]
+    # The pauses cost samples, and the comparison the block that they are in.
+    assert abs(ends[0] - ends[1]) <= 3600e9
+    assert {one.seq for one in machine.candidates()} >= {o.sample.seq for o in machine.outcomes[1260:1340]}
+    checked(machine)
+
+
+async def test_a_kill_in_the_middle_of_a_diagnosis_leaves_nothing_and_it_is_made_once_more(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    hangs, machine.waits_for_diagnoses = asyncio.Event(), False
+
+    async def hanging(wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+        machine.asked.append(wanted)
+        await hangs.wait()
+        raise AssertionError
+
+    answers, machine.diagnose = machine.diagnose, hanging  # type: ignore[method-assign]
+    await machine.run_and_kill(1250)
+    assert len(machine.asked) == 1 and machine.steps() == [("diagnose", "night")]
+    machine.diagnose, machine.waits_for_diagnoses = answers, True  # type: ignore[method-assign]
+    await machine.run(100)
+    assert machine.steps() == [("diagnose", "night"), ("diagnose", "again"), ("shadow", "")]
+    assert machine.asked[1].to_utc_ns == machine.asked[0].to_utc_ns
+    checked(machine)
+
+
+async def test_a_diagnosis_that_is_interrupted_twice_waits_for_the_next_night(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    machine.waits_for_diagnoses = False
+
+    async def hanging(wanted: StartDiagnosis, calibrated: bytes) -> Diagnosed:
+        machine.asked.append(wanted)
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    machine.diagnose = hanging  # type: ignore[method-assign]
+    await machine.run(1250)
+    for _ in range(3):
+        await machine.run(10)
+    assert len(machine.asked) == 2
+    assert machine.steps() == [("diagnose", "night"), ("diagnose", "again"), ("end", "interrupted")]
+    checked(machine)
+
+
+async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_the_exchange(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    copy = tmp_path / "killed"
+
+    def stored() -> None:
+        model = machine.outcomes[-1].offset.model_sha256 if machine.outcomes else ""
+        if not copy.exists() and model == sha256_of(QUILL) and machine.store.in_use() == extended():
+            shutil.copytree(machine.recordings, copy)
+            assert machine.daemon is not None
+            machine.daemon.stop()
+
+    machine.at_poll = stored
+    await machine.run(1800)
+    machine.at_poll = lambda: None
+    last = machine.outcomes[-1]
+    assert last.offset.model_sha256 == sha256_of(QUILL)
+    shutil.rmtree(machine.recordings)
+    copy.rename(machine.recordings)
+    await machine.run(30)
+    after = machine.outcomes[-30:]
+    assert {outcome.offset.model_sha256 for outcome in after} == {sha256_of(extended())}
+    # As if nothing had happened: the shadow goes on where it was, without another warm-up.
+    assert not any("cold_start" in outcome.offset.reasons for outcome in after)
+    assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+    assert {one.role for one in machine.candidates()[-30:]} == {"before"}
+    assert machine.events("adopt")[-1].data["by"] == "loop"
+    checked(machine)
