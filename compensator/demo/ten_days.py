@@ -40,7 +40,7 @@ from sim_hardware.physics.effects.during import During
 HOUR_S, DAY_MIN = 3600.0, 1440
 #: Hours since the start, at 06:00 of the first day.
 TIMES = Times(first_begins_h=54.0, second_begins_h=126.0, break_h=174.0, repaired_h=176.0, first_ends_h=198.0)
-FIRST = BearingFriction(full_speed_w=14.0)
+FIRST = BearingFriction(full_speed_w=6.0)
 SECOND = CoolantJacket(w_per_k=9.0)
 #: A probe in minutes, and the seed of its noise beside that of the demo.
 PROBE_EVERY_MIN, PROBE_SEED = 60, 16

@@ -3,7 +3,7 @@
 Each machine-week of `sim_hardware.drawn_machines.weeks` is calibrated by `identify` on a run without effects (the
 published ones have the published model). Then a week of samples goes through the service's loop with policy `adopt` and
 the real diagnosis in this process. The service is killed in the middle of its second diagnosis and right after its
-first adoption, and continues from its last state, an hour old at most, as from a recording.
+first adoption, and continues from its last state, six hours old at most, as from a recording.
 
 error           true displacement since the first sample, plus the published offset.
 base, best      error of the calibrated model alone over the week; the same where no effect acts.
@@ -57,7 +57,7 @@ WITHIN_MIN, FAIR_MIN = 48 * 60, 36 * 60
 #: For so long after a fault of a temperature the state of the model is wrong, and after a zero the offset is limited.
 AFTER_FAULT_MIN, LIMITED_MIN = 360, 15
 #: A state is kept this often, samples: a recording begins with one and is read from there.
-STATE_EVERY = 60
+STATE_EVERY = 360
 #: Samples that a killed service misses.
 KILLED_MIN = 3
 KINDS = ("zero", "loop", "diagnosis", "adopt", "plausibility")
