@@ -30,13 +30,13 @@ def main() -> int:
     """Diagnose what a job names."""
     folder = Path(sys.argv[1])
     job = read_job(folder / JOB)
-    _limit(job)
+    why = _limit(job)
     from compensator.errors import CompensatorError
 
     try:
-        result = _diagnose(job, folder)
+        result = _diagnose(job, folder) if not why else Result(verdict="failed", needs=why)
     except CompensatorError as error:
-        result = Result(verdict="failed", text=f"the diagnosis failed: {error}", needs=str(error))
+        result = Result(verdict="failed", needs=str(error))
     result.write(folder / RESULT)
     return 0
 
@@ -54,14 +54,20 @@ def _diagnose(job: Job, folder: Path) -> Result:
     return Result(verdict=short.verdict, effects=list(short.effects), text=short.text, needs=short.needs)
 
 
-def _limit(job: Job) -> None:
-    """Take the lowest priority and the limits of the job; end with the parent."""
+def _limit(job: Job) -> str:
+    """Take the lowest priority and the limits of the job, and end with the parent.
+
+    Returns
+    -------
+    str
+        Why that is not possible: it must not compete with the samples, so nothing is diagnosed then.
+    """
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != job.parent:  # it ended before
         raise SystemExit(1)
-    with suppress(OSError):
-        os.nice(19)
+    with suppress(OSError):  # if memory runs out, this process is ended and not the service
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     limits = (
@@ -70,9 +76,13 @@ def _limit(job: Job) -> None:
         (resource.RLIMIT_FSIZE, _LARGEST_FILE),
         (resource.RLIMIT_CORE, 0),
     )
-    for limit, value in limits:
-        with suppress(OSError, ValueError):
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, 19)
+        for limit, value in limits:
             resource.setrlimit(limit, (value, value))
+    except (OSError, ValueError) as error:
+        return f"its priority and limits cannot be set ({error}); the unit of the service must permit it"
+    return ""
 
 
 if __name__ == "__main__":

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
+from collections.abc import Iterator
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+from compensator.clock import NS
+from compensator.config import Config
 from compensator.events import EventKind
+from compensator.messages import ProbeRequest, Sample, number
 from compensator.service.loop.record import usable_table
-from compensator.service.loop.run import Diagnosed, LoopRun
+from compensator.service.loop.run import Diagnosed, LoopRun, LoopStep
+from compensator.service.loop.trust import is_alarmed
+from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.second_opinion import sensor_suspected
 from tests.service.looping import DAY, Night, decisions, errors, extended, machine, run, settings, shown
@@ -116,17 +126,36 @@ CHECKED = {"plausibility": {"false_alarm_days": 30.0, "residual_std_um": 0.6, "r
 
 
 def test_a_sensor_fault_in_the_middle_of_a_shadow_begins_the_comparison_anew() -> None:
-    """T_Q drifts under both models; the candidate has an effect that is there."""
+    """T_Q drifts under both models, while the candidate has an effect that is there."""
+    begins, ends = NIGHT + 240, NIGHT + 540
 
     def drifting(i: int, values: dict[str, float]) -> None:
-        if NIGHT + 240 <= i < NIGHT + 600:
-            values["t_q_degc"] += 0.01 * (i - NIGHT - 240)
+        if begins <= i < ends:
+            values["t_q_degc"] += 0.02 * (i - begins)
 
-    loop = LoopRun(settings(**CHECKED), extended(), Night(shown(None, "adequate")))
-    steps = run(loop, machine(2 * DAY, change=drifting))
-    suspected = [s for s in steps if any(r.startswith("implausible") for r in s.outcome.offset.reasons)]
-    assert suspected, "the fault was not seen"
-    assert decisions(steps)[0][0] == NIGHT
+    loop = LoopRun(settings(**CHECKED), QUILL, Night(shown(extended())))
+    source = machine(3 * DAY, acts=lambda i: float(i >= NIGHT), change=drifting)
+    steps = run(loop, source)
+    hours = [
+        step.candidate.hours for step in steps if step.candidate is not None and step.candidate.role == "candidate"
+    ]
+    assert any(later == 0.0 < before for before, later in itertools.pairwise(hours)), "nothing was forgotten"
+    adopted = next(seq for seq, step, _ in decisions(steps) if step == "adopt")
+    assert adopted >= ends + 12 * 60 and loop.effects == ("input:coolant_degc",)
+
+
+def test_an_alarm_under_the_present_model_alone_is_a_reason_to_diagnose_and_no_fault_of_a_sensor() -> None:
+    """To a check that knows one model a missing effect looks like a sensor that drifts."""
+    loop = LoopRun(settings(**CHECKED), QUILL, Night(shown(extended())))
+    steps = run(loop, machine(NIGHT + 60))
+    alarmed = [step for step in steps if sensor_suspected(step.outcome.offset.reasons)]
+    assert len(alarmed) > 240
+    assert [decision[1:] for decision in decisions(steps)][:3] == [
+        ("diagnose", "misfit"),
+        ("shadow", ""),
+        ("adopt", ""),
+    ]
+    assert not any(is_alarmed(step.outcome.offset.reasons) for step in steps[-30:])
 
 
 def test_a_creeping_mount_does_not_make_a_better_model() -> None:
@@ -163,18 +192,14 @@ def test_a_missing_channel_of_the_candidate_does_not_judge_it() -> None:
     assert last.hours <= 1.0 and "channel_missing:coolant_degc" in last.reasons
 
 
-def test_no_diagnosis_while_a_sensor_is_suspected() -> None:
-    night = Night(shown(extended()))
-    loop = LoopRun(settings(**CHECKED), QUILL, night)
+def test_no_diagnosis_while_sensors_contradict_each_other_or_a_temperature_is_missing() -> None:
+    def missing(i: int, values: dict[str, float]) -> None:
+        if NIGHT - 60 <= i < NIGHT + 90:
+            values["at_degc"] = math.nan
 
-    def drifting(i: int, values: dict[str, float]) -> None:
-        values["y_um"] += 0.02 * max(i - NIGHT + 600, 0)
-
-    steps = run(loop, machine(DAY + 60, acts=lambda i: 0.0, change=drifting))
-    at_night = steps[NIGHT].outcome.offset.reasons
-    assert any(reason.startswith("implausible") for reason in at_night)
-    if "implausible:model" not in at_night:
-        assert not night.asked
+    night = Night(shown(None, "adequate"))
+    steps = run(LoopRun(settings(), QUILL, night), machine(NIGHT + 200, acts=lambda i: 0.0, change=missing))
+    assert NIGHT + 90 + 29 <= decisions(steps)[0][0] <= NIGHT + 90 + 31 and len(night.asked) == 1
 
 
 def test_a_run_continues_from_its_state_with_the_same_bits() -> None:
@@ -226,14 +251,74 @@ def test_a_proposal_is_withdrawn_when_it_is_no_longer_better() -> None:
 
 def test_the_table_of_a_diagnosis_leaves_out_what_must_not_be_used() -> None:
     loop = LoopRun(settings(**CHECKED), QUILL, Night(shown(None, "adequate")))
-    source = machine(900, acts=lambda i: 0.0, more=lambda i: 0.05 * max(i - 500, 0))
+    source = machine(900)
     steps = run(loop, source, 300)
     loop.compensation.hold()
     steps += run(loop, source, 60)
     loop.compensation.resume()
-    steps += run(loop, source)
-    table = usable_table([step.outcome for step in steps])
-    y = table.columns["y_um"]
-    assert np.isnan(y[300:360]).all() and np.isfinite(y[100:300]).all() and np.isfinite(table.columns["t_q_degc"]).all()
-    alarm = next(i for i, s in enumerate(steps) if sensor_suspected(s.outcome.offset.reasons))
-    assert np.isnan(y[alarm - 59 : alarm + 1]).all()
+    outcomes = [step.outcome for step in [*steps, *run(loop, source)]]
+    assert any(is_alarmed(outcome.offset.reasons) for outcome in outcomes)
+    apart = msgspec.structs.replace(outcomes[700].offset, reasons=["t_q_at_apart"])
+    outcomes[700] = dataclasses.replace(outcomes[700], offset=apart)
+    y = usable_table(outcomes).columns["y_um"]
+    left_out = {*range(300, 360), *range(641, 701)}
+    assert {int(i) for i in np.flatnonzero(np.isnan(y))} == left_out
+    assert np.isfinite(usable_table(outcomes).columns["t_q_degc"]).all()
+
+
+PROBED = {"probe": {"std_um": 0.5, "measured_max_um": 80.0, "largest_um": 60.0}}
+
+
+def probed(loop: LoopRun, samples: Iterator[Sample], every: int, seed: int = 3) -> list[LoopStep]:
+    """Run a machine without a displacement sensor, whose Y is probed now and then."""
+    rng, steps, known = np.random.default_rng(seed), list[LoopStep](), 0.0
+    for i, one in enumerate(samples):
+        y = number(one.channels["y_um"].mean)
+        channels = {name: channel for name, channel in one.channels.items() if name != "y_um"}
+        received = []
+        if steps and i % every == every - 1 and i > 60:
+            offset = steps[-1].outcome.offset
+            applied = number(offset.y_offset_um) + number(offset.y_offset_rate_um_per_min) / 6.0
+            request = ProbeRequest(
+                schema=1,
+                time_utc_ns=offset.time_utc_ns + 10 * NS,
+                axis="y",
+                measured_um=known + applied + 0.5 * float(rng.normal()),
+                offset_applied_um=applied,
+                feature="sphere",
+            )
+            received = [ReceivedProbe(request=request, received_utc_ns=offset.time_utc_ns + 12 * NS)]
+        known = y
+        steps.append(loop.process(msgspec.structs.replace(one, channels=channels), received))
+    return steps
+
+
+def without_sensor(**changes: Any) -> Config:
+    found = settings(**PROBED, **changes)
+    return msgspec.structs.replace(found, channel=[one for one in found.channel if one.name != "y_um"])
+
+
+def test_from_probes_alone_a_better_model_is_adopted_and_nothing_is_counted_twice() -> None:
+    loop = LoopRun(without_sensor(), QUILL, Night(shown(extended())))
+    source = list(machine(int(2.4 * DAY), noise_um=0.0))
+    steps = probed(loop, iter(source), 30)
+    assert sum(probe.taken for step in steps for probe in step.outcome.probes) > 40
+    found = decisions(steps)
+    assert [step for _, step, _ in found[:3]] == ["diagnose", "shadow", "adopt"]
+    event = next(note for step in steps for note in step.events if note.kind == EventKind.ADOPT)
+    comparison = event.data["comparison"]
+    assert comparison["measured_by"] == "probe" and comparison["probes"] >= 8 and comparison["hours"] >= 12.0
+    # What the probes have corrected is handed over: the corrected deformation stays where it was.
+    assert abs(event.data["difference_um"]) < 0.01
+    truth = np.array([number(one.channels["y_um"].mean) for one in source])
+    left = truth + np.array([number(step.outcome.offset.y_offset_um) for step in steps])
+    adopted = found[2][0]
+    assert np.std(left[adopted + 120 :]) < 0.5 * np.std(left[DAY // 2 : adopted])
+    last = [step.candidate for step in steps if step.candidate is not None and step.candidate.innovations_um][-1]
+    assert (last.role == "before" and last.residual_um is None) or math.isnan(number(last.residual_um))
+
+
+def test_from_probes_alone_a_false_candidate_is_not_adopted() -> None:
+    loop = LoopRun(without_sensor(), QUILL, Night(shown(extended())))
+    steps = probed(loop, machine(2 * DAY, noise_um=0.0, acts=lambda i: 0.0), 30)
+    assert "adopt" not in [step for _, step, _ in decisions(steps)]

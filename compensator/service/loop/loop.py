@@ -21,9 +21,10 @@ from compensator.errors import ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Avoided, Compared, LoopState, Running, fresh
+from compensator.service.loop.trust import both_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_MIN, Comparison
-from compensator.service.transfer.second_opinion import described, is_unusable, sensor_suspected
+from compensator.service.transfer.second_opinion import described, is_unusable
 
 #: A candidate with the effects of the present model must differ from it by so many standard deviations.
 DIFFERS = 4.0
@@ -36,7 +37,6 @@ _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
 _HOUR_NS, _DAY_NS = 3600 * NS, 86400 * NS
-_LEFT_OUT = (Reason.OPERATOR_HOLD, Reason.INTERNAL_ERROR, Reason.RESIDUAL_TOO_LARGE)
 _LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
@@ -104,11 +104,12 @@ class Loop:
             The decisions, each with the figures on which it rests.
         """
         state, now_ns, reasons = self.state, present.sample.time_utc_ns, present.offset.reasons
-        minutes, suspected = self._period_s / 60.0, sensor_suspected(reasons)
-        disturbed = suspected or any(reason in _LEFT_OUT for reason in reasons) or is_unusable(present)
+        minutes, suspected = self._period_s / 60.0, is_contradicted(reasons)
+        if other is not None:
+            suspected = suspected or both_suspect_a_sensor(present, other)
+        disturbed = suspected or is_disturbed(reasons) or is_unusable(present)
         state.clean_min = 0.0 if disturbed else state.clean_min + minutes
-        misfit = f"{Reason.IMPLAUSIBLE}:model" in reasons
-        state.misfit_min = state.misfit_min + minutes if misfit else 0.0
+        state.misfit_min = state.misfit_min + minutes if is_alarmed(reasons) else 0.0
         notes: list[Note] = []
         if other is not None and state.shadow is not None:
             may_have_changed = self._compare(present, other, suspected=suspected)
@@ -126,9 +127,9 @@ class Loop:
             if state.comparison.first_ns:
                 self._begin_comparison()
             return False
-        left_out = (*_LEFT_OUT, Reason.CHANNEL_MISSING)
-        reasons = (*present.offset.reasons, *other.offset.reasons)
-        if is_unusable(present, other) or any(reason.startswith(left_out) for reason in reasons):
+        reasons = [*present.offset.reasons, *other.offset.reasons]
+        missing = any(reason.startswith(Reason.CHANNEL_MISSING) for reason in reasons)
+        if missing or is_unusable(present, other) or is_disturbed(reasons):
             return False
         if not found.add(present, other, suspected=False):
             return False
@@ -256,7 +257,9 @@ class Loop:
             step=LoopAction.DIAGNOSE, why=running.why, from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns
         )
         return Note(
-            EventKind.LOOP, text + (": the model has been suspected" if running.why == "misfit" else ""), data.table()
+            EventKind.LOOP,
+            text + (": measured and predicted Y have diverged" if running.why == "misfit" else ""),
+            data.table(),
         )
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
@@ -346,7 +349,8 @@ class Loop:
         if back:
             self._avoid(state.effects, now_ns)
         state.effects, state.diagnosis = list(effects), None
-        return self.give_up("by_hand", "an operator has changed the model") if state.shadow is not None else []
+        words = "a person has changed the model or the configuration"
+        return self.give_up("by_hand", words) if state.shadow is not None else []
 
     def give_up(self, why: str, text: str) -> list[Note]:
         """End the shadow for a cause outside of the loop, or a candidate that could not be warmed up."""

@@ -1,8 +1,8 @@
 """What of a record may be diagnosed: the outcomes of the service as a table.
 
-Y is left out where a sensor was suspected or missing, or the offset was held by hand, by an internal error or because
-of the residual; and an hour before a suspicion, in which the fault was there already. Temperatures and other channels
-stay as they were measured: they drive the model throughout.
+Y is left out where a sample shows a fault by itself (`trust`), and for an hour before T_Q and AT contradict each other,
+in which the fault was there already. Temperatures and other channels stay as they were measured: they drive the model
+throughout.
 """
 
 from __future__ import annotations
@@ -18,19 +18,11 @@ from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.data.table import Table
 from compensator.messages import Offset, Probe, Sample, number
+from compensator.service.loop.trust import is_contradicted, is_disturbed
 from compensator.service.outcome import Outcome
-from compensator.service.transfer.second_opinion import sensor_suspected
 
-#: Y is left out for so long before a sensor was suspected, h.
-BEFORE_SUSPICION_H = 1.0
-_LEFT_OUT = (
-    Reason.T_Q_MISSING,
-    Reason.AT_MISSING,
-    Reason.T_Q_AT_EXCHANGED,
-    Reason.OPERATOR_HOLD,
-    Reason.INTERNAL_ERROR,
-    Reason.RESIDUAL_TOO_LARGE,
-)
+#: Y is left out for so long before T_Q and AT contradict each other, h.
+BEFORE_H = 1.0
 
 
 def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
@@ -76,9 +68,9 @@ def _left_out_s(rows: Sequence[tuple[Sample, Offset | None]]) -> Vector:
     times, left_out = np.array([sample.time_utc_ns / NS for sample, _ in rows]), np.zeros(len(rows), dtype=bool)
     for i, (_, offset) in enumerate(rows):
         reasons = offset.reasons if offset is not None else [Reason.INTERNAL_ERROR]
-        if sensor_suspected(reasons):
-            left_out |= (times > times[i] - 3600.0 * BEFORE_SUSPICION_H) & (times <= times[i])
-        left_out[i] |= any(reason.startswith(_LEFT_OUT) for reason in reasons)
+        if is_contradicted(reasons):
+            left_out |= (times > times[i] - 3600.0 * BEFORE_H) & (times <= times[i])
+        left_out[i] |= is_disturbed(reasons)
     return times[left_out]
 
 

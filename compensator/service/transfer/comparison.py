@@ -160,8 +160,8 @@ class Comparison:
 
     @property
     def judged_h(self) -> float:
-        """Time of the usable blocks, h."""
-        return sum(block.means is not None for block in self._blocks()) * BLOCK_MIN / 60.0
+        """Time of the usable blocks, h; without the open one."""
+        return sum(block.means is not None for block in self.state.blocks) * BLOCK_MIN / 60.0
 
     def verdict(self, *, deviations: float = DEVIATIONS) -> ComparisonData:
         """Return the verdict on what was compared.

@@ -1,0 +1,51 @@
+"""Which samples may be diagnosed, and may judge a model.
+
+Left out is what shows a fault by itself: a missing temperature, sensors that contradict each other, an offset that is
+held by hand or by an internal error.
+
+A residual alarm does not say whether a sensor or the model is wrong: to a check that knows one model, most effects that
+the model lacks look like a sensor that drifts. It is a reason to diagnose, which tells the two apart. Beside a shadow,
+a sensor counts as suspected only if it is under both models: a fault of a sensor stays under the other model, an effect
+that only one of them has does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from compensator.codes import Reason
+from compensator.service.outcome import Outcome
+from compensator.service.transfer.second_opinion import sensor_suspected
+
+_CONTRADICTED = (Reason.T_Q_AT_EXCHANGED, Reason.T_Q_AT_APART)
+_DISTURBED = (
+    Reason.T_Q_MISSING,
+    Reason.AT_MISSING,
+    Reason.OPERATOR_HOLD,
+    Reason.INTERNAL_ERROR,
+    *_CONTRADICTED,
+)
+_ALARMS = (Reason.IMPLAUSIBLE, Reason.RESIDUAL_TOO_LARGE)
+
+
+def is_disturbed(reasons: Sequence[str]) -> bool:
+    """Return whether a sample with these reasons shows a fault by itself."""
+    return any(reason.startswith(_DISTURBED) for reason in reasons)
+
+
+def is_contradicted(reasons: Sequence[str]) -> bool:
+    """Return whether T_Q and AT contradict each other: they have done so for a while when it shows."""
+    return any(reason in _CONTRADICTED for reason in reasons)
+
+
+def is_alarmed(reasons: Sequence[str]) -> bool:
+    """Return whether measured and predicted Y diverge."""
+    return any(reason.startswith(_ALARMS) for reason in reasons)
+
+
+def both_suspect_a_sensor(present: Outcome, other: Outcome) -> bool:
+    """Return whether a sensor, and not the model, is suspected under both models."""
+    return all(
+        sensor_suspected(one.offset.reasons) or Reason.RESIDUAL_TOO_LARGE in one.offset.reasons
+        for one in (present, other)
+    )
