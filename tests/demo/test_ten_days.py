@@ -33,7 +33,7 @@ def decided(t_h, action, **data):
 
 
 def made(**changes):
-    acts = (T_H >= demo.TIMES.first_begins_h).astype(float)
+    acts = np.where(demo.TIMES.first_begins_h <= T_H, 1.0, 0.0)
     found = MachineDays(
         name="sensor",
         is_probed=False,
