@@ -22,7 +22,7 @@ from compensator.blas import in_one_thread
 from compensator.clock import NS
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
-from compensator.config import Config, Loop, parse_config
+from compensator.config import Channel, Config, Loop, parse_config
 from compensator.demo.calibration import PERIOD_S, calibrate
 from compensator.demo.day import START_NS
 from compensator.demo.machine import PROBE_RANGE_UM, TOUCH_STD_UM, configuration
@@ -34,14 +34,16 @@ from compensator.report.ten_days import DAYS, MachineDays, Times
 from compensator.service.loop.run import LoopRun
 from compensator.service.outcome import Outcome
 from sim_hardware.physics import Duty, QuillMachine, World, usual_sensors
-from sim_hardware.physics.effects import BearingFriction, CoolantJacket
+from sim_hardware.physics.effects import BearingFriction, FanMotor
 from sim_hardware.physics.effects.during import During
 
-HOUR_S, DAY_MIN = 3600.0, 1440
+HOUR_S = 3600.0
+#: Rest at the start of the first day, s.
+REST_S = 1800.0
 #: Hours since the start, at 06:00 of the first day.
-TIMES = Times(first_begins_h=54.0, second_begins_h=126.0, break_h=174.0, repaired_h=176.0, first_ends_h=198.0)
+TIMES = Times(first_begins_h=50.0, second_begins_h=122.0, break_h=174.0, repaired_h=175.0, first_ends_h=194.0)
 FIRST = BearingFriction(full_speed_w=6.0)
-SECOND = CoolantJacket(w_per_k=9.0)
+SECOND = FanMotor(full_speed_w=30.0, place="rear")
 #: A probe in minutes, and the seed of its noise beside that of the demo.
 PROBE_EVERY_MIN, PROBE_SEED = 60, 16
 LOOP = Loop(policy="adopt", misfit_h=3.0, record_h=24.0, shadow_h=6.0)
@@ -113,7 +115,7 @@ def _record(seed: int) -> Record:
         During(effect=FIRST, from_s=at["first_begins_h"], to_s=at["first_ends_h"]),
         During(effect=SECOND, from_s=at["second_begins_h"]),
     ]
-    duty = Duty.working_day(seed, hours=24.0 * DAYS)
+    duty = _duty(seed)
     world = World(QuillMachine(effects=effects), duty, usual_sensors(duty.extra_names), seed)
     columns = world.record(PERIOD_S)
     del columns["t_s"]
@@ -126,10 +128,19 @@ def _record(seed: int) -> Record:
     return Record(columns=columns, true_um=np.asarray(true_um))
 
 
+def _duty(seed: int) -> Duty:
+    """Return ten days of work; the fan stands still too while the machine is at rest at the start."""
+    drawn = Duty.working_day(seed, hours=24.0 * DAYS)
+    columns = dict(drawn.columns)
+    columns["fan_rpm"] = np.where(np.arange(columns["fan_rpm"].size) < REST_S / 10.0, 0.0, columns["fan_rpm"])
+    return Duty(drawn.duration_s, **columns)
+
+
 def _config(name: str, *, is_probed: bool) -> Config:
     text = configuration(f"sim-{name}", _LINES, 7447, is_probed=is_probed)
     config = parse_config(text.encode(), source="demo")
-    return msgspec.structs.replace(config, loop=LOOP)
+    fan = Channel(name="fan_rpm", device="control", input=0)
+    return msgspec.structs.replace(config, loop=LOOP, channel=[*config.channel, fan])
 
 
 def _samples(

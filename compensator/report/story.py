@@ -31,7 +31,7 @@ _FOLLOWS_S = 1800.0
 #: Models whose time in force is drawn one by one.
 _MODELS = 8
 _BY_LOOP, _BY_OPERATOR = "the loop", "an operator"
-_NS = 1e-9
+_NS, _HALF_DAY_S = 1e-9, 43200.0
 #: Steps in words; those of every night are counted.
 WORDS: Mapping[str, str] = {
     LoopAction.SHADOW: "candidate begins in shadow",
@@ -234,7 +234,8 @@ def _needs(story: Story) -> list[Cell]:
 
 def _picture(story: Story, left_by_day: Mapping[float, float], x_limits: tuple[float, float]) -> Figure:
     days = sorted(left_by_day)
-    x, y = np.array(days), np.array([left_by_day[day] for day in days])
+    y = np.repeat([left_by_day[day] for day in days], 2)
+    x = np.column_stack((np.array(days) - _HALF_DAY_S, np.array(days) + _HALF_DAY_S)).ravel()
     top = float(np.nanmax(y)) if y.size and bool(np.isfinite(y).any()) else 1.0
     marks = []
     for what, marker, height in ((LoopAction.ADOPT, "o", 1.08), (LoopAction.BACK, "x", 1.16)):
@@ -247,9 +248,10 @@ def _picture(story: Story, left_by_day: Mapping[float, float], x_limits: tuple[f
         y_label="error in Y, µm rms",
         lines=(Line("left with the offset applied", x, y),),
         marks=tuple(marks),
+        limits=(0.0,),
         clock=True,
         x_limits=x_limits,
-        note="Measured + offset, or what touch probes found; a day without measured Y is a gap.",
+        note="Each step is a day. Measured + offset, or what touch probes found; a day without measured Y is a gap.",
     )
 
 
@@ -283,11 +285,14 @@ def _model(sha: str, names: Mapping[str, str], effects: Mapping[str, Sequence[st
 
 def story_tables(story: Story) -> list[Block]:
     """Return every decision with its figures, and all steps in words."""
-    head = ["time, UTC", "what", "model, effects", "present → other, µm rms", "measured", "deviations", "by"]
+    head = ["time, UTC", "what", "by", "model, effects", "error, µm rms", "on what"]
     told = [step for step in story.steps if step.what != LoopAction.NOTHING]
     blocks: list[Block] = []
     if told:
-        note = "µm rms of measured − predicted over what was compared; deviations: by how many the other is better."
+        note = (
+            "Error: measured − predicted of the present model → of the other one, over the measured Y or the probes "
+            "that were compared; σ: by how many standard deviations of the difference the other one is better."
+        )
         blocks.append(Table(head=head, rows=[_row(step) for step in told], note=note))
     lines: list[Cell] = [f"{_utc(step.at_s)}: {step.text}" for step in story.steps]
     if lines:
@@ -298,12 +303,12 @@ def story_tables(story: Story) -> list[Block]:
 def _row(step: Step) -> list[Cell]:
     found = step.comparison
     model = f"{step.model_sha256[:6]} {', '.join(step.effects)}".strip()
-    figures = ["", "", ""]
+    figures = ["", ""]
     if found is not None and found.present_rms_um is not None and found.candidate_rms_um is not None:
         measured = f"{found.probes} probes" if found.measured_by == "probe" else f"{found.hours:.3g} h"
-        deviations = "" if found.deviations is None else plain(found.deviations, 1)
-        figures = [f"{found.present_rms_um:.1f} → {found.candidate_rms_um:.1f}", measured, deviations]
-    return [_utc(step.at_s), WORDS.get(step.what, step.what), model, *figures, step.by]
+        deviations = "" if found.deviations is None else f", {plain(found.deviations, 1)} σ"
+        figures = [f"{found.present_rms_um:.1f} → {found.candidate_rms_um:.1f}", f"{measured}{deviations}"]
+    return [_utc(step.at_s), WORDS.get(step.what, step.what), step.by, model, *figures]
 
 
 def _utc(t_s: float) -> str:

@@ -45,8 +45,8 @@ class Times:
         """Return what happens, in order."""
         return [
             (self.first_begins_h, "the bearing begins to heat the nose (no calibration has seen it)"),
-            (self.second_begins_h, "coolant begins to cool the housing"),
-            (self.break_h, f"the couple of T_Q breaks, for {self.repaired_h - self.break_h:g} h"),
+            (self.second_begins_h, "the motor of the fan begins to heat the column"),
+            (self.break_h, f"the couple of T_Q breaks, for {self.repaired_h - self.break_h:g} h: the offset is held"),
             (self.first_ends_h, "the bearing no longer heats"),
         ]
 
@@ -142,7 +142,7 @@ def _acting(times: Times, day: int) -> str:
     if times.first_begins_h < end and times.first_ends_h > begin:
         parts.append("bearing")
     if times.second_begins_h < end:
-        parts.append("coolant")
+        parts.append("fan motor")
     if begin <= times.break_h < end:
         parts.append("T_Q broken")
     return ", ".join(parts) or "nothing"
@@ -194,6 +194,7 @@ def _picture(days: Sequence[MachineDays]) -> Figure:
         lines=first.lines,
         marks=first.marks,
         edges=first.edges,
+        limits=first.limits,
         below=tuple(panels[1:]),
         x_limits=(1.0, DAYS + 1.0),
         note=note,
@@ -218,6 +219,7 @@ def _panel(one: MachineDays, *, is_last: bool) -> Figure:
         marks=tuple(marks),
         edges=(Edges("something happens", changes),),
         x_limits=(1.0, DAYS + 1.0),
+        limits=(0.0,),
         height=2.6,
     )
 

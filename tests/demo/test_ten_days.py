@@ -14,7 +14,7 @@ from compensator.messages import SCHEMA, Event, Offset
 from compensator.report.page import html_of
 from compensator.report.ten_days import DAYS, MachineDays, days_page, days_table, days_verdict
 from compensator.service.loop.run import Diagnosed, LoopRun
-from sim_hardware.physics import Duty, QuillMachine, World, usual_sensors
+from sim_hardware.physics import QuillMachine, World, usual_sensors
 
 HOUR_NS = 3_600_000_000_000
 T_H = np.arange(DAYS * 24) + 0.5
@@ -52,13 +52,13 @@ def test_the_error_of_a_day_is_that_of_its_samples():
     by_day = made().by_day(made().first_um)
     assert by_day.shape == (DAYS,)
     assert by_day[:2].tolist() == [0.0, 0.0]
-    assert by_day[2] == pytest.approx(5.0 * math.sqrt(18 / 24))  # The effect begins at the sixth hour of day 3.
+    assert by_day[2] == pytest.approx(5.0 * math.sqrt(22 / 24))  # The effect begins at the second hour of day 3.
     assert by_day[3:].tolist() == [5.0] * 7
 
 
 def test_the_page_names_what_happens_and_what_was_decided():
     text = html.unescape(html_of(days_page([made()])))
-    assert "Day 3, hour 6" in text and "the couple of T_Q breaks, for 2 h" in text
+    assert "Day 3, hour 2" in text and "the couple of T_Q breaks, for 1 h" in text
     assert "input:spindle_rpm" in text and "nothing was adopted from a broken couple" in text
     assert "Passed" in text
     assert days_table([made()]).text().count("\n") == DAYS + 1
@@ -85,7 +85,9 @@ def short():
 
 
 def test_the_effects_act_when_they_are_told_to(short):
-    duty = Duty.working_day(3, hours=24.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "DAYS", 1)
+        duty = demo._duty(3)
     world = World(QuillMachine(), duty, usual_sensors(duty.extra_names), 3)
     world.advance_to(24 * 3600.0)
     past = world.history()
