@@ -245,6 +245,8 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
         Effects of the candidate, each with its kind and place.
     candidate_sha256, candidate : str
         Hash and name of the candidate's model file; empty if there is none.
+    calibrated : bool
+        Whether the candidate is the calibrated model itself.
     same_effects : bool
         Whether the present model has the same effects.
     change_deviations : float, optional
@@ -265,6 +267,7 @@ class DiagnosisData(_Data, frozen=True, kw_only=True):
     effects: list[str] = []
     candidate_sha256: str = ""
     candidate: str = ""
+    calibrated: bool = False
     same_effects: bool = False
     change_deviations: float | None = None
     in_shadow: bool = False

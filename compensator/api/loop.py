@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -12,12 +13,19 @@ from compensator.config import Config
 from compensator.data.frames import hash_of
 from compensator.data.measurement import Measurement, Origin
 from compensator.data.table import Table
-from compensator.errors import DataError
+from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.service.loop.record import is_probed, usable_table
 from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
+
+#: Ends of a record that are diagnosed if the whole is not explained, h.
+ENDS_H = (24.0, 16.0, 10.0, 7.0)
+#: A record is explained well if no more than this part of its error is left on held-out data.
+WELL_EXPLAINED = 0.25
+#: A shorter end must leave less than this part of what a longer one does.
+SHORTER_IS_BETTER = 0.7
 
 
 def diagnosis_in_process(config: Config) -> Callable[[Sequence[Outcome], bytes], Diagnosed]:
@@ -46,7 +54,10 @@ def diagnosis_of_record(record: Sequence[Outcome], model: bytes, *, probe_std_um
 
 
 def diagnosis_of_table(table: Table, model: bytes, *, probe_std_um: float | None = None) -> DiagnosisResult:
-    """Diagnose a table of `service.loop.record`.
+    """Diagnose a table of `service.loop.record`: all of it, or the end of it if that explains itself better.
+
+    An effect that began or ended within the record explains no whole of it: where the whole is not explained, shorter
+    ends are, the longest first.
 
     Raises
     ------
@@ -55,6 +66,37 @@ def diagnosis_of_table(table: Table, model: bytes, *, probe_std_um: float | None
     """
     if not np.isfinite(table.columns["y_um"]).any():
         raise DataError(f"{table.name}: no measured Y that may be used")
+    whole = _diagnosed(table, model, probe_std_um)
+    best, least = whole, _left(whole)
+    for hours in ENDS_H:
+        if least <= WELL_EXPLAINED or np.ptp(table.t_s) < 3600.0 * (hours + 1.0):
+            continue
+        try:
+            found = _diagnosed(_end_of(table, hours), model, probe_std_um)
+        except CompensatorError:  # too little data in so short an end
+            break
+        if _left(found) < SHORTER_IS_BETTER * least:
+            best, least = found, _left(found)
+    return best
+
+
+def _left(found: DiagnosisResult) -> float:
+    """Return which part of the error on held-out data a diagnosis leaves; 1 if nothing can be deployed."""
+    if found.verdict == "adequate":
+        return 0.0
+    before, after, floor = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um, found.diagnosis.noise_floor_um
+    if not _added(found) or not before > floor:
+        return 1.0
+    return math.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
+
+
+def _end_of(table: Table, hours: float) -> Table:
+    kept = table.t_s > table.t_s[-1] - 3600.0 * hours
+    columns = {name: values[kept] for name, values in table.columns.items()}
+    return Table(name=table.name, t_s=table.t_s[kept], columns=columns, rows=range(2, int(kept.sum()) + 2))
+
+
+def _diagnosed(table: Table, model: bytes, probe_std_um: float | None) -> DiagnosisResult:
     columns = {name: values for name, values in table.columns.items() if np.isfinite(values).any()}
     table = Table(name=table.name, t_s=table.t_s, columns=columns, rows=table.rows)
     origin = Origin(name=table.name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))

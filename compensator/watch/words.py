@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from compensator.clock import NS
 from compensator.codes import State, WatchWarning, explain
-from compensator.events import EventKind, RecordingData, data_of
+from compensator.events import EventKind, LoopAction, RecordingData, data_of
 from compensator.messages import Event
 from compensator.report.notation import plain
 
@@ -81,6 +81,10 @@ def to_do(event: Event) -> str:
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
         return " ".join(dict.fromkeys(explained(code).do for code in codes)) if state not in ("", State.OK) else ""
+    if event.kind == EventKind.DIAGNOSIS:
+        return str(event.data.get("needs", ""))
+    if event.kind == EventKind.LOOP and event.data.get("step") == LoopAction.PROPOSE:
+        return f"Answer with `{LOOP_COMMANDS[0]}` or `{LOOP_COMMANDS[1]}`."
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
     if recording is not None and recording.is_resolved:
         return ""

@@ -296,3 +296,15 @@ def test_killed_restarted_and_given_another_model(tmp_path: Path, capsys: pytest
         for r in read_messages(path, ("estimate",))
     }
     assert len(references - {None}) == 1  # one zero, across kill, stop and models
+
+
+def test_a_candidate_or_a_file_and_only_a_running_service_has_a_candidate(
+    idle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for given in (["adopt"], ["adopt", "quill", "--candidate"]):
+        assert main([*given, "--config", str(idle)]) == 2
+        assert "either MODEL, or --candidate" in capsys.readouterr().err
+    for given in (["adopt", "--candidate"], ["dismiss"]):
+        assert main([*given, "--config", str(idle), "--timeout", "1"]) == 1
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and "Traceback" not in error

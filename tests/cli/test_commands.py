@@ -283,6 +283,9 @@ BAD_CONFIGS = [
     ("[machine]", PROBE_TABLE.replace("1.0", "0.0") + "[machine]", "probe.std_um = 0.0"),
     ("[machine]", PROBE_TABLE.replace("40.0", "400.0") + "[machine]", "probe.largest_um = 400, expected at most"),
     ("[machine]", PROBE_TABLE + "oldest_min = 1000.0\n[machine]", "probe.oldest_min = 1000.0"),
+    ("[machine]", '[loop]\npolicy = "always"\n[machine]', "loop.policy = 'always'"),
+    ("[machine]", '[loop]\npolicy = "adopt"\nat_utc = "25:00"\n[machine]', "loop.at_utc = '25:00'"),
+    ("[machine]", "[loop]\nshadow_h = 1.0\n[machine]", "loop.shadow_h = 1.0"),
     ("[machine]", PROBE_TABLE + "often = true\n[machine]", "probe.often: no such key, expected one of: std_um"),
 ]
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from compensator.clock import NS
-from compensator.config import Config
+from compensator.config import Config, parse_config
+from compensator.errors import ConfigError
 from compensator.events import EventKind
 from compensator.messages import ProbeRequest, Sample, number
 from compensator.service.loop.record import usable_table
@@ -22,7 +23,9 @@ from compensator.service.loop.trust import is_alarmed
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.model_store import sha256_of
 from compensator.service.transfer.second_opinion import sensor_suspected
+from tests.audit.made import CONFIG
 from tests.service.looping import DAY, Night, decisions, errors, extended, machine, run, settings, shown
+from tests.service.probed import COOLANT, PROBE, SENSOR
 from tests.service.test_restart import QUILL
 
 #: Samples are counted from 6 o'clock; the first night is 20 h later.
@@ -322,3 +325,11 @@ def test_from_probes_alone_a_false_candidate_is_not_adopted() -> None:
     loop = LoopRun(without_sensor(), QUILL, Night(shown(extended())))
     steps = probed(loop, machine(2 * DAY, noise_um=0.0, acts=lambda i: 0.0), 30)
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
+
+
+def test_a_loop_without_measured_y_is_refused() -> None:
+    data = CONFIG[:SENSOR] + CONFIG[COOLANT:] + b'\n[loop]\npolicy = "adopt"\n'
+    with pytest.raises(ConfigError, match=r"loop.policy = 'adopt': nothing measures Y, expected a channel 'y_um' or"):
+        parse_config(data, source="test")
+    parse_config(data + PROBE, source="test")
+    parse_config(data.replace(b'"adopt"', b'"off"'), source="test")

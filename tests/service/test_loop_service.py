@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from compensator.audit.replay_check import ReplayCheck
+from compensator.audit.result import RecordingAudit
 from compensator.audit.series import audit
 from compensator.config import parse_config
 from compensator.messages import Candidate
-from compensator.recording.reading import messages, recordings
+from compensator.recording.container import Container
+from compensator.recording.reading import RawRecord, groups_of, messages, recordings
 from compensator.service.loop.loop import StartDiagnosis
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.replay import opening_of
@@ -114,6 +117,30 @@ async def test_the_service_adopts_what_shows_itself_better_and_every_decision_is
     assert list(dict.fromkeys(models)) == [(QUILL, None), (QUILL, extended()), (extended(), QUILL)]
     event = machine.events("adopt")[-1]
     assert event.data["by"] == "loop" and event.data["comparison"]["verdict"] == "better"
+    # A replay sees what was changed afterwards: a record of the shadow, and a decision that was made up or left out.
+    comparing = next(path for path in files if opening_of(path).get("candidate.toml") == extended())
+    assert replayed(comparing, lambda group: group) is None
+    assert replayed(comparing, changed("candidate", b'"verdict":"', b'"verdict":"x')).topic == "candidate"
+    assert replayed(comparing, lambda group: [one for one in group if one.topic != "candidate"]).topic == "candidate"
+    deciding = next(path for path in reversed(files) if opening_of(path).get("candidate.toml") == extended())
+    assert replayed(deciding, changed("event", b'"step":"adopt"', b'"step":"back"')).topic == "event"
+
+
+def changed(topic: str, old: bytes, new: bytes) -> Callable[[list[RawRecord]], list[RawRecord]]:
+    """Change the records of a topic."""
+    return lambda group: [one._replace(body=one.body.replace(old, new)) if one.topic == topic else one for one in group]
+
+
+def replayed(path: Path, change: Callable[[list[RawRecord]], list[RawRecord]]) -> Any:
+    """Replay a recording with changed records; return the first difference."""
+    result = RecordingAudit(file=path.name, size=0)
+    with Container(path) as container:
+        check = ReplayCheck(container.survey(whole=False), result)
+        for records, _, whole in groups_of(container):
+            if whole and records:
+                check.check(change(records))
+    check.finish()
+    return result.difference
 
 
 class Asked:

@@ -120,3 +120,22 @@ def event(
     return json.dumps(
         {"schema": 1, "machine": "vmc-07", "seq": seq, "time_utc_ns": time_ns, "kind": kind, "text": text, "data": data}
     ).encode()
+
+
+#: The status of a loop that proposes a model.
+LOOP: dict[str, Any] = {
+    "phase": "proposed",
+    "diagnosing": False,
+    "model_sha256": "c" * 64,
+    "effects": ["input:coolant_degc"],
+    "since_utc_ns": START_NS - 3600 * NS,
+    "y_pred_um": 11.0,
+    "verdict": "better",
+    "text": "last 12 h: present 6.9 µm rms, this one 1.2 (better by 31 standard deviations of the difference)",
+    "present_rms_um": 6.9,
+    "candidate_rms_um": 1.2,
+    "deviations": 31.0,
+    "hours": 12.0,
+    "probes": 0,
+    "adopted_utc_ns": 0,
+}

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import msgspec
 import pytest
 
 from compensator.clock import NS
-from compensator.messages import EstimateMessage, Event, Offset, Sample
-from compensator.watch.history import state_intervals
+from compensator.messages import EstimateMessage, Event, Offset, Sample, Status
+from compensator.watch.history import MachineHistory, state_intervals
 from compensator.watch.machine import WatchedMachine, decoded
 from compensator.watch.shop import Shop
-from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
+from tests.watch.heard import LOOP, START_NS, Clock, estimate, event, offset, sample, status
 
 KEY = "shop/vmc-07/thermal/"
 
@@ -314,3 +315,25 @@ def test_whether_a_probe_is_wanted_and_what_probes_add(heard: Heard) -> None:
     assert heard.machine["probe"]["means"].startswith("The standard deviation exceeds the tolerance")
     heard.clock.advance(600)  # an old status says nothing about now
     assert heard.machine["probe"] is None
+
+
+def test_a_proposed_model_is_shown_with_its_figures_and_what_a_person_can_answer(heard: Heard) -> None:
+    heard.hear(offset=offset(5), estimate=estimate(5, y_pred_um=14.34))
+    heard.hear(status=status(5))
+    assert "loop" not in heard.machine  # a machine without a loop
+    heard.hear(status=status(6, START_NS + 60 * NS, loop=LOOP))
+    found = heard.machine["loop"]
+    assert "a better one is proposed, with input:coolant_degc" in found["line"]
+    assert "present 6.9 µm rms, this one 1.2" in found["line"]
+    assert [command.split()[1] for command in found["commands"]] == ["adopt", "dismiss"]
+    heard.clock.advance(600)  # an old status says nothing about now
+    assert "loop" not in heard.machine
+
+
+def test_the_prediction_of_the_shadow_is_in_the_history_of_its_sample() -> None:
+    history = MachineHistory()
+    history.add(msgspec.json.decode(estimate(5, y_pred_um=14.34), type=EstimateMessage))
+    assert "candidate_um" not in history.columns()
+    for number in (5, 7):  # the other one is of a sample that did not arrive
+        history.add_candidate(msgspec.json.decode(status(number, loop=LOOP), type=Status))
+    assert history.columns()["candidate_um"] == [11.0]

@@ -12,7 +12,7 @@ from rich.console import Console
 from compensator.clock import NS
 from compensator.watch.shop import Shop
 from compensator.watch.terminal import line, view
-from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
+from tests.watch.heard import LOOP, START_NS, Clock, estimate, event, offset, sample, status
 
 STATES = {"vmc-01": ("ok", []), "vmc-02": ("hold", ["operator_hold"]), "vmc-03": ("degraded", ["t_q_missing"])}
 
@@ -163,3 +163,19 @@ def test_what_is_no_offset_is_no_number() -> None:
         ),
     )
     assert "⚠ starting  no offset, 0 s old" in shown(shop, 80)
+
+
+def test_a_proposal_is_a_line_with_two_commands() -> None:
+    shop, clock = filled("vmc-01")
+    assert "Model:" not in shown(shop, 200)
+    shop.receive("shop/vmc-01/thermal/status", status(3, clock.now_ns, loop=LOOP))
+    text = " ".join(shown(shop, 200).replace("│", "").split())
+    assert "a better one is proposed" in text and "compensator adopt --candidate" in text
+    assert "compensator dismiss" in text
+    one = shop.one("shop/vmc-01")
+    assert one is not None and "better model proposed" in line(one)
+    watching = LOOP | {"phase": "watching", "diagnosing": True}
+    shop.receive("shop/vmc-01/thermal/status", status(4, clock.now_ns, loop=watching))
+    text = " ".join(shown(shop, 200).replace("│", "").split())
+    assert "goes on beside the adopted one" in text and "A diagnosis is in progress." in text
+    assert "adopt --candidate" not in text

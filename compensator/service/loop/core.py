@@ -17,7 +17,7 @@ from compensator.messages import Candidate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.loop.loop import Loop
-from compensator.service.loop.shadow import Shadow, candidate_message
+from compensator.service.loop.shadow import Role, Shadow, candidate_message
 from compensator.service.loop.state import LoopState, decode_loop
 from compensator.service.loop.weighing import Diagnosed, Weighed, effect_names, weigh, without_candidate
 from compensator.service.status import Zero
@@ -121,11 +121,11 @@ class ModelLoop:
         """Decide what follows from a diagnosis."""
         return self.loop.receive(found, now_ns)
 
-    def begin_shadow(self, compensation: Compensation, data: bytes, now_ns: int) -> None:
-        """Begin to compare a candidate that is in its state after the last sample."""
+    def begin_shadow(self, compensation: Compensation, data: bytes, now_ns: int, role: Role) -> None:
+        """Begin to compare another model that is in its state after the last sample."""
         if self.shadow is None or self.shadow.compensation.model.sha256 != compensation.model.sha256:
             self.shadow = Shadow(compensation, data)
-        self.loop.shadow_begins(compensation.model.sha256, effect_names(compensation.model), now_ns)
+        self.loop.shadow_begins(compensation.model.sha256, effect_names(compensation.model), now_ns, role)
 
     def exchange(self, present: Compensation, data: bytes, now_ns: int) -> tuple[Compensation, bytes]:
         """Let the shadow continue from the present compensation; that one becomes the shadow, or ends after a way back.

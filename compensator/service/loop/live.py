@@ -21,6 +21,7 @@ from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.loop.core import Followed, ModelLoop, exchange_note
+from compensator.service.loop.loop import role_of
 from compensator.service.loop.process import Diagnose, failed
 from compensator.service.loop.replaying import FAILED_OUTSIDE
 from compensator.service.loop.shadow import Shadow
@@ -150,7 +151,8 @@ class LiveLoop:
             if compensation.status.seq >= 0:
                 compensation.pause(missing)
             shadow.process(outcome)
-        core.begin_shadow(compensation, warmed.weighed.candidate, compensation.status.time_utc_ns)
+        role = role_of(warmed.weighed.data)
+        core.begin_shadow(compensation, warmed.weighed.candidate, compensation.status.time_utc_ns, role)
         self._journal.start_new_file()
 
     def hand_over(self, present: Compensation) -> None:

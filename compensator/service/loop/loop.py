@@ -240,7 +240,12 @@ class Loop:
         since_last_h = (now_ns - state.diagnosed_utc_ns) / _HOUR_NS
         if night_ns > state.night_utc_ns:
             why = "night"
-        elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_h >= MISFIT_AGAIN_H:
+        elif (
+            state.misfit_min >= 60.0 * settings.misfit_h
+            and since_last_h >= MISFIT_AGAIN_H
+            # A candidate that is better so far may be what is missing.
+            and not (state.phase != "watching" and state.verdict.verdict == ComparisonVerdict.BETTER)
+        ):
             why = "misfit"
         else:
             return []
@@ -276,9 +281,10 @@ class Loop:
             return [Note(EventKind.LOOP, _nothing_follows(why, found), data.table())]
         state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256)
         text = f"a candidate is compared with the present model: {', '.join(found.effects) or 'no added effect'}"
-        data = LoopData(
-            step=LoopAction.SHADOW, role="candidate", model_sha256=found.candidate_sha256, effects=found.effects
-        )
+        role = role_of(found)
+        if role == "before":
+            text = "nothing is found that the calibrated model lacks: it is compared with the present one"
+        data = LoopData(step=LoopAction.SHADOW, role=role, model_sha256=found.candidate_sha256, effects=found.effects)
         return [Note(EventKind.LOOP, text, data.table())]
 
     def _why_nothing(self, found: DiagnosisData, now_ns: int) -> str:
@@ -289,10 +295,10 @@ class Loop:
             return {"failed": "failed", "adequate": "nothing_found"}.get(found.verdict, "unexplained")
         if found.same_effects and (found.change_deviations or 0.0) < DIFFERS:
             return "unchanged"
-        if found.in_shadow and self.state.shadow is not None and self.state.shadow.role == "candidate":
+        if found.in_shadow and self.state.shadow is not None and self.state.shadow.role == role_of(found):
             return "in_shadow"
         self.state.avoided = [one for one in self.state.avoided if one.until_utc_ns > now_ns]
-        if any(sorted(one.effects) == sorted(found.effects) for one in self.state.avoided):
+        if not found.calibrated and any(sorted(one.effects) == sorted(found.effects) for one in self.state.avoided):
             return "avoided"
         return ""
 
@@ -375,6 +381,11 @@ class Loop:
     def _avoid(self, effects: Sequence[str], now_ns: int) -> None:
         until_ns = now_ns + round(self._settings.watch_h * _HOUR_NS)
         self.state.avoided = [*self.state.avoided, Avoided(effects=list(effects), until_utc_ns=until_ns)]
+
+
+def role_of(found: DiagnosisData) -> Role:
+    """Return the role of a candidate: the calibrated model is one from before, and the service goes back to it."""
+    return "before" if found.calibrated else "candidate"
 
 
 def _is_limited(outcome: Outcome) -> bool:

@@ -19,6 +19,7 @@ from compensator.events import EventKind, Note
 from compensator.messages import Candidate, Sample
 from compensator.service.compensation import Compensation, Outcome, model_of, slowest_min
 from compensator.service.loop.core import ModelLoop, exchange_note, is_rest, warmed_on
+from compensator.service.loop.loop import role_of
 from compensator.service.loop.weighing import FAILED, Diagnosed, effect_names
 from compensator.service.probing import ReceivedProbe
 from compensator.service.transfer.candidate import WARM_UP
@@ -91,6 +92,8 @@ class LoopRun:
         self._at_rest: Outcome | None = None
         self._warm_ns = 0
         self._found: Diagnosed | None = None
+        #: Events since the last sample.
+        self._notes: list[Note] = []
 
     @property
     def compensation(self) -> Compensation:
@@ -136,9 +139,9 @@ class LoopRun:
         """
         self._core.loop.accept()
 
-    def dismiss(self) -> tuple[Note, ...]:
-        """End the candidate, as an operator can."""
-        return tuple(self._core.loop.dismiss(self._compensation.status.time_utc_ns))
+    def dismiss(self) -> None:
+        """End the candidate, as an operator can; the event comes with the next sample."""
+        self._notes += self._core.loop.dismiss(self._compensation.status.time_utc_ns)
 
     # ------------------------------------------------------------------ state
 
@@ -170,7 +173,7 @@ class LoopRun:
         compensation = Compensation(self._config, model_of(self._config, saved.model, source="state of a run"))
         compensation.restore(saved.compensation)
         core = ModelLoop(self._config, compensation.model, saved.attachments)
-        core.loop.restarted()
+        self._notes = core.loop.restarted()
         self._compensation, self._core = compensation, core
         self._data, self._calibrated = saved.model, saved.calibrated
         self._record, self._found = deque(saved.record), None
@@ -180,7 +183,7 @@ class LoopRun:
 
     def _between(self, now_ns: int) -> list[Note]:
         """Do what follows from the last sample before the next one."""
-        core, notes = self._core, list[Note]()
+        core, notes, self._notes = self._core, self._notes, []
         core.drop_ended()
         if core.state.exchange:
             notes.append(self._exchange(now_ns))
@@ -193,7 +196,7 @@ class LoopRun:
             if running is not None and weighed.candidate is not None:
                 model = model_of(self._config, weighed.candidate, source="candidate")
                 warmed = warmed_on(self._config, model, list(self._record), self._at_rest)
-                core.begin_shadow(warmed, weighed.candidate, now_ns)
+                core.begin_shadow(warmed, weighed.candidate, now_ns, role_of(weighed.data))
         return notes
 
     def _exchange(self, now_ns: int) -> Note:

@@ -107,13 +107,14 @@ def weigh(
         same_effects=same,
         change_deviations=min(change, 1e9) if same else None,
         in_shadow=in_shadow,
+        calibrated=model.sha256 == base.sha256,
     )
     return Weighed(weighed, data)
 
 
 def without_candidate(found: Diagnosed) -> DiagnosisData:
     """Return the data of a diagnosis from which no candidate follows."""
-    return DiagnosisData(verdict=found.verdict, effects=list(found.effects), needs=found.needs or found.text)
+    return DiagnosisData(verdict=found.verdict, effects=list(found.effects), needs=found.needs)
 
 
 def effect_names(model: ThermalModel) -> list[str]:
