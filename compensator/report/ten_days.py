@@ -41,13 +41,21 @@ class Times:
         """Return them by name."""
         return asdict(self)
 
-    def told(self) -> list[tuple[float, str]]:
-        """Return what happens, in order."""
+    def told(self) -> list[tuple[float, str, str]]:
+        """Return what happens, in order: when, in a word for the picture, and in a sentence."""
         return [
-            (self.first_begins_h, "the bearing begins to heat the nose (no calibration has seen it)"),
-            (self.second_begins_h, "the motor of the fan begins to heat the column"),
-            (self.break_h, f"the couple of T_Q breaks, for {self.repaired_h - self.break_h:g} h: the offset is held"),
-            (self.first_ends_h, "the bearing no longer heats"),
+            (
+                self.first_begins_h,
+                "bearing heats",
+                "the bearing begins to heat the nose, which no calibration has seen",
+            ),
+            (self.second_begins_h, "fan motor heats", "the motor of the fan begins to heat the column"),
+            (
+                self.break_h,
+                "T_Q breaks",
+                f"the couple of T_Q breaks, for {self.repaired_h - self.break_h:g} h: the offset is held",
+            ),
+            (self.first_ends_h, "bearing stops", "the bearing no longer heats"),
         ]
 
 
@@ -169,7 +177,7 @@ def days_page(days: Sequence[MachineDays]) -> Page:
         float(np.mean(one.loop_um**2)) >= float(np.mean(one.first_um**2)) for one in days
     )
     happens: list[Cell] = [
-        f"Day {h // _DAY_H + 1:.0f}, hour {h % _DAY_H:.0f}: {words}." for h, words in days[0].times.told()
+        f"Day {h // _DAY_H + 1:.0f}, hour {h % _DAY_H:.0f}: {words}." for h, _, words in days[0].times.told()
     ]
     blocks: list[Block] = [
         _picture(days),
@@ -181,10 +189,10 @@ def days_page(days: Sequence[MachineDays]) -> Page:
 
 
 def _picture(days: Sequence[MachineDays]) -> Figure:
-    panels = [_panel(one, is_last=i == len(days) - 1) for i, one in enumerate(days)]
+    panels = [_panel(one) for one in days]
     note = (
-        "Each step is one day. Vertical lines: what happens to the machine, in the order below; points: what the loop "
-        "decided."
+        "Above the machine with a displacement sensor, below the one with a touch probe each hour. Each step is one "
+        "day; vertical lines: what happens to the machine; points: what the loop decided."
     )
     first = panels[0]
     return Figure(
@@ -202,7 +210,7 @@ def _picture(days: Sequence[MachineDays]) -> Figure:
     )
 
 
-def _panel(one: MachineDays, *, is_last: bool) -> Figure:
+def _panel(one: MachineDays) -> Figure:
     first, loop = one.by_day(one.first_um), one.by_day(one.loop_um)
     top = 1.15 * float(max(first.max(), loop.max()))
     marks = []
@@ -210,14 +218,14 @@ def _panel(one: MachineDays, *, is_last: bool) -> Figure:
         at = np.array([t_h / _DAY_H + 1.0 for t_h, _ in one.decided(action)])
         if at.size:
             marks.append(Marks(words, at, np.full(at.size, top), marker=marker))  # type: ignore[arg-type]
-    changes = tuple(t_h / _DAY_H + 1.0 for t_h, _ in one.times.told())
+    changes = tuple(Edges(words, (t_h / _DAY_H + 1.0,)) for t_h, words, _ in one.times.told())
     return Figure(
         title="",
-        x_label="day" if is_last else "",
-        y_label=f"{'touch probe' if one.is_probed else 'displacement sensor'}: error, µm rms",
+        x_label="day of the run, 1 to 10",
+        y_label=f"{'touch probe' if one.is_probed else 'sensor'}: rms error, µm",
         lines=(_steps("first model", first), _steps("with the loop", loop)),
         marks=tuple(marks),
-        edges=(Edges("something happens", changes),),
+        edges=changes,
         x_limits=(1.0, DAYS + 1.0),
         limits=(0.0,),
         height=2.6,
