@@ -85,13 +85,13 @@ def _row(one: MachineLoop) -> FleetRow:
     from compensator.report.fleet import FleetRow
 
     if one.error:
-        return FleetRow(name=one.folder, needs=one.error, is_bad=True)
+        return FleetRow(name=Path(one.folder).name, needs=f"see to its recordings: {one.error}", is_bad=True)
     now = "–" if one.now_um is None else f"{one.now_um:.1f}"
     error = now if one.first_um is None else f"{one.first_um:.1f} → {now}"
     measured = {"sensor": "", "probe": " (probes)", "": ""}[one.measured_by]
     return FleetRow(
         name=one.machine,
-        span=f"{one.from_utc[:10]} to {one.to_utc[:10]}, {'its own loop' if one.is_recorded else 'computed'}",
+        span=f"{one.from_utc[:10]} to {one.to_utc[:10]}, {'its own loop' if one.is_recorded else 'computed now'}",
         error=f"{error}{measured}",
         found=", ".join(one.found) or "nothing",
         proposed=", ".join(one.proposed),

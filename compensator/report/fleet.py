@@ -42,27 +42,20 @@ class FleetRow:
     is_bad: bool = False
 
 
-def fleet_table(rows: Sequence[FleetRow]) -> Table:
-    """Return the table of machines."""
-    head = [
-        "machine",
-        "recordings",
-        "error now, µm rms",
-        "found",
-        "proposed",
-        "adopted",
-        "gone back",
-        "a person has to",
-    ]
-    cells = [
-        [row.name, row.span, row.error, row.found, row.proposed, row.adopted, row.gone_back, row.needs or "–"]
-        for row in rows
-    ]
+def fleet_table(rows: Sequence[FleetRow], *, on_page: bool = False) -> Table:
+    """Return the table of machines; on a page what a person has to do comes first, on a terminal last."""
+    head = ["error, µm rms", "found", "proposed", "adopted", "back", "recordings"]
+    cells = [[row.error, row.found, row.proposed, row.adopted, row.gone_back, row.span] for row in rows]
+    place = 0 if on_page else len(head)
+    head.insert(place, "a person has to")
+    for row, line in zip(rows, cells, strict=True):
+        line.insert(place, row.needs or "do nothing")
     note = (
         "Error: measured Y with the offset applied, or what touch probes found, in the last 24 h; with the model alone "
-        "→ with the loop."
+        "→ with the loop. Found: the last candidate; back: how often the loop went back."
     )
-    return Table(title="Machines", head=head, rows=cells, note=note)
+    lines = [[row.name, *line] for row, line in zip(rows, cells, strict=True)]
+    return Table(title="Machines", head=["machine", *head], rows=lines, note=note)
 
 
 def fleet_verdict(rows: Sequence[FleetRow]) -> str:
@@ -78,7 +71,7 @@ def fleet_verdict(rows: Sequence[FleetRow]) -> str:
 def fleet_page(rows: Sequence[FleetRow]) -> Page:
     """Make the page."""
     tone: Tone = "bad" if any(row.is_bad for row in rows) else "warn" if any(row.needs for row in rows) else "good"
-    blocks: list[Block] = [fleet_table(rows)]
+    blocks: list[Block] = [fleet_table(rows, on_page=True)]
     blocks += [
         Details(title=f"{row.name}: {len(row.steps)} decision(s)", blocks=[Words(title="", lines=list(row.steps))])
         for row in rows
