@@ -16,6 +16,7 @@ from compensator.data.table import Table
 from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
+from compensator.model.thermal_model import ThermalModel
 from compensator.service.loop.record import is_probed, usable_table
 from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
@@ -50,14 +51,21 @@ def diagnosis_of_record(record: Sequence[Outcome], model: bytes, *, probe_std_um
     CompensatorError
         If there is too little data.
     """
-    return summarised(diagnosis_of_table(usable_table(record), model, probe_std_um=probe_std_um))
+    return summarised(*diagnoses_of_table(usable_table(record), model, probe_std_um=probe_std_um), model)
 
 
-def diagnosis_of_table(table: Table, model: bytes, *, probe_std_um: float | None = None) -> DiagnosisResult:
-    """Diagnose a table of `service.loop.record`: all of it, or the end of it if that explains itself better.
+def diagnoses_of_table(
+    table: Table, model: bytes, *, probe_std_um: float | None = None
+) -> tuple[DiagnosisResult, DiagnosisResult]:
+    """Diagnose a table of `service.loop.record`: all of it, and the end of it if that explains itself better.
 
     An effect that began or ended within the record explains no whole of it: where the whole is not explained, shorter
     ends are, the longest first.
+
+    Returns
+    -------
+    DiagnosisResult, DiagnosisResult
+        The diagnosis to go by, and that of the whole.
 
     Raises
     ------
@@ -66,26 +74,27 @@ def diagnosis_of_table(table: Table, model: bytes, *, probe_std_um: float | None
     """
     if not np.isfinite(table.columns["y_um"]).any():
         raise DataError(f"{table.name}: no measured Y that may be used")
-    whole = _diagnosed(table, model, probe_std_um)
-    best, least = whole, _left(whole)
+    base = parse_model(model, source="calibrated model")
+    whole = _diagnosed(table, base, probe_std_um)
+    best, least = whole, _left(whole, base)
     for hours in ENDS_H:
         if least <= WELL_EXPLAINED or np.ptp(table.t_s) < 3600.0 * (hours + 1.0):
             continue
         try:
-            found = _diagnosed(_end_of(table, hours), model, probe_std_um)
+            found = _diagnosed(_end_of(table, hours), base, probe_std_um)
         except CompensatorError:  # too little data in so short an end
             break
-        if _left(found) < SHORTER_IS_BETTER * least:
-            best, least = found, _left(found)
-    return best
+        if _left(found, base) < SHORTER_IS_BETTER * least:
+            best, least = found, _left(found, base)
+    return best, whole
 
 
-def _left(found: DiagnosisResult) -> float:
+def _left(found: DiagnosisResult, base: ThermalModel) -> float:
     """Return which part of the error on held-out data a diagnosis leaves; 1 if nothing can be deployed."""
     if found.verdict == "adequate":
         return 0.0
     before, after, floor = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um, found.diagnosis.noise_floor_um
-    if not _added(found) or not before > floor:
+    if len(found.model.effects) == len(base.effects) or not before > floor:
         return 1.0
     return math.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
 
@@ -96,33 +105,29 @@ def _end_of(table: Table, hours: float) -> Table:
     return Table(name=table.name, t_s=table.t_s[kept], columns=columns, rows=range(2, int(kept.sum()) + 2))
 
 
-def _diagnosed(table: Table, model: bytes, probe_std_um: float | None) -> DiagnosisResult:
+def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> DiagnosisResult:
     columns = {name: values for name, values in table.columns.items() if np.isfinite(values).any()}
     table = Table(name=table.name, t_s=table.t_s, columns=columns, rows=table.rows)
     origin = Origin(name=table.name, sha256=hash_of(table), size=(table.t_s.size, tuple(table.columns)))
     measured = Measurement(table=table, label=table.name, origins=(origin,))
     y_std_um = probe_std_um if is_probed(table) else None
-    return diagnose(parse_model(model, source="calibrated model"), [measured], y_std_um=y_std_um)
+    return diagnose(base, [measured], y_std_um=y_std_um)
 
 
-def summarised(found: DiagnosisResult) -> Diagnosed:
-    """Return the result of a diagnosis as the loop needs it."""
-    deployed = tuple(name_of(effect) for effect in found.model.effects)
-    effects = deployed[len(deployed) - _added(found) :] if _added(found) else ()
-    left = [effect for effect in found.effects if not effect.deployable and not effect.replaced]
-    needs = [f"{effect.kind}: {effect.explanation}" for effect in left]
-    advice = found.diagnosis.advice
-    if advice is not None and advice.sensor:
-        needs.append(advice.sensor)
+def summarised(found: DiagnosisResult, whole: DiagnosisResult, model: bytes) -> Diagnosed:
+    """Return the result of a diagnosis of a model as the loop needs it; what a person has to do also by the whole."""
+    base = parse_model(model, source="calibrated model")
+    effects = tuple(name_of(effect) for effect in found.model.effects[len(base.effects) :])
     text = f"diagnosis: {found.verdict}, {', '.join(effects) or 'nothing to deploy'}"
     before, after = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um
     text += f"; held-out error {before:.2f} µm rms before, {after:.2f} after"
-    model = dump_model(found.model).encode() if effects else None
-    return Diagnosed(found.verdict, effects, model, text, " ".join(needs))
+    extended = dump_model(found.model).encode() if effects else None
+    return Diagnosed(found.verdict, effects, extended, text, _needs(found) or _needs(whole))
 
 
-def _added(found: DiagnosisResult) -> int:
-    """Return how many effects the extended model has more than the base."""
-    remainder = found.diagnosis.remainder
-    named = sum(effect.deployable for effect in found.effects)
-    return min(named + (remainder is not None and remainder.deployed), len(found.model.effects))
+def _needs(found: DiagnosisResult) -> str:
+    """Return what a person has to do: about effects that cannot be compensated, and where a sensor is missing."""
+    left = [effect for effect in found.effects if not effect.deployable and not effect.replaced]
+    needs = [f"{effect.kind}: {effect.explanation}" for effect in left]
+    advice = found.diagnosis.advice
+    return " ".join([*needs, *([advice.sensor] if advice is not None and advice.sensor else [])])

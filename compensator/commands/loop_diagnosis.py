@@ -42,15 +42,16 @@ def main() -> int:
 
 
 def _diagnose(job: Job, folder: Path) -> Result:
-    from compensator.api.loop import diagnosis_of_table, summarised
+    from compensator.api.loop import diagnoses_of_table, summarised
     from compensator.service.loop.job import read_record
     from compensator.service.loop.record import table_of_rows
 
     rows, probes = read_record(job)
     table = table_of_rows(rows, probes, job.machine)
-    found = diagnosis_of_table(table, (folder / CALIBRATED).read_bytes(), probe_std_um=job.probe_std_um)
+    model = (folder / CALIBRATED).read_bytes()
+    found, whole = diagnoses_of_table(table, model, probe_std_um=job.probe_std_um)
     found.save_all(folder)
-    short = summarised(found)
+    short = summarised(found, whole, model)
     return Result(verdict=short.verdict, effects=list(short.effects), text=short.text, needs=short.needs)
 
 

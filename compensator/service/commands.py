@@ -128,6 +128,8 @@ class Commands:
             execute(compensation, name, arguments)
             if self._models is not None and name == CommandName.DISMISS:
                 self._models.dismiss(compensation)
+            elif self._models is not None and name == CommandName.RESUME:
+                self._models.resume()
             elif self._models is not None and name == CommandName.ADOPT:
                 self._models.accept()
 

@@ -174,13 +174,28 @@ def test_a_hand_on_the_machine_is_not_compared() -> None:
     source = machine(3 * DAY)
     run(loop, source, NIGHT + 60)
     before = run(loop, source, 1)[0].candidate
-    loop.compensation.hold()
+    loop.hold()
     held = run(loop, source, 600)
     assert before is not None and held[-1].candidate is not None
     assert held[-1].candidate.hours <= before.hours + 0.5
     assert "adopt" not in [step for _, step, _ in decisions(held)]
-    loop.compensation.resume()
+    loop.resume()
     assert "adopt" in [step for _, step, _ in decisions(run(loop, source, 900))]
+
+
+def test_after_an_adoption_under_a_hand_the_model_before_is_watched_all_the_same() -> None:
+    tables = {"loop": {"policy": "propose", "shadow_h": 6.0}}
+    loop = LoopRun(settings(**tables), QUILL, Night(shown(extended())))
+    ends = NIGHT + 600
+    source = machine(NIGHT + 1800, acts=lambda i: float(i < ends))
+    run(loop, source, NIGHT + 420)
+    assert loop.phase == "proposed"
+    loop.hold()
+    loop.accept()
+    held = run(loop, source, 60)
+    assert loop.phase == "watching" and np.ptp([number(step.outcome.offset.y_offset_um) for step in held]) == 0.0
+    loop.resume()
+    assert "back" in [step for _, step, _ in decisions(run(loop, source))]
 
 
 def test_a_missing_channel_of_the_candidate_does_not_judge_it() -> None:
@@ -256,9 +271,9 @@ def test_the_table_of_a_diagnosis_leaves_out_what_must_not_be_used() -> None:
     loop = LoopRun(settings(**CHECKED), QUILL, Night(shown(None, "adequate")))
     source = machine(900)
     steps = run(loop, source, 300)
-    loop.compensation.hold()
+    loop.hold()
     steps += run(loop, source, 60)
-    loop.compensation.resume()
+    loop.resume()
     outcomes = [step.outcome for step in [*steps, *run(loop, source)]]
     assert any(is_alarmed(outcome.offset.reasons) for outcome in outcomes)
     apart = msgspec.structs.replace(outcomes[700].offset, reasons=["t_q_at_apart"])

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from compensator.audit.replay_check import ReplayCheck
 from compensator.audit.result import RecordingAudit
@@ -21,7 +22,10 @@ from compensator.messages import Candidate
 from compensator.recording.container import Container
 from compensator.recording.reading import RawRecord, groups_of, messages, recordings
 from compensator.service.loop.loop import StartDiagnosis
+from compensator.service.loop.process import DiagnosisProcess
+from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.weighing import Diagnosed
+from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
 from tests.audit.made import CONFIG
@@ -295,4 +299,43 @@ async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_th
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
     assert {one.role for one in machine.candidates()[-30:]} == {"before"}
     assert machine.events("adopt")[-1].data["by"] == "loop"
+    checked(machine)
+
+
+async def test_a_defect_of_the_shadow_ends_the_shadow_and_never_a_sample(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    works = Shadow.process
+
+    def breaks(shadow: Shadow, outcome: Outcome) -> Any:
+        if len(machine.outcomes) == 1300:
+            raise ZeroDivisionError("a defect")
+        return works(shadow, outcome)
+
+    monkeypatch.setattr(Shadow, "process", breaks)
+    await machine.run(1320)
+    monkeypatch.setattr(Shadow, "process", works)
+    assert machine.steps() == [("diagnose", "night"), ("shadow", ""), ("end", "failed")]
+    states = {outcome.offset.state for outcome in machine.outcomes[1290:]}
+    assert states == {"ok"} and len(machine.outcomes) == 1320
+    assert "a defect" in machine.events("loop")[-1].text
+    checked(machine)
+
+
+async def test_the_process_of_the_service_finds_the_effect_in_its_recordings(tmp_path: Path) -> None:
+    machine = Looping(tmp_path)
+    machine.diagnose = DiagnosisProcess(  # type: ignore[method-assign]
+        machine.config, machine.recordings, machine.store.folder / "diagnoses"
+    )
+    await machine.run(1250, until=in_phase(machine, "shadow"))
+    assert machine.steps() == [("diagnose", "night"), ("shadow", "")]
+    found = machine.events("diagnosis")[-1].data
+    assert found["verdict"] == "explained" and found["effects"] == ["input:coolant_degc"]
+    folder = next((machine.store.folder / "diagnoses").iterdir())
+    assert {"diagnosis.json", "model.toml", "report.html"} <= {path.name for path in folder.iterdir()}
+    await machine.run(5)
+    assert opening_of(recordings(machine.recordings, MACHINE)[-1])["candidate.toml"] == (
+        (folder / "model.toml").read_bytes()
+    )
     checked(machine)

@@ -16,7 +16,7 @@ from compensator.clock import NS
 from compensator.watch import server as server_module
 from compensator.watch.server import PageServer, page
 from compensator.watch.shop import Shop
-from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
+from tests.watch.heard import LOOP, START_NS, Clock, estimate, event, offset, sample, status
 from tests.watch.test_page import STATUS, drawn
 
 #: Shows the page to itself in frames of each width, opens what can be opened, and tells what is wider than its frame.
@@ -72,7 +72,7 @@ def shop_in_trouble() -> Shop:
             shop.receive(key + "y/offset", offset(i, t, **({"machine": name, "state": state} | changes)))
             shop.receive(key + "sample", sample(i, t, quality="open_circuit" if name == "hold" else "good"))
             shop.receive(key + "estimate", estimate(i, t))
-            shop.receive(key + "status", status(i, t, devices={"couples": LONG}, recording=LONG, **WANTED))
+            shop.receive(key + "status", status(i, t, devices={"couples": LONG}, recording=LONG, loop=LOOP, **WANTED))
         clock.advance(60)
     shop.receive("shop/hold/thermal/event", event(3, text=LONG, ok=False))
     shop.receive("shop/hold/thermal/y/offset", b"nonsense")

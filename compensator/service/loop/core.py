@@ -93,6 +93,11 @@ class ModelLoop:
         message = candidate_message(present, other, compared.role, verdict, self.loop.judged_h, probes)
         return Followed(message, tuple(notes))
 
+    def resume(self) -> None:
+        """Acknowledge exchanged sensors, as the present compensation does at an operator's `resume`."""
+        if self.shadow is not None:
+            self.shadow.compensation.resume()
+
     def pause(self, samples: int | None) -> None:
         """Account for samples that were not measured, as the present compensation does."""
         if self.shadow is not None:
@@ -150,6 +155,8 @@ class ModelLoop:
         new.compensation.continue_from(replace(handover, model_changed=present.status.zero is not None))
         self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
+        # What holds the published offset concerns the new one only.
+        present.continue_from(replace(handover, operator_hold=False, internal_error=False, probing=None))
         self.shadow = Shadow(present, data) if self.state.shadow is not None else None
         return new.compensation, new.data
 

@@ -172,6 +172,11 @@ class LiveLoop:
             self._not_stored, self._warming = "", None
             self._give_up(core, why)
 
+    def resume(self) -> None:
+        """Pass on an operator's `resume`."""
+        if self._core is not None:
+            self._core.resume()
+
     def dismiss(self, present: Compensation) -> None:
         """End the candidate: an operator's command that acts with the next sample."""
         if self._core is not None:

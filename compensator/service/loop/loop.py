@@ -22,6 +22,7 @@ from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData,
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Avoided, Compared, LoopState, Running, fresh
 from compensator.service.loop.trust import both_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
+from compensator.service.loop.words import ended, nothing_follows
 from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_MIN, Comparison
 from compensator.service.transfer.second_opinion import described, is_unusable
@@ -197,14 +198,7 @@ class Loop:
     def _end(self, why: str, text: str = "") -> list[Note]:
         """End the shadow."""
         state = self.state
-        words = {
-            "limits": "the candidate reaches limits that the present model keeps",
-            "worse": f"the candidate is worse: {described(state.verdict)}",
-            "no_difference": f"the candidate shows no clear difference: {described(state.verdict)}",
-            "watched": f"the adopted model is no longer watched: {described(state.verdict)}",
-            "dismissed": "the candidate is dismissed by an operator",
-        }
-        note = self._note(LoopAction.END, text or words[why], why=why)
+        note = self._note(LoopAction.END, text or ended(why, state.verdict), why=why)
         state.phase, state.shadow, state.exchange = "idle", None, ""
         self._begin_comparison()
         return [note]
@@ -278,7 +272,7 @@ class Loop:
             data = LoopData(
                 step=LoopAction.NOTHING, why=why, effects=found.effects, model_sha256=found.candidate_sha256
             )
-            return [Note(EventKind.LOOP, _nothing_follows(why, found), data.table())]
+            return [Note(EventKind.LOOP, nothing_follows(why, found), data.table())]
         state.diagnosis = msgspec.structs.replace(running, candidate_sha256=found.candidate_sha256)
         text = f"a candidate is compared with the present model: {', '.join(found.effects) or 'no added effect'}"
         role = role_of(found)
@@ -396,17 +390,3 @@ def _is_clearly_better(found: ComparisonData) -> bool:
     if found.verdict != ComparisonVerdict.BETTER or found.present_rms_um is None or found.candidate_rms_um is None:
         return False
     return found.ratio is not None and found.ratio <= BETTER_PART
-
-
-def _nothing_follows(why: str, found: DiagnosisData) -> str:
-    effects = ", ".join(found.effects) or "no added effect"
-    words = {
-        "failed": f"the diagnosis failed: {found.needs}",
-        "unexplained": f"the diagnosis explains nothing that can be compensated ({found.verdict}); {found.needs}",
-        "refused": f"the candidate cannot be used: {found.refused}",
-        "nothing_found": "the diagnosis finds nothing that the model lacks",
-        "unchanged": f"the diagnosis finds what the model has: {effects}",
-        "in_shadow": f"the diagnosis finds what is in shadow already: {effects}",
-        "avoided": f"{effects}: the service went back from it, or an operator dismissed it, a short time ago",
-    }
-    return words[why].rstrip("; ")

@@ -62,7 +62,9 @@ def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
         name = command_of(event)
         if name == CommandName.DISMISS:
             return core.loop.dismiss(now_ns)
-        if name == CommandName.ADOPT and event.data.get("candidate") is True:
+        if name == CommandName.RESUME:
+            core.resume()
+        elif name == CommandName.ADOPT and event.data.get("candidate") is True:
             with suppress(ServiceError):
                 core.loop.accept()
     elif event.kind == EventKind.DIAGNOSIS:

@@ -129,6 +129,15 @@ class LoopRun:
         self._compensation.pause(samples)
         self._core.pause(samples)
 
+    def hold(self) -> None:
+        """Freeze the offset, as an operator can."""
+        self._compensation.hold()
+
+    def resume(self) -> None:
+        """Follow the model again, as an operator can."""
+        self._compensation.resume()
+        self._core.resume()
+
     def accept(self) -> None:
         """Adopt the candidate in shadow before the next sample, as an operator can.
 
