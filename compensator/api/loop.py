@@ -25,6 +25,8 @@ from compensator.service.outcome import Outcome
 ENDS_H = (24.0, 16.0, 10.0, 7.0)
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
+#: An end with fewer probes is not diagnosed: they name nothing, and a search takes as long as one of the whole.
+FEWEST_PROBES = 20
 #: A shorter end must leave less than this part of what a longer one does.
 SHORTER_IS_BETTER = 0.7
 
@@ -80,8 +82,11 @@ def diagnoses_of_table(
     for hours in ENDS_H:
         if least <= WELL_EXPLAINED or np.ptp(table.t_s) < 3600.0 * (hours + 1.0):
             continue
+        end = _end_of(table, hours)
+        if is_probed(table) and np.sum(np.isfinite(end.columns["y_um"])) < FEWEST_PROBES:
+            break
         try:
-            found = _diagnosed(_end_of(table, hours), base, probe_std_um)
+            found = _diagnosed(end, base, probe_std_um)
         except CompensatorError:  # too little data in so short an end
             break
         if _left(found, base) < SHORTER_IS_BETTER * least:
