@@ -152,6 +152,7 @@ class ModelLoop:
         assert self.shadow is not None
         new = self.shadow
         handover = present.status.handover
+        new.compensation.raise_level(self.loop.level_um)
         new.compensation.continue_from(replace(handover, model_changed=present.status.zero is not None))
         self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
