@@ -41,6 +41,7 @@ from compensator.api.loop import diagnosis_in_process
 from compensator.clock import NS
 from compensator.config import parse_config
 from compensator.demo.offline import probe_of, run_alone, sample_of
+from compensator.errors import CompensatorError
 from compensator.events import EventKind
 from compensator.messages import number
 from compensator.model.model_file import parse_model
@@ -109,12 +110,15 @@ def _channel(name):
 def samples_of(week, columns):
     """Return for each minute in which the service runs: sample, what a probe before it shows, whether a zero is set."""
     start_ns = MIDNIGHT_NS + round(week.start_h * 60) * MINUTE_NS
-    shown = np.full(week.minutes, math.nan)
-    for probe in week.probes:
-        shown[probe.minute] = week.true_um[probe.minute - 1] - week.true_um[0] + probe.error_um
     visited = np.zeros(week.minutes, dtype=bool)
     for minute in week.visits:
         visited[minute + int(np.argmax(week.running[minute:]))] = True
+    # A person who sets a zero also sets that of the feature.
+    zeros = np.concatenate(([0], np.flatnonzero(visited)))
+    shown = np.full(week.minutes, math.nan)
+    for probe in week.probes:
+        zero = zeros[np.searchsorted(zeros, probe.minute) - 1]
+        shown[probe.minute] = week.true_um[probe.minute - 1] - week.true_um[zero] + probe.error_um
     names = list(columns)
     table = np.column_stack([columns[name] for name in names])
     return [
@@ -147,7 +151,10 @@ class Diagnoses:
             if self.count in self._kill_at:
                 raise Killed
             began = time.perf_counter()
-            self.found[key] = self._diagnose(outcomes, model)
+            try:
+                self.found[key] = self._diagnose(outcomes, model)
+            except CompensatorError as error:  # as LoopRun has it
+                self.found[key] = Diagnosed("failed", (), None, f"the diagnosis failed: {error}", needs=str(error))
             self.seconds += time.perf_counter() - began
         return self.found[key]
 
