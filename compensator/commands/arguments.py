@@ -40,7 +40,7 @@ def demo(parser: argparse.ArgumentParser) -> None:
         help="one machine that continues in real time after these hours, for experiments",
     )
     add("--port", type=int, default=7447, help="with --live: port on loopback (default 7447)")
-    words = "ten days of two machines, unattended: effects come and go, the loop finds and adopts them; 3 minutes"
+    words = "ten days of two machines, unattended: effects come and go, the loop finds and adopts them; some minutes"
     add("--loop", action="store_true", help=words)
     _page(parser)
 

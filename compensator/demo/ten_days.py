@@ -1,7 +1,7 @@
 """Ten simulated days, unattended: effects that begin and end are found, compared, adopted and dropped by the loop.
 
 One machine has a displacement sensor, the other one a touch probe each hour. The same service and loop as in operation,
-without devices, so that ten days take two minutes.
+without devices, so that ten days take minutes.
 """
 
 from __future__ import annotations
