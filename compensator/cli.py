@@ -72,6 +72,11 @@ USERS = {
             "dismiss --config machine.toml",
             "commands.adopt:dismiss",
         ),
+        Command(
+            "loop",
+            "what diagnosis, comparison and adoption make of a shop's recordings",
+            "loop recordings/vmc-07 recordings/vmc-08 --page shop.html",
+        ),
     ),
     "operator": (
         Command("watch", "show one machine or many, live", "watch --connect tcp/127.0.0.1:7447 --prefix shop"),

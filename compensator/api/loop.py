@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from compensator.api.diagnosis import DiagnosisResult, diagnose
+from compensator.config import Config
 from compensator.data.frames import hash_of
 from compensator.data.measurement import Measurement, Origin
 from compensator.data.table import Table
@@ -23,8 +25,15 @@ from compensator.service.outcome import Outcome
 ENDS_H = (24.0, 16.0, 10.0, 7.0)
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
+#: An end with fewer probes is not diagnosed: they name nothing, and a search takes as long as one of the whole.
+FEWEST_PROBES = 20
 #: A shorter end must leave less than this part of what a longer one does.
 SHORTER_IS_BETTER = 0.7
+
+
+def diagnosis_in_process(config: Config) -> Callable[[Sequence[Outcome], bytes], Diagnosed]:
+    """Return the function by which a `LoopRun` of this machine diagnoses in its own process."""
+    return partial(diagnosis_of_record, probe_std_um=config.probe.std_um if config.probe is not None else None)
 
 
 def diagnosis_of_record(record: Sequence[Outcome], model: bytes, *, probe_std_um: float | None = None) -> Diagnosed:
@@ -73,8 +82,11 @@ def diagnoses_of_table(
     for hours in ENDS_H:
         if least <= WELL_EXPLAINED or np.ptp(table.t_s) < 3600.0 * (hours + 1.0):
             continue
+        end = _end_of(table, hours)
+        if is_probed(table) and np.sum(np.isfinite(end.columns["y_um"])) < FEWEST_PROBES:
+            break
         try:
-            found = _diagnosed(_end_of(table, hours), base, probe_std_um)
+            found = _diagnosed(end, base, probe_std_um)
         except CompensatorError:  # too little data in so short an end
             break
         if _left(found, base) < SHORTER_IS_BETTER * least:

@@ -40,6 +40,8 @@ def demo(parser: argparse.ArgumentParser) -> None:
         help="one machine that continues in real time after these hours, for experiments",
     )
     add("--port", type=int, default=7447, help="with --live: port on loopback (default 7447)")
+    words = "ten days of two machines, unattended: effects come and go, the loop finds and adopts them; some minutes"
+    add("--loop", action="store_true", help=words)
     _page(parser)
 
 
@@ -67,6 +69,17 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     add("--correct", action="store_true", help=words)
     _y_std(parser)
     _column(parser)
+
+
+def loop(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `loop`."""
+    add = parser.add_argument
+    words = "recordings of a machine, or a folder that contains such folders"
+    add("folder", type=Path, nargs="+", metavar="FOLDER", help=words)
+    words = "for a machine whose service has no loop of its own: what a better model leads to (default adopt)"
+    add("--policy", choices=("propose", "adopt"), default="adopt", help=words)
+    add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
+    _page(parser)
 
 
 def export(parser: argparse.ArgumentParser) -> None:

@@ -18,9 +18,11 @@ from compensator.demo.live import run_live
 from compensator.demo.loop import FIRST_MODEL, SECOND_DAY, Loop, close_the_loop
 from compensator.demo.machine import MACHINES
 from compensator.demo.shop import run_shop_day
+from compensator.demo.ten_days import results, ten_days
 from compensator.report.demonstration import closed, page_of, verdict
 from compensator.report.formats import write
 from compensator.report.shop import ShopDay, probe_words, shop_table
+from compensator.report.ten_days import days_page, days_table, days_verdict
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -53,6 +55,8 @@ def _run(arguments: argparse.Namespace) -> Answer:
         text = f"stopped; to check the recordings: compensator replay {recordings}, compensator report {recordings}"
         return Answer({"recordings": str(recordings)}, text)
     also = checked_page(arguments.page)
+    if arguments.loop:
+        return Answer(*run_ten_days(arguments.out, seed=arguments.seed, also=also))
     return Answer(*run_demo(arguments.out, hours=arguments.hours, seed=arguments.seed, also=also))
 
 
@@ -97,6 +101,16 @@ def run_demo(out: Path, *, hours: float, seed: int, also: Path | None = None) ->
     result = {"machines": results, "loop": loop, "shop": shop.figures, "report": str(page)}
     tables = f"{table.text()}\n\n{verdict(days)}\n{summary}\n\n{shop_table(shop).text()}\n\n{probe_words(shop).text()}"
     return result, f"{tables}\n{pages_text(page, also)}"
+
+
+def run_ten_days(out: Path, *, seed: int, also: Path | None = None) -> tuple[dict[str, Any], str]:
+    """Run ten days of two machines with the loop, and write the page; parameters and result are those of `run_demo`."""
+    days = ten_days(out, seed=seed)
+    page, made = out / "loop.html", days_page(days)
+    for path in filter(None, (page, also)):
+        write(path, made)
+    text = f"{days_table(days).text()}\n\n{days_verdict(days)}\n{pages_text(page, also)}"
+    return {"loop_days": results(days), "report": str(page)}, text
 
 
 def _shop(folder: Path, loop: Loop, *, hours: float, seed: int) -> ShopDay:

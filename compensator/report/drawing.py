@@ -62,9 +62,9 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
         heights = [panel.height for panel in panels]
         canvas = Canvas(figsize=(width, figure.full_height), layout="constrained")
         rows = canvas.subplots(len(panels), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-        drawn = 0
+        colours: dict[str, int] = {}
         for axes, panel in zip(rows, panels, strict=True):
-            drawn = _draw(axes, panel, drawn)
+            _draw(axes, panel, colours)
             axes.label_outer()
             if panel.strips:
                 _strips(axes, panel)
@@ -84,9 +84,19 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
     return f"{opening}><desc>{html.escape(described(figure))}</desc>{rest}"
 
 
-def _draw(axes: Axes, figure: Figure, drawn: int) -> int:
-    """Draw a panel below others with so many curves; return how many there are then."""
+def _draw(axes: Axes, figure: Figure, colours: dict[str, int]) -> None:
+    """Draw a panel; a name that a panel above it has keeps its number, by which it has its colour."""
     named: set[str] = set()
+    above, drawn = dict(colours), len(colours)
+
+    def number(name: str) -> int:
+        nonlocal drawn
+        if name in above:
+            return above[name]
+        drawn += 1
+        colours[name or f"curve {drawn}"] = drawn - 1
+        return drawn - 1
+
     unit = _DAY_S if figure.clock else 1.0
     for span in figure.spans:
         label = "" if span.name in named else _plain(span.name)
@@ -97,17 +107,14 @@ def _draw(axes: Axes, figure: Figure, drawn: int) -> int:
         axes.plot(np.cos(angle), np.sin(angle), color=INK, linewidth=0.8)
         axes.set_aspect("equal", adjustable="datalim")
     for i, line in enumerate(figure.lines):
-        _curve(axes, line, i, drawn + i, figure)
-    drawn += len(figure.lines)
+        _curve(axes, line, i, number(line.name), figure)
     for marks in figure.marks:
         hollow: dict[str, Any] = {"markerfacecolor": "none"} if marks.marker == "o" else {}
-        colour = LINES[drawn % len(LINES)]
+        colour = LINES[number(marks.name) % len(LINES)]
         axes.plot(marks.x / unit, marks.y, marks.marker, color=colour, label=_plain(marks.name), **hollow)
-        drawn += 1
     for stems in figure.stems:
-        colour = LINES[drawn % len(LINES)]
+        colour = LINES[number(stems.name) % len(LINES)]
         axes.vlines(stems.x, 0.0, stems.y, color=colour, label=_plain(stems.name), linewidth=2.0)
-        drawn += 1
     if figure.stems:
         axes.axhline(0.0, color=INK, linewidth=0.8)
     for limit in figure.limits:
@@ -119,7 +126,6 @@ def _draw(axes: Axes, figure: Figure, drawn: int) -> int:
     if figure.y_log and np.isfinite(axes.dataLim.minposy):
         axes.set_yscale("log")
     _axes(axes, figure, unit)
-    return drawn
 
 
 def _axes(axes: Axes, figure: Figure, unit: float) -> None:

@@ -194,6 +194,7 @@ class _Reader:
             first = self._last_s
         elif first > self._last_s:
             self._extend("", (), self._last_s, first)
+        history.in_force.setdefault(offset.model_sha256, Stretches()).add(first, t)
         self._extend(offset.state, tuple(offset.reasons), first, t)
         self._last_s = t
         for period in (history.whole, self._day(t)):
@@ -218,8 +219,10 @@ class _Reader:
         if probe.taken:
             history.probes_taken += 1
             history.probes_left.add(shown.left_um, shown.at_s)
+            self._day(shown.at_s).probed.add(shown.left_um, shown.at_s)
 
     def _event(self, event: Event) -> None:
+        self.history.story.add(event)
         self.history.events_count += 1
         self.history.events = [*self.history.events[1 - EVENTS :], (event.time_utc_ns * _NS, event.kind, event.text)]
 

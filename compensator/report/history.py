@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from compensator.codes import RecordingEnd
 from compensator.report.envelope import Envelope, Stretches
+from compensator.report.story import Story
 
 #: Numbers of events and episodes that are kept; the others are only counted.
 EVENTS, EPISODES = 500, 200
@@ -66,8 +67,9 @@ class Period:
         Number of samples.
     seconds : dict of str to float
         Time in each state, s.
-    offset, residual, measured, left, std : Spread
-        Offset; measured − predicted; measured deformation; measured + offset; standard deviation of the offset. µm.
+    offset, residual, measured, left, std, probed : Spread
+        Offset; measured − predicted; measured deformation; measured + offset; standard deviation of the offset; error
+        that probes have found with the offset applied. µm.
     """
 
     samples: int = 0
@@ -77,13 +79,14 @@ class Period:
     measured: Spread = field(default_factory=Spread)
     left: Spread = field(default_factory=Spread)
     std: Spread = field(default_factory=Spread)
+    probed: Spread = field(default_factory=Spread)
 
     def join(self, other: Period) -> None:
         """Add the figures of another period."""
         self.samples += other.samples
         for state, seconds in other.seconds.items():
             self.seconds[state] += seconds
-        for name in ("offset", "residual", "measured", "left", "std"):
+        for name in ("offset", "residual", "measured", "left", "std", "probed"):
             getattr(self, name).join(getattr(other, name))
 
 
@@ -212,6 +215,10 @@ class History:
         The longest.
     models : dict of str to (str, float)
         Name and first time of each model, by its SHA-256.
+    in_force : dict of str to Stretches
+        When each model was in force, by its SHA-256.
+    story : Story
+        What happened to the models.
     """
 
     machine: str = ""
@@ -232,6 +239,8 @@ class History:
     episodes: list[Episode] = field(default_factory=list)
     episodes_count: int = 0
     models: dict[str, tuple[str, float]] = field(default_factory=dict)
+    in_force: dict[str, Stretches] = field(default_factory=dict)
+    story: Story = field(default_factory=Story)
 
     @property
     def first_s(self) -> float:

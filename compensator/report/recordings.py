@@ -40,6 +40,7 @@ from compensator.report.page import (
     Words,
     warnings_of,
 )
+from compensator.report.story import figures_of, in_words, story_section
 
 TIME = "time, UTC"
 #: Order of the states on the page.
@@ -82,6 +83,7 @@ def page_of(history: History) -> Page:
     blocks: list[Block] = [
         _offset(history),
         *warnings_of([beyond] if beyond else []),
+        *_story(history),
         _band(history),
         _figures(history),
         _states(history),
@@ -123,6 +125,7 @@ def figures(history: History) -> dict[str, object]:
         "left_rms_um": _null(whole.left.rms),
         "models": list(history.models),
         **_probe_figures(history),
+        **figures_of(history.story),
         "events": history.events_count,
         "alarms": history.episodes_count,
     }
@@ -153,7 +156,7 @@ def verdict(history: History) -> str:
     if history.probes_left.samples and not whole.left.samples:
         left = history.probes_left
         words += f"; {left.samples} probe(s) found {left.rms:.1f} µm rms with the offset applied"
-    return f"{words}."
+    return f"{words}. {in_words(history.story)}".rstrip()
 
 
 def _against_stated(whole: Period) -> str:
@@ -233,6 +236,24 @@ def _offset(history: History) -> Figure:
         curves = {"measured": "measured", "remaining (measured + offset)": "left"} | curves
         words += f" Remaining error: {history.whole.left.rms:.2f} µm rms."
     return _curves(history, "Offset and remaining error", "Y, µm", curves, words, 3.4, tuple(held[:_SHADED]))
+
+
+def _story(history: History) -> list[Block]:
+    """Return the story of the models; nothing if none was found, compared or changed."""
+    if history.story.is_empty:
+        return []
+    left = {}
+    for date, day in history.days.items():
+        noon = datetime.fromisoformat(f"{date}T12:00:00+00:00").timestamp()
+        left[noon] = day.left.rms if day.left.samples else day.probed.rms
+    section = story_section(
+        history.story,
+        left_by_day=left,
+        in_force={sha: stretches.pieces for sha, stretches in history.in_force.items()},
+        names={sha: name for sha, (name, _) in history.models.items()},
+        x_limits=(history.first_s, history.last_s),
+    )
+    return [section]
 
 
 def _band(history: History) -> Figure:

@@ -269,6 +269,10 @@ class Compensation:
         if self.probing is not None and handover.probing is not None:
             self.probing.continue_from(handover.probing)
 
+    def raise_level(self, um: float) -> None:
+        """Raise the predicted deformation from now on by a constant, µm; its changes stay as they are."""
+        self._zero.y_base -= um
+
     # ------------------------------------------------------------------ one sample
 
     def process(self, raw: Sample) -> Outcome:

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from sim_hardware.drawn_machines.catalogue import Place
 from sim_hardware.drawn_machines.duty import LEVELS, STEP_S, Duty, Habits, lag
-from sim_hardware.drawn_machines.plant import Response, minutes
+from sim_hardware.drawn_machines.plant import Mask, Response, minutes
 
 Array = NDArray[np.float64]
 
@@ -144,8 +144,8 @@ class ConductionMachine:
         B[self.hidden_at, 6] = 1.0
         return K, B
 
-    def inputs(self, duty: Duty, habits: Habits, effect: str, strength: float) -> Array:
-        """Return u over a duty, shape (n, 7)."""
+    def inputs(self, duty: Duty, habits: Habits, effect: str, strength: float | Array) -> Array:
+        """Return u over a duty, shape (n, 7); the strength may be one for each step."""
         given, zero = duty.columns, np.zeros(duty.n)
         floor = habits.hall_degc + (strength if effect == "floor" else 0.0) * (given["floor_degc"] - habits.hall_degc)
         friction = strength * duty.share("spindle_rpm", habits) ** self.friction_power
@@ -161,15 +161,18 @@ class ConductionMachine:
             )
         )
 
-    def run(self, duty: Duty, habits: Habits, effect: str, strength: float) -> Response:
-        """Return the response over a duty, the steps before the recording included; strength 0 is no effect."""
-        u = self.inputs(duty, habits, effect, strength)
+    def run(self, duty: Duty, habits: Habits, effect: str, strength: float, on: Mask | None = None) -> Response:
+        """Return the response over a duty, see `plant.Plant`."""
+        u = self.inputs(duty, habits, effect, strength if on is None else np.asarray(strength * on, dtype=np.float64))
         fan = np.round(LEVELS * duty.share("fan_rpm", habits)).astype(int) if effect == "fan" else np.zeros(duty.n, int)
         flow = np.round(LEVELS * duty.share("coolant_flow_lpm", habits)).astype(int) if effect == "wet" else 0 * fan
-        level = (fan + (LEVELS + 1) * flow).tolist()
+        off = np.zeros(duty.n, int) if on is None else (~on).astype(int)
+        level = (fan + (LEVELS + 1) * flow + (LEVELS + 1) ** 2 * off).tolist()
         steps, added = {}, np.empty((duty.n, self.base + 1))
         for key in sorted(set(level)):
-            K, B = self.matrices(effect, strength, (key % (LEVELS + 1)) / LEVELS, (key // (LEVELS + 1)) / LEVELS)
+            is_off, rest = divmod(key, (LEVELS + 1) ** 2)
+            here_strength = 0.0 if is_off else strength
+            K, B = self.matrices(effect, here_strength, (rest % (LEVELS + 1)) / LEVELS, (rest // (LEVELS + 1)) / LEVELS)
             rate = -K / self.capacity_j_per_k[:, None]
             phi = expm(STEP_S * rate)
             steps[key] = phi
@@ -177,8 +180,9 @@ class ConductionMachine:
             added[here] = (
                 u[here] @ (np.linalg.solve(rate, phi - np.eye(K.shape[0])) @ (B / self.capacity_j_per_k[:, None])).T
             )
-        K, B = self.matrices(effect, strength)
-        degc = np.linalg.solve(K, B @ self.inputs(duty.resting(), habits, effect, strength)[0])
+        first = strength if on is None or on[0] else 0.0
+        K, B = self.matrices(effect, first)
+        degc = np.linalg.solve(K, B @ self.inputs(duty.resting(), habits, effect, first)[0])
         states = np.empty((duty.n, degc.size))
         for i, key in enumerate(level):
             degc = steps[key] @ degc + added[i]

@@ -14,7 +14,7 @@ from sim_hardware.drawn_machines.fairness import error_um, imitated_um
 from sim_hardware.drawn_machines.lumped import LumpedMachine
 from sim_hardware.drawn_machines.machine import Machine, Table, Truth
 from sim_hardware.drawn_machines.measuring import Sensors, mismeasured_t_q, mismeasured_y
-from sim_hardware.drawn_machines.plant import Plant, Response
+from sim_hardware.drawn_machines.plant import Mask, Plant, Response, minutes
 from sim_hardware.drawn_machines.transfer import TransferMachine
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ STRONGEST = {
 OVER_NOISE, OVER_NOISE_SMALL, OVER_IMITATION = 4.0, 3.0, 2.0
 
 
-class _UnfairError(Exception):
+class UnfairError(Exception):
     """A draw that nobody could be asked to diagnose, or that is no machine."""
 
 
@@ -88,13 +88,13 @@ def draw(
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([FAMILIES.index(family), seed, attempt])
         try:
-            return _Draw(rng, family, effect, shop_floor=shop_floor, published=published).machine(seed)
-        except _UnfairError as error:
+            return Draw(rng, family, effect, shop_floor=shop_floor, published=published).machine(seed)
+        except UnfairError as error:
             why = str(error)
     raise ValueError(f"{family} {seed}, {effect}: no fair machine in {ATTEMPTS} draws; the last one: {why}")
 
 
-class _Draw:
+class Draw:
     """One attempt."""
 
     def __init__(
@@ -138,14 +138,14 @@ class _Draw:
         calibration = self._within(self._run(self.calibration_duty, 0.0), "calibration")
         rise = float(np.ptp(calibration.t_q_degc - calibration.at_degc))
         if not RISE_K[0] <= rise <= RISE_K[1]:
-            raise _UnfairError(f"T_Q rises by {rise:.1f} K")
+            raise UnfairError(f"T_Q rises by {rise:.1f} K")
         fresh = self._run(self.fresh_duty, 0.0)
         fresh_acted = self._run(self.fresh_duty, strength)
         for each in (fresh, fresh_acted):
             self._within(each, "fresh")
         least = 0.5 * (LEAST_SMALL_UM if self.effect in SMALL else SIZE_UM[0])
         if self.entry.deployable and self._size_um(fresh, fresh_acted) < least:
-            raise _UnfairError("the effect does not act on the fresh run")
+            raise UnfairError("the effect does not act on the fresh run")
         if self.entry.acts_on == "y":
             fresh_acted = fresh
         truth = Truth(
@@ -173,15 +173,20 @@ class _Draw:
             noise_k=self.sensors.t_q_noise_k,
         )
 
-    def _run(self, duty: Duty, strength: float) -> Response:
-        """Return the machine's response with the effect, without the time before the recording."""
+    def _run(self, duty: Duty, strength: float, on: Mask | None = None) -> Response:
+        """Return the machine's response with the effect, without the time before the recording.
+
+        `on` says at which steps the effect acts; without it always.
+        """
         on_machine = self.entry.acts_on == "machine" and self.effect != "none"
         try:
-            response = self.plant.run(duty, self.habits, self.effect, strength if on_machine else 0.0)
+            response = self.plant.run(duty, self.habits, self.effect, strength if on_machine else 0.0, on)
         except ValueError as error:
-            raise _UnfairError(str(error)) from error
+            raise UnfairError(str(error)) from error
         if self.entry.acts_on == "t_q" and strength:
             t_q = mismeasured_t_q(response.t_q_degc, response.at_degc, self.effect, strength)
+            if on is not None:
+                t_q = np.where(minutes(on.astype(np.float64)) > 0.5, t_q, response.t_q_degc)
             response = dataclasses.replace(response, t_q_degc=t_q)
         before = duty.before * 15 // 60
         return Response(**{f.name: getattr(response, f.name)[before:] for f in dataclasses.fields(response)})
@@ -189,7 +194,7 @@ class _Draw:
     def _within(self, response: Response, name: str) -> Response:
         growth = float(np.ptp(response.y_um))
         if not GROWTH_UM[0] <= growth <= GROWTH_UM[1]:
-            raise _UnfairError(f"{name}: Y moves by {growth:.0f} um")
+            raise UnfairError(f"{name}: Y moves by {growth:.0f} um")
         return response
 
     def _sized_heat(self) -> Response:
@@ -218,7 +223,7 @@ class _Draw:
         for _ in range(3 if scaled else 0):
             found = self._size_um(healthy, response)
             if found < 1e-6:
-                raise _UnfairError("the effect does not act on the record")
+                raise UnfairError("the effect does not act on the record")
             if abs(found / self.size_um - 1.0) < 0.15:
                 break
             limit = STRONGEST.get(self.effect, np.inf) if self.family != "transfer" else np.inf
@@ -239,7 +244,7 @@ class _Draw:
         over_noise = (OVER_NOISE_SMALL if small else OVER_NOISE) * self.sensors.y_noise_um
         least = max(LEAST_SMALL_UM if small else SIZE_UM[0], over_noise)
         if not least <= size_um <= SIZE_UM[1]:
-            raise _UnfairError(f"an effect of {size_um:.2g} um, expected {least:.2g} to {SIZE_UM[1]:g}")
+            raise UnfairError(f"an effect of {size_um:.2g} um, expected {least:.2g} to {SIZE_UM[1]:g}")
 
     def _check_imitation(self, healthy: Response, response: Response) -> None:
         """Refuse an effect that another logged channel, or the model's own inputs, could cause just as well."""
@@ -249,7 +254,7 @@ class _Draw:
         channels = {name: self.record_duty.columns[name] for name in self.sensors.logged if name not in own}
         left = imitated_um(error_um(healthy, response), healthy, channels, self.record_duty)
         if left < OVER_IMITATION * float(np.hypot(self.sensors.y_noise_um, 0.3 * self.sensors.shop_floor)):
-            raise _UnfairError("another channel does the same")
+            raise UnfairError("another channel does the same")
 
     def _table(
         self,

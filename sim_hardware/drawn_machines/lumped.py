@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sim_hardware.drawn_machines.catalogue import Place
 from sim_hardware.drawn_machines.duty import STEP_S, Duty, Habits, lag
-from sim_hardware.drawn_machines.plant import Response, minutes
+from sim_hardware.drawn_machines.plant import Mask, Response, minutes
 
 Array = NDArray[np.float64]
 
@@ -154,8 +154,8 @@ class LumpedMachine:
             a - b * degc - self.area_m2 * film * above - (links_w_per_k * tightened * across) @ self.across
         )
 
-    def run(self, duty: Duty, habits: Habits, effect: str, strength: float) -> Response:
-        """Return the response over a duty, the steps before the recording included; strength 0 is no effect.
+    def run(self, duty: Duty, habits: Habits, effect: str, strength: float, on: Mask | None = None) -> Response:
+        """Return the response over a duty, see `plant.Plant`.
 
         Raises
         ------
@@ -168,11 +168,18 @@ class LumpedMachine:
         per_step = STEP_S / self.capacity_j_per_k
         if np.max(per_step * (b.max(axis=0) + 2.0 * np.abs(self.across).T @ links)) > 1.0:
             raise ValueError(f"{effect} of {strength:g}: too strong for steps of {STEP_S:g} s")
-        rest_a, rest_b = self.linear(duty.resting(), habits, effect, strength)
-        degc = self._settled(air[0], rest_a[0], rest_b[0], links)
+        first = strength if on is None or on[0] else 0.0
+        rest_a, rest_b = self.linear(duty.resting(), habits, effect, first)
+        degc = self._settled(air[0], rest_a[0], rest_b[0], links if first else self.links())
+        each = [links] * duty.n
+        if on is not None:
+            healthy_a, healthy_b = self.linear(duty, habits, "none", 0.0)
+            a, b = np.where(on[:, None], a, healthy_a), np.where(on[:, None], b, healthy_b)
+            healthy = self.links()
+            each = [links if acts else healthy for acts in on]
         states = np.empty((duty.n, degc.size))
         for i in range(duty.n):
-            degc = degc + per_step * self.flows(degc, air[i], a[i], b[i], links)
+            degc = degc + per_step * self.flows(degc, air[i], a[i], b[i], each[i])
             states[i] = degc
         return Response(
             t_q_degc=minutes(lag(states[:, self.seat], self.seat_lag_min)),

@@ -12,6 +12,7 @@ from sim_hardware.drawn_machines.catalogue import Place
 from sim_hardware.drawn_machines.duty import PER_MIN, Duty, Habits
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,8 +33,11 @@ class Plant(Protocol):
     def first_strength(self, effect: str) -> tuple[float, str, bool]:
         """Return a strength to begin with, its unit, and whether it is scaled to a wanted size."""
 
-    def run(self, duty: Duty, habits: Habits, effect: str, strength: float) -> Response:
-        """Return the response over a duty, the steps before the recording included; strength 0 is no effect."""
+    def run(self, duty: Duty, habits: Habits, effect: str, strength: float, on: Mask | None = None) -> Response:
+        """Return the response over a duty, the steps before the recording included; strength 0 is no effect.
+
+        `on`, shape (steps of the duty,), says when the effect acts; without it always.
+        """
 
 
 def minutes(values: Array) -> Array:

@@ -16,12 +16,14 @@ from scipy.signal import lfilter
 
 from sim_hardware.drawn_machines.catalogue import Place
 from sim_hardware.drawn_machines.duty import Duty, Habits, lag
-from sim_hardware.drawn_machines.plant import Response, minutes
+from sim_hardware.drawn_machines.plant import Mask, Response, minutes
 from sim_hardware.physics.published import DEFORMATION_POLES, DTF, TDTF, TTF, TTF_POLES, tustin
 
 Array = NDArray[np.float64]
 Function = Callable[[Array], Array]
 
+#: How quickly a path changes where an effect on it begins or ends, min.
+CHANGE_MIN = 20.0
 #: Gains at rest and time constants, min, of the modes that the drawn functions lie around.
 DTF_MODES = ((1.45, 20.9), (-0.43, 292.0))
 TTF_MODES = ((0.055, 12.8), (0.19, 76.3))
@@ -107,23 +109,41 @@ class TransferMachine:
             "nonlinear": (self._sign, "per 100 um", True),
         }.get(effect, (self._sign, "um at full signal", True))
 
-    def run(self, duty: Duty, habits: Habits, effect: str, strength: float) -> Response:
-        """Return the response over a duty, the steps before the recording included; strength 0 is no effect."""
+    def run(self, duty: Duty, habits: Habits, effect: str, strength: float, on: Mask | None = None) -> Response:
+        """Return the response over a duty, see `plant.Plant`."""
         heat, air = minutes(duty.columns["power_w"]), minutes(duty.columns["air_degc"])
         y_dtf, y_tdtf = self.dtf(heat), self.tdtf(air - air[0])
-        part = self._part(duty, habits, effect, strength, y_dtf, y_tdtf) if strength else 0.0
+        part = self._part(duty, habits, effect, strength, y_dtf, y_tdtf, on) if strength else 0.0
         return Response(t_q_degc=air + self.ttf(heat), at_degc=air, y_um=y_dtf + y_tdtf + part, heat_w=heat)
 
-    def _part(self, duty: Duty, habits: Habits, effect: str, strength: float, y_dtf: Array, y_tdtf: Array) -> Array:
-        if effect == "time_constant":
-            # (1 + τ₀ s) / (1 + τ s) on the path, τ = strength · τ₀.
-            return np.asarray((1.0 / strength - 1.0) * (y_dtf - lag(y_dtf, 20.92 * strength, 1.0)))
-        if effect in ("gain_dtf", "gain_tdtf"):
-            return strength * (y_dtf if effect == "gain_dtf" else y_tdtf)
-        if effect == "nonlinear":
-            return np.asarray(strength * y_dtf * np.abs(y_dtf) / 100.0)
+    def _part(
+        self,
+        duty: Duty,
+        habits: Habits,
+        effect: str,
+        strength: float,
+        y_dtf: Array,
+        y_tdtf: Array,
+        on: Mask | None,
+    ) -> Array:
+        share = None if on is None else minutes(on.astype(np.float64))
+        if effect in ("time_constant", "gain_dtf", "gain_tdtf", "nonlinear"):
+            part = self._on_path(effect, strength, y_dtf, y_tdtf)
+            return part if share is None else part * lag(share, CHANGE_MIN, 1.0)
         if effect == "speed":
             u = minutes(duty.share("spindle_rpm", habits) ** self._power)
         else:
             u = minutes(duty.columns[{"coolant": "coolant_degc", "floor": "floor_degc", "hidden": "hidden"}[effect]])
+        if share is not None:
+            u = u[0] + share * (u - u[0])
         return strength * np.asarray(np.mean([lag(u, tau, 1.0) - u[0] for tau in self._taus[effect]], axis=0))
+
+    @staticmethod
+    def _on_path(effect: str, strength: float, y_dtf: Array, y_tdtf: Array) -> Array:
+        """Return what an effect adds to a path."""
+        if effect == "time_constant":
+            # (1 + τ₀ s) / (1 + τ s) on the path, τ = strength · τ₀.
+            return np.asarray((1.0 / strength - 1.0) * (y_dtf - lag(y_dtf, 20.92 * strength, 1.0)))
+        if effect == "nonlinear":
+            return np.asarray(strength * y_dtf * np.abs(y_dtf) / 100.0)
+        return strength * (y_dtf if effect == "gain_dtf" else y_tdtf)

@@ -1,8 +1,9 @@
 """All figures of the project, in one table at the end: `make bench`. Nothing passes or fails here.
 
-python -m tests.bench                    everything but `drawn`, which takes an hour or more
+python -m tests.bench                    everything but `drawn` and `loop`, which take hours
 python -m tests.bench speed diagnosis    some of it
 python -m tests.bench drawn --help       drawn machines, with options of their own
+python -m tests.bench loop --help        the loop over machine-weeks, too
 """
 
 import sys
@@ -15,6 +16,7 @@ from tests.bench import (
     faults,
     hidden,
     identification,
+    loop,
     machines,
     probe_calibration,
     probe_naming,
@@ -31,6 +33,7 @@ AREAS = {
     "diagnosis": diagnosis.report,
     "machines": machines.report,
     "drawn": drawn.report,
+    "loop": loop.report,
     "probe_calibration": probe_calibration.report,
     "probe_naming": probe_naming.report,
     "spindle": spindle.report,
@@ -43,8 +46,8 @@ AREAS = {
 
 
 def main(chosen):
-    if chosen[:1] == ["drawn"] and len(chosen) > 1 and chosen[1].startswith("-"):
-        drawn.main(chosen[1:])
+    if chosen[:1] in (["drawn"], ["loop"]) and len(chosen) > 1 and chosen[1].startswith("-"):
+        {"drawn": drawn, "loop": loop}[chosen[0]].main(chosen[1:])
         return
     unknown = set(chosen) - set(AREAS)
     if unknown:
@@ -53,7 +56,7 @@ def main(chosen):
     print(where + "\n", flush=True)
     figures = []
     try:
-        for name in chosen or [name for name in AREAS if name != "drawn"]:
+        for name in chosen or [name for name in AREAS if name not in ("drawn", "loop")]:
             figures.extend(AREAS[name]())
     finally:  # what was measured in an hour is not lost with what goes wrong after it
         print(f"\n{where}\n\n{table(figures)}")

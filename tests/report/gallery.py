@@ -12,16 +12,31 @@ from compensator.identify.comparison import Row
 from compensator.recording.reading import recordings
 from compensator.report.demonstration import MachineDay, page_of
 from compensator.report.page import Table, write_page
-from tests.audit.made import MACHINE, Service, other_model, readings
+from compensator.report.ten_days import days_page
+from tests.audit.made import CONFIG, MACHINE, Service, other_model, readings
 from tests.audit.test_command import tampered
+from tests.cli.test_loop import LOOP, TOLD, recorded
 from tests.demo.made import SHOP_DAY
+from tests.demo.test_ten_days import made
 from tests.identify.quill_runs import CALIBRATION_W, published
+
+NAMES = (
+    "demo",
+    "demo-loop",
+    "identify",
+    "diagnose",
+    "loop",
+    "replay",
+    "replay-found",
+    "replay-model",
+    "report",
+    "results",
+)
 
 
 def make(folder: Path) -> dict[str, Path]:
     """Make the pages; their names stand for the commands."""
-    names = ("demo", "identify", "diagnose", "replay", "replay-found", "replay-model", "report", "results")
-    pages = {name: folder / name / "report.html" for name in names}
+    pages = {name: folder / name / "report.html" for name in NAMES}
     for path in pages.values():
         path.parent.mkdir()
     rec = _recordings(folder)
@@ -56,6 +71,13 @@ def make(folder: Path) -> dict[str, Path]:
     tampered(recordings(rec, MACHINE)[0])
     assert main(["replay", str(rec), "--page", str(pages["replay-found"])]) == 3
     _demo(pages["demo"])
+    write_page(pages["demo-loop"], days_page([made(), made(name="probes", is_probed=True)]))
+    assert (
+        main(
+            ["loop", str(recorded(folder / "live", 400, config=CONFIG + LOOP, told=TOLD)), "--page", str(pages["loop"])]
+        )
+        == 0
+    )
     assert main(["report", str(pages["diagnose"].parent), "--out", str(pages["results"])]) == 0
     return pages
 

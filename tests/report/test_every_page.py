@@ -14,14 +14,14 @@ import pytest
 
 from compensator.cli import main
 from compensator.codes import WORDS
+from tests.report.gallery import NAMES
 
 STYLE = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
 SCHEMES = [
     dict(re.findall(r"(--[\w-]+): (#[0-9a-f]{6})", scheme)) for scheme in re.findall(r":root \{(.*?)\}", STYLE, re.S)
 ]
-NAMES = ("demo", "identify", "diagnose", "replay", "replay-found", "replay-model", "report", "results")
 #: Axes that have no unit.
-NO_UNIT = {"correlation", "model", "real part", "imaginary part", "state, reason", "outcome"}
+NO_UNIT = {"correlation", "day of the run, 1 to 10", "model", "real part", "imaginary part", "state, reason", "outcome"}
 UNIT = re.compile(r", (h|UTC|µm|W|K|°C|samples|1/min|1/h|%)$|^(µm|K)/(W|K)( per sample)?$|^degrees$")
 
 

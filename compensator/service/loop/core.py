@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import msgspec
 from msgspec.structs import replace as replace_fields
 
+from compensator.clock import NS
 from compensator.config import Config
 from compensator.errors import DataError
 from compensator.events import ComparisonData, DiagnosisData, EventKind, Note
@@ -151,6 +152,7 @@ class ModelLoop:
         assert self.shadow is not None
         new = self.shadow
         handover = present.status.handover
+        new.compensation.raise_level(self.loop.level_um)
         new.compensation.continue_from(replace(handover, model_changed=present.status.zero is not None))
         self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
@@ -188,25 +190,42 @@ def exchange_note(action: str, old: Compensation, new: Compensation, verdict: Co
     return Note(EventKind.ADOPT, text, data)
 
 
-def warmed_on(config: Config, model: ThermalModel, record: Sequence[Outcome]) -> Compensation:
+def warmed_on(
+    config: Config, model: ThermalModel, record: Sequence[Outcome], at_rest: Outcome | None = None
+) -> Compensation:
     """Return a compensation of another model in its state after recorded samples, with their zeros and probes.
 
-    It starts at the last zero at rest, or at the first sample with the zero that was current there.
+    It starts with the last zero at rest, from which effects count their channels, also where the record begins later.
+
+    Parameters
+    ----------
+    record : sequence of Outcome
+        Outcomes in order; what is missing between two of them is a pause.
+    at_rest : Outcome, optional
+        That of the last zero at rest before the record.
     """
     compensation = Compensation(config, model)
     compensation.begin(None)
     shadow = Shadow(compensation, b"")
-    begin = max((i for i, outcome in enumerate(record) if _is_rest(outcome)), default=0)
-    if record and not _is_rest(record[begin]):
+    begin = max((i for i, outcome in enumerate(record) if is_rest(outcome)), default=-1)
+    last = record[begin] if begin >= 0 else at_rest
+    if last is not None:
+        shadow.process(last)
+    else:
         zero = next((found for outcome in record if (found := _zero_of(outcome)) is not None), None)
         if zero is not None:
             compensation.begin(zero)
-    for outcome in record[begin:]:
+    for outcome in record[begin + 1 :]:
+        if last is not None:
+            apart = (outcome.sample.time_utc_ns - last.sample.time_utc_ns) / (outcome.sample.period_s * NS)
+            compensation.pause(round(apart) - 1)
         shadow.process(outcome)
+        last = outcome
     return compensation
 
 
-def _is_rest(outcome: Outcome) -> bool:
+def is_rest(outcome: Outcome) -> bool:
+    """Return whether a zero at rest was set with a sample."""
     return any(note.kind == EventKind.ZERO and note.data["mode"] == "rest" for note in outcome.notes)
 
 

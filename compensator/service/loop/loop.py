@@ -83,6 +83,15 @@ class Loop:
         return StartDiagnosis(from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why=running.why)
 
     @property
+    def level_um(self) -> float:
+        """By how much the shadow's prediction must rise to stand at the level of the present one, µm; 0 if it need not.
+
+        A model is judged by changes of Y. If its level contradicts measured Y, it counts from a zero that was set
+        before its effect acted, or measured Y has moved: then the level stays as it is and only its changes are new.
+        """
+        return self._comparison.level_um if self.state.verdict.y_moved else 0.0
+
+    @property
     def judged_h(self) -> float:
         """Time of the usable blocks of measured Y, h."""
         return self._comparison.judged_h

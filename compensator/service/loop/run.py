@@ -18,7 +18,7 @@ from compensator.errors import CompensatorError, DataError
 from compensator.events import EventKind, Note
 from compensator.messages import Candidate, Sample
 from compensator.service.compensation import Compensation, Outcome, model_of, slowest_min
-from compensator.service.loop.core import ModelLoop, exchange_note, warmed_on
+from compensator.service.loop.core import ModelLoop, exchange_note, is_rest, warmed_on
 from compensator.service.loop.loop import role_of
 from compensator.service.loop.weighing import FAILED, Diagnosed, effect_names
 from compensator.service.probing import ReceivedProbe
@@ -57,6 +57,8 @@ class _Saved(msgspec.Struct, kw_only=True):
     compensation: bytes
     attachments: dict[str, bytes]
     record: list[Outcome]
+    at_rest: Outcome | None = None
+    warm_utc_ns: int = 0
 
 
 class LoopRun:
@@ -86,6 +88,9 @@ class LoopRun:
         self._compensation = Compensation(config, model_of(config, model, source="model"))
         self._core = ModelLoop(config, self._compensation.model, {})
         self._record: deque[Outcome] = deque()
+        #: The last zero at rest, and the time of a later one on a warm machine; 0 without one.
+        self._at_rest: Outcome | None = None
+        self._warm_ns = 0
         self._found: Diagnosed | None = None
         #: Events since the last sample.
         self._notes: list[Note] = []
@@ -157,6 +162,8 @@ class LoopRun:
             compensation=self._compensation.state(),
             attachments=self._core.attachments(),
             record=list(self._record),
+            at_rest=self._at_rest,
+            warm_utc_ns=self._warm_ns,
         )
         return msgspec.msgpack.encode(saved)
 
@@ -179,6 +186,7 @@ class LoopRun:
         self._compensation, self._core = compensation, core
         self._data, self._calibrated = saved.model, saved.calibrated
         self._record, self._found = deque(saved.record), None
+        self._at_rest, self._warm_ns = saved.at_rest, saved.warm_utc_ns
 
     # ------------------------------------------------------------------ the loop
 
@@ -196,7 +204,7 @@ class LoopRun:
             running = core.state.diagnosis
             if running is not None and weighed.candidate is not None:
                 model = model_of(self._config, weighed.candidate, source="candidate")
-                warmed = warmed_on(self._config, model, list(self._record))
+                warmed = warmed_on(self._config, model, list(self._record), self._at_rest)
                 core.begin_shadow(warmed, weighed.candidate, now_ns, role_of(weighed.data))
         return notes
 
@@ -215,7 +223,14 @@ class LoopRun:
         """Keep what a diagnosis or a warm-up needs."""
         assert self._config.loop is not None
         self._record.append(outcome)
+        if is_rest(outcome):
+            self._at_rest, self._warm_ns = outcome, 0
+        elif any(note.kind == EventKind.ZERO for note in outcome.notes):
+            self._warm_ns = outcome.sample.time_utc_ns
         warm_up_h = WARM_UP * slowest_min(self._compensation.model) / 60.0
         oldest_ns = outcome.sample.time_utc_ns - round(max(self._config.loop.record_h, warm_up_h) * 3600 * NS)
+        if self._warm_ns:
+            # The deformation counts from what the model predicts at that zero, so its state must be known there.
+            oldest_ns = min(oldest_ns, self._warm_ns - round(warm_up_h * 3600 * NS))
         while self._record[0].sample.time_utc_ns <= oldest_ns:
             self._record.popleft()

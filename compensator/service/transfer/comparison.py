@@ -163,6 +163,14 @@ class Comparison:
         """Time of the usable blocks, h; without the open one."""
         return sum(block.means is not None for block in self.state.blocks) * BLOCK_MIN / 60.0
 
+    @property
+    def level_um(self) -> float:
+        """Mean of the other model's residual less that of the present one since the last zero, µm; 0 if unknown."""
+        means = [
+            block.means for block in self.state.blocks if block.zeros == self.state.zeros and block.means is not None
+        ]
+        return float(np.mean([other - own for own, other, _ in means])) if means else 0.0
+
     def verdict(self, *, deviations: float = DEVIATIONS) -> ComparisonData:
         """Return the verdict on what was compared.
 

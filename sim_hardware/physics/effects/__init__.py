@@ -14,6 +14,7 @@ from sim_hardware.physics.effects.mechanical import (
 from sim_hardware.physics.effects.thermal import (
     BearingFriction,
     CoolantJacket,
+    FanMotor,
     FanOnFilm,
     HiddenSource,
     SecondMass,
@@ -25,6 +26,7 @@ __all__ = [
     "BearingFriction",
     "CoolantJacket",
     "Cycle",
+    "FanMotor",
     "FanOnFilm",
     "HiddenSource",
     "LateSensor",

@@ -67,6 +67,29 @@ class BearingFriction(UndeclaredEffect):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FanMotor(UndeclaredEffect):
+    """The fan's motor heats the wall that it is mounted on.
+
+    Parameters
+    ----------
+    full_speed_w : float
+        Heat at 3000 rpm, W; it grows with the square of the speed.
+    place : str
+        ``"front"`` or ``"rear"`` wall of the column.
+    """
+
+    kind: ClassVar[str] = "input"
+    channel: ClassVar[str | None] = "fan_rpm"
+    thermal: ClassVar[bool] = True
+    full_speed_w: float
+    place: str = "front"
+
+    def add_heat(self, heat_w: Array, t_s: float, inputs: Inputs, degc: Array, places: Places) -> None:
+        """Add the motor's heat, W."""
+        _spread(heat_w, list(places[self.place]), self.full_speed_w * (abs(inputs.fan_rpm) / MAX_FAN_RPM) ** 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FanOnFilm(UndeclaredEffect):
     """A fan moves the air: the forced coefficient of every surface grows with its speed.
 

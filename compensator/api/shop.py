@@ -1,0 +1,303 @@
+"""The loop over the recordings of one machine of a shop: what it found, would adopt, and needs from a person."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import msgspec
+import numpy as np
+
+from compensator.api.loop import diagnosis_in_process
+from compensator.clock import NS
+from compensator.config import Config, Loop
+from compensator.errors import CompensatorError, DataError
+from compensator.events import CommandName, EventKind, LoopAction, Note, command_of
+from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
+from compensator.recording.container import Container
+from compensator.recording.reading import in_order, recordings_in
+from compensator.service.compensation import Compensation, Outcome
+from compensator.service.loop.run import LoopRun
+from compensator.service.probing import ReceivedProbe
+from compensator.service.replay import RecordedStep, execute, setup_of, steps_of
+from compensator.service.status import Zero
+from compensator.service.transfer.candidate import RecordedRun
+
+Policy = Literal["propose", "adopt"]
+#: Over how long before the end of the recordings an error is that of now, h.
+NOW_H = 24.0
+#: Most decisions that are kept.
+MOST_STEPS = 500
+_KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachineLoop:
+    """What the loop makes of a machine.
+
+    Parameters
+    ----------
+    folder, machine : str
+        Folder of its recordings, and its name; empty where it cannot be read.
+    from_utc, to_utc : str
+        What they cover.
+    is_recorded : bool
+        Whether its service has a loop: these are that loop's decisions. Otherwise they were computed now.
+    measured_by : {"sensor", "probe", ""}
+        What measured Y in the last day.
+    first_um, now_um : float, optional
+        Error that was left in the last day: with the present model and no loop, and with the loop, µm rms. The first
+        only where it was computed.
+    effects : tuple of str
+        Effects of the last model that was adopted; empty for the calibrated one.
+    found, proposed : tuple of str
+        Effects of the last candidate of a diagnosis, and of a proposal that stands.
+    diagnoses, adopted, gone_back : int
+        Numbers.
+    needs : str
+        What a person has to do; empty where nothing.
+    steps : tuple of (str, str)
+        Time and text of the last decisions.
+    error : str
+        Why the recordings cannot be used.
+    """
+
+    folder: str
+    machine: str = ""
+    from_utc: str = ""
+    to_utc: str = ""
+    is_recorded: bool = False
+    measured_by: Literal["sensor", "probe", ""] = ""
+    first_um: float | None = None
+    now_um: float | None = None
+    effects: tuple[str, ...] = ()
+    found: tuple[str, ...] = ()
+    proposed: tuple[str, ...] = ()
+    diagnoses: int = 0
+    adopted: int = 0
+    gone_back: int = 0
+    needs: str = ""
+    steps: tuple[tuple[str, str], ...] = ()
+    error: str = ""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it for `--json`."""
+        return dataclasses.asdict(self)
+
+
+def loop_of_machine(folder: Path, policy: Policy) -> MachineLoop:
+    """Return what the loop makes of the recordings of one machine.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Folder of its recordings.
+    policy : {"propose", "adopt"}
+        Policy of the loop that is computed for a machine whose service has none.
+    """
+    try:
+        return _loop_of(folder, policy)
+    except (CompensatorError, OSError) as error:
+        return MachineLoop(folder=str(folder), error=str(error))
+
+
+def _loop_of(folder: Path, policy: Policy) -> MachineLoop:
+    paths = in_order(recordings_in([folder]))
+    with Container(paths[-1]) as container:
+        contents = container.survey(whole=False)
+        config, model = setup_of(contents, paths[-1].name)
+        file = contents.attachments["model.toml"].data
+    summary = _Summary(str(folder), config.machine.name)
+    if config.loop is not None and config.loop.is_on:
+        for step in _steps(paths):
+            summary.add_events((event.kind, event.text, event.data, event.time_utc_ns) for event in step.events)
+            if step.estimate is not None and step.offset is not None:
+                summary.add(step.estimate, step.offset, [probe for _, probe in step.probes])
+        return summary.result(is_recorded=True)
+    if config.probe is None and not any(channel.name == "y_um" for channel in config.channel):
+        raise DataError(f"{folder}: nothing measures Y, expected a channel y_um or the table [probe]")
+    config = msgspec.structs.replace(config, loop=Loop(policy=policy))
+    alone, followed = _Summary("", ""), _Followed(LoopRun(config, file, diagnosis_in_process(config)))
+    of_loop, of_first = _Fed(config, followed), _Fed(config, Compensation(config, model))
+    for step in _steps(paths):
+        outcome, first = of_loop.process(step), of_first.process(step)
+        if outcome is not None:
+            at_ns = outcome.sample.time_utc_ns
+            summary.add_events((note.kind, note.text, note.data, at_ns) for note in followed.notes)
+            summary.add(outcome.estimate, outcome.offset, outcome.probes)
+        if first is not None:
+            alone.add(first.estimate, first.offset, first.probes)
+    return dataclasses.replace(summary.result(is_recorded=False), first_um=alone.now_um)
+
+
+def _steps(paths: Sequence[Path]) -> Iterator[RecordedStep]:
+    for path in paths:
+        yield from steps_of(path)
+
+
+# ---------------------------------------------------------------------- what came out
+
+
+class _Summary:
+    """Counts decisions, and keeps the errors of the last day."""
+
+    def __init__(self, folder: str, machine: str) -> None:
+        self._named = {"folder": folder, "machine": machine}
+        self._times = [0, 0]
+        self._left: deque[tuple[int, float]] = deque()
+        self._probed: deque[tuple[int, float]] = deque()
+        self._counts = dict.fromkeys(LoopAction, 0)
+        self._diagnoses = 0
+        self._found: tuple[str, ...] = ()
+        self._effects: tuple[str, ...] = ()
+        self._proposed: tuple[str, ...] = ()
+        self._needs = ""
+        self._steps: deque[tuple[str, str]] = deque(maxlen=MOST_STEPS)
+
+    def add(self, estimate: EstimateMessage, offset: Offset, probes: Iterable[Probe]) -> None:
+        """Add a sample."""
+        now_ns = estimate.time_utc_ns
+        self._times = [self._times[0] or now_ns, now_ns]
+        left_um = number(estimate.y_um) + number(offset.y_offset_um)
+        for kept, values in (
+            (self._left, [(now_ns, left_um)]),
+            (self._probed, [(probe.time_utc_ns, number(probe.measured_um)) for probe in probes if probe.taken]),
+        ):
+            kept.extend(one for one in values if math.isfinite(one[1]))
+            while kept and kept[0][0] <= now_ns - NOW_H * 3600 * NS:
+                kept.popleft()
+
+    def add_events(self, events: Iterable[tuple[str, str, Any, int]]) -> None:
+        """Add events: kind, text, data, time."""
+        for kind, text, data, at_ns in events:
+            if kind not in _KINDS:
+                continue
+            self._steps.append((_utc(at_ns), text))
+            if kind == EventKind.DIAGNOSIS:
+                self._diagnoses += 1
+                self._needs = str(data.get("needs", "")) if data.get("verdict") not in _HEALTHY else ""
+            elif kind == EventKind.LOOP:
+                self._add_decision(data)
+
+    def _add_decision(self, data: Any) -> None:
+        step, effects = LoopAction(data["step"]), tuple(data.get("effects", ()))
+        self._counts[step] += 1
+        if step == LoopAction.SHADOW:
+            self._found = effects
+        if step == LoopAction.PROPOSE:
+            self._proposed = effects
+        elif step in (LoopAction.WITHDRAW, LoopAction.ADOPT, LoopAction.END):
+            self._proposed = ()
+        if step in (LoopAction.ADOPT, LoopAction.BACK):
+            self._effects = effects
+
+    @property
+    def now_um(self) -> float | None:
+        """Error that was left in the last day; None without measured Y."""
+        kept = self._left or self._probed
+        return float(np.sqrt(np.mean(np.square([value for _, value in kept])))) if kept else None
+
+    def result(self, *, is_recorded: bool) -> MachineLoop:
+        """Return what the loop made of the machine.
+
+        Raises
+        ------
+        DataError
+            If there were no samples.
+        """
+        if not self._times[0]:
+            raise DataError(f"{self._named['folder']}: no samples in its recordings")
+        needs = self._needs
+        if self._proposed:
+            needs = f"decide on the proposal: compensator adopt --candidate, or dismiss{f'; {needs}' if needs else ''}"
+        return MachineLoop(
+            folder=self._named["folder"],
+            machine=self._named["machine"],
+            from_utc=_utc(self._times[0]),
+            to_utc=_utc(self._times[1]),
+            is_recorded=is_recorded,
+            measured_by="sensor" if self._left else "probe" if self._probed else "",
+            now_um=self.now_um,
+            effects=self._effects,
+            found=self._found,
+            proposed=self._proposed,
+            diagnoses=self._diagnoses,
+            adopted=self._counts[LoopAction.ADOPT],
+            gone_back=self._counts[LoopAction.BACK],
+            needs=needs,
+            steps=tuple(self._steps),
+        )
+
+
+#: Verdicts after which no person is needed.
+_HEALTHY = ("adequate", "explained")
+
+
+def _utc(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns / NS, UTC):%Y-%m-%dT%H:%MZ}"
+
+
+# ---------------------------------------------------------------------- recorded samples
+
+
+class _Followed:
+    """A run of the loop that takes recorded samples as a compensation does."""
+
+    def __init__(self, run: LoopRun) -> None:
+        self._run = run
+        self._probes: tuple[ReceivedProbe, ...] = ()
+        #: Events of the last sample.
+        self.notes: tuple[Note, ...] = ()
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what is the same: model, status, zero, begin, hold, resume, fail, held, continue_from."""
+        return getattr(self._run.compensation, name)
+
+    def pause(self, samples: int | None) -> None:
+        self._run.pause(samples)
+
+    def receive_probes(self, probes: Sequence[ReceivedProbe]) -> None:
+        self._probes = tuple(probes)
+
+    def process(self, sample: Sample) -> Outcome:
+        probes, self._probes = self._probes, ()
+        step = self._run.process(sample, probes)
+        self.notes = step.events
+        return step.outcome
+
+
+class _Fed:
+    """Runs recorded samples through a compensation, with the zeros, probes, holds and pauses of the record."""
+
+    def __init__(self, config: Config, compensation: Compensation | _Followed) -> None:
+        self._compensation = cast(Compensation, compensation)
+        self._run = RecordedRun(config, self._compensation, probes=True)
+        self._begun = False
+        self._compensation.begin(None)
+
+    def process(self, step: RecordedStep) -> Outcome | None:
+        """Process a recorded group; return the outcome of its sample."""
+        if not self._begun and not self._begin(step):
+            return None
+        for event in step.events:
+            if event.kind == EventKind.COMMAND and command_of(event) in (CommandName.HOLD, CommandName.RESUME):
+                execute(self._compensation, command_of(event), {})
+        return self._run.process(step)
+
+    def _begin(self, step: RecordedStep) -> bool:
+        """Begin at the first sample with a zero, with that zero if it was set before."""
+        if step.sample is None or step.estimate is None:
+            return False
+        zero = Zero.of_estimate(step.estimate)
+        if step.zero is None and math.isnan(zero.t_q_ref_degc):
+            return False
+        self._begun = True
+        if step.zero is None:
+            self._compensation.begin(zero)
+        return True

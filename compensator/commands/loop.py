@@ -1,0 +1,102 @@
+"""`compensator loop`: the loop over the recordings of a shop, a folder for each machine."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from concurrent.futures import Executor, as_completed
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from compensator.blas import in_one_thread
+from compensator.commands import Answer
+from compensator.commands.outputs import checked_page
+from compensator.commands.progress import progress_bar
+from compensator.commands.workers import workers
+from compensator.errors import DataError
+from compensator.progress import Progress
+
+if TYPE_CHECKING:
+    from compensator.api.shop import MachineLoop, Policy
+    from compensator.report.fleet import FleetRow
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command.
+
+    Raises
+    ------
+    DataError
+        If a folder is none, or no machine's recordings can be used.
+    """
+    folders, page = _folders(arguments.folder), checked_page(arguments.page)
+    if arguments.scheduler is not None:
+        # Workers may run in other folders, so paths must be absolute.
+        folders = [folder.resolve() for folder in folders]
+    with progress_bar("machines") as progress, workers(len(folders), arguments.scheduler) as executor:
+        found = _each(folders, arguments.policy, progress, executor)
+    if all(one.error for one in found):
+        raise DataError(found[0].error)
+    return _answer(found, page)
+
+
+def _folders(given: Sequence[Path]) -> list[Path]:
+    """Return the folder of each machine: those given, or, where one has no recordings itself, those in it."""
+    found = []
+    for folder in given:
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no folder, expected one with the recordings of a machine")
+        below = [one for one in sorted(folder.iterdir()) if one.is_dir() and any(one.glob("*.mcap"))]
+        found += [folder] if any(folder.glob("*.mcap")) or not below else below
+    return list(dict.fromkeys(found))
+
+
+def _each(folders: Sequence[Path], policy: Policy, progress: Progress, executor: Executor | None) -> list[MachineLoop]:
+    """Return what the loop makes of each machine, in their order."""
+    from compensator.api.shop import loop_of_machine
+
+    if executor is None:
+        found = []
+        for i, folder in enumerate(folders):
+            progress(i, len(folders))
+            found.append(in_one_thread(loop_of_machine, folder, policy))
+        return found
+    jobs = [executor.submit(in_one_thread, loop_of_machine, folder, policy) for folder in folders]
+    for i, _ in enumerate(as_completed(jobs)):
+        progress(i + 1, len(jobs))
+    return [job.result() for job in jobs]
+
+
+def _answer(found: Sequence[MachineLoop], page: Path | None) -> Answer:
+    from compensator.report.fleet import fleet_page, fleet_table, fleet_verdict
+
+    rows = [_row(one) for one in found]
+    result = {"machines": [one.as_json() for one in found]}
+    text = f"{fleet_table(rows).text()}\n\n{fleet_verdict(rows)}"
+    if page is None:
+        return Answer(result, text)
+    from compensator.report.formats import write
+
+    write(page, fleet_page(rows))
+    return Answer(result | {"report": str(page)}, f"{text}\npage: {page}")
+
+
+def _row(one: MachineLoop) -> FleetRow:
+    from compensator.report.fleet import FleetRow
+
+    if one.error:
+        return FleetRow(name=Path(one.folder).name, needs=f"see to its recordings: {one.error}", is_bad=True)
+    now = "–" if one.now_um is None else f"{one.now_um:.1f}"
+    error = now if one.first_um is None else f"{one.first_um:.1f} → {now}"
+    measured = {"sensor": "", "probe": " (probes)", "": ""}[one.measured_by]
+    return FleetRow(
+        name=one.machine,
+        span=f"{one.from_utc[:10]} to {one.to_utc[:10]}, {'its own loop' if one.is_recorded else 'computed now'}",
+        error=f"{error}{measured}",
+        found=", ".join(one.found) or "nothing",
+        proposed=", ".join(one.proposed),
+        adopted=": ".join(filter(None, (str(one.adopted), ", ".join(one.effects)))),
+        gone_back=str(one.gone_back),
+        needs=one.needs,
+        steps=[f"{at}: {text}" for at, text in one.steps],
+    )

@@ -1,0 +1,478 @@
+"""The loop of the service over machine-weeks: what it finds, adopts and returns from, and what it must not adopt.
+
+Each machine-week of `sim_hardware.drawn_machines.weeks` is calibrated by `identify` on a run without effects (the
+published ones have the published model). Then a week of samples goes through the service's loop with policy `adopt` and
+the real diagnosis in this process. The service is killed in the middle of its second diagnosis and right after its
+first adoption, and continues from its last state, six hours old at most, as from a recording.
+
+error           true displacement since the first sample, plus the published offset.
+base, best      error of the calibrated model alone over the week; the same where no effect acts.
+found           within 48 h of an effect's beginning a diagnosis has a right name of it among what can be deployed.
+adopted         within 48 h of its beginning another model is adopted.
+removed %       of the mean square that the effects add to the error from 48 h after the beginning to the effect's end:
+                100 (base² − loop²) / (base² − best²); only where they add at least 5 % to the mean square there.
+fair            for at least 36 of the 48 h nothing else was wrong, or a person had not yet seen to it: no decision is
+                made while a sensor is suspected.
+                Errors are those of the times in which both temperatures were right, and had been for 6 h.
+worse           from an adoption to the next change of the model, or to the end, the error is more than 5 % and 0.05 µm
+                above that of the model before.
+reproduced      a second run, which gets the recorded results of the diagnoses, makes the same decisions with the same
+                figures at the same samples.
+
+python -m tests.bench loop                              the development set, 100 weeks, some minutes each
+python -m tests.bench loop --part 3/10 --out part.json  a tenth of it
+python -m tests.bench loop --resume                     leaves out what is in the file
+"""
+
+import argparse
+import hashlib
+import json
+import math
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+import compensator as tc
+from compensator.api.loop import diagnosis_in_process
+from compensator.clock import NS
+from compensator.config import parse_config
+from compensator.demo.offline import probe_of, run_alone, sample_of
+from compensator.errors import CompensatorError
+from compensator.events import EventKind
+from compensator.messages import number
+from compensator.model.model_file import parse_model
+from compensator.model.model_writer import dump_model
+from compensator.service.loop.run import Diagnosed, LoopRun
+from sim_hardware.drawn_machines.weeks import DEVELOPMENT_WEEKS, SEALED_WEEK_RUNS, SEALED_WEEKS
+from tests.bench.figures import Figure, rows, told
+
+SETS = {"development": DEVELOPMENT_WEEKS, "sealed": SEALED_WEEKS}
+#: 2026-01-05T00:00:00Z.
+MIDNIGHT_NS = 1_767_571_200 * NS
+PERIOD_S, MINUTE_NS = 60.0, 60 * NS
+WITHIN_MIN, FAIR_MIN = 48 * 60, 36 * 60
+#: For so long after a fault of a temperature the state of the model is wrong, and after a zero the offset is limited.
+AFTER_FAULT_MIN, LIMITED_MIN = 360, 15
+#: A state is kept this often, samples: a recording begins with one and is read from there.
+STATE_EVERY = 360
+#: Samples that a killed service misses.
+KILLED_MIN = 3
+KINDS = ("zero", "loop", "diagnosis", "adopt", "plausibility")
+LOOP = '[loop]\npolicy = "adopt"\n'
+
+
+def config_of(week, model):
+    """Return the configuration of a machine as its commissioning would have it."""
+    calibration = week.calibration.columns
+    low, high = (
+        {name: float(side(calibration[name])) for name in ("t_q_degc", "at_degc")} for side in (np.nanmin, np.nanmax)
+    )
+    channels = "".join(_channel(name) for name in week.columns)
+    probe = ""
+    if week.probes:
+        probe = f"[probe]\nstd_um = {week.probe_std_um}\nmeasured_max_um = 100.0\nlargest_um = 60.0\n"
+    text = f"""
+line = []
+device = [{{name = "simulated"}}]
+machine.name = "{week.family}-{week.seed}"
+model.file = "model.toml"
+loss.predict_for_min = 30.0
+zero.rest_rate_um_per_min = 0.2
+guards.t_q_below_at_max_k = 2.0
+zenoh.prefix = "bench"
+recording.folder = "recordings"
+[limits]
+offset_max_um = 300.0
+offset_rate_max_um_per_min = 8.0
+[limits.validity]
+t_q_degc = [{low["t_q_degc"] - 10.0}, {high["t_q_degc"] + 15.0}]
+at_degc = [{low["at_degc"] - 8.0}, {high["at_degc"] + 8.0}]
+[plausibility]
+t_q_below_at_after_min = 30.0
+false_alarm_days = 30.0
+{probe}{LOOP}{channels}"""
+    return parse_config(text.encode(), source=f"{week.family} {week.seed}")
+
+
+def _channel(name):
+    limits = {
+        "t_q_degc": "range = [0.0, 90.0]\nrate_max_per_min = 5.0\nstuck_after_min = 120.0\n",
+        "at_degc": "range = [0.0, 50.0]\nrate_max_per_min = 2.0\nstuck_after_min = 240.0\n",
+        "y_um": "range = [-400.0, 400.0]\nrate_max_per_min = 30.0\nstuck_after_min = 60.0\n",
+    }
+    return f'[[channel]]\nname = "{name}"\ndevice = "simulated"\ninput = 0\n{limits.get(name, "")}'
+
+
+def samples_of(week, columns):
+    """Return for each minute in which the service runs: sample, what a probe before it shows, whether a zero is set."""
+    start_ns = MIDNIGHT_NS + round(week.start_h * 60) * MINUTE_NS
+    visited = np.zeros(week.minutes, dtype=bool)
+    for minute in week.visits:
+        visited[minute + int(np.argmax(week.running[minute:]))] = True
+    # A person who sets a zero also sets that of the feature.
+    zeros = np.concatenate(([0], np.flatnonzero(visited)))
+    shown = np.full(week.minutes, math.nan)
+    for probe in week.probes:
+        zero = zeros[np.searchsorted(zeros, probe.minute) - 1]
+        shown[probe.minute] = week.true_um[probe.minute - 1] - week.true_um[zero] + probe.error_um
+    names = list(columns)
+    table = np.column_stack([columns[name] for name in names])
+    return [
+        (
+            sample_of(
+                week.family, i, start_ns + i * MINUTE_NS, dict(zip(names, table[i], strict=True)), period_s=PERIOD_S
+            ),
+            float(shown[i]),
+            bool(visited[i]),
+        )
+        for i in np.flatnonzero(week.running).tolist()
+    ]
+
+
+class Killed(BaseException):
+    """The service was killed."""
+
+
+class Diagnoses:
+    """Runs each diagnosis once: what it gave is recorded, and is read where the run comes by again."""
+
+    def __init__(self, diagnose, *, kill_at=()):
+        self.found, self.seconds = {}, 0.0
+        self._diagnose, self._kill_at, self.count = diagnose, set(kill_at), 0
+
+    def __call__(self, outcomes, model):
+        key = (outcomes[-1].sample.seq, len(outcomes), hashlib.sha256(model).hexdigest()) if outcomes else None
+        if key not in self.found:
+            self.count += 1
+            if self.count in self._kill_at:
+                raise Killed
+            began = time.perf_counter()
+            try:
+                self.found[key] = self._diagnose(outcomes, model)
+            except CompensatorError as error:  # as LoopRun has it
+                self.found[key] = Diagnosed("failed", (), None, f"the diagnosis failed: {error}", needs=str(error))
+            self.seconds += time.perf_counter() - began
+        return self.found[key]
+
+
+class Service:
+    """A machine's service and loop that is killed and continues from its last state."""
+
+    def __init__(self, config, model, diagnoses):
+        self._made = lambda: LoopRun(config, model, diagnoses)
+        self.run = self._made()
+        self.steps = []
+        self._kept, self._state = 0, self.run.state()
+
+    def process(self, sample, probe, is_visit):
+        waits = self.steps and any(is_begin(note) for note in self.steps[-1][2].events)
+        if len(self.steps) - self._kept >= STATE_EVERY and not waits:
+            self._kept, self._state = len(self.steps), self.run.state()
+        step = advance(self.run, self.steps[-1][0].seq if self.steps else None, sample, probe, is_visit)
+        self.steps.append((sample, probe, step, is_visit))
+        return step
+
+    def restart(self):
+        """Continue from the last state and what is recorded since; return whether every step came out the same."""
+        self.run = self._made()
+        self.run.restore(self._state)
+        last = self.steps[self._kept - 1][0].seq if self._kept else None
+        same = True
+        for sample, probe, step, is_visit in self.steps[self._kept :]:
+            again = advance(self.run, last, sample, probe, is_visit)
+            same = same and seen(again) == seen(step) and again.outcome.offset == step.outcome.offset
+            last = sample.seq
+        return same
+
+    @property
+    def last(self):
+        return self.steps[-1][2].outcome.offset if self.steps else None
+
+
+def advance(run, last, sample, probe, is_visit):
+    """Process a sample after the pause before it, and after a person has acknowledged a trouble."""
+    if last is not None and sample.seq > last + 1:
+        run.pause(sample.seq - last - 1)
+    if is_visit:
+        run.compensation.resume()
+        run.compensation.zero("warm")
+    return run.process(sample, [probe] if probe is not None else [])
+
+
+def is_begin(note):
+    """Return whether a diagnosis begins with this event: its result is not in a state yet."""
+    return note.kind == EventKind.LOOP and note.data["step"] == "diagnose"
+
+
+def seen(step):
+    """Return the events of a step as they are compared; NaN is like NaN."""
+    return json.dumps([[note.kind, note.text, dict(note.data)] for note in step.events], default=str, sort_keys=True)
+
+
+def looped(config, model, samples, diagnoses, *, kills=True):
+    """Return the service after the week, and how many of its restarts came out the same, of how many."""
+    service, restarts, killed_adoption, skip_to = Service(config, model, diagnoses), [], not kills, -1
+    for sample, shown_um, is_visit in samples:
+        if sample.seq < skip_to:
+            continue
+        probe = None
+        if math.isfinite(shown_um):
+            probe = probe_of(shown_um, service.last, sample.time_utc_ns - MINUTE_NS // 2)
+        before = service.steps[-1][2].model_sha256 if service.steps else None
+        try:
+            step = service.process(sample, probe, is_visit)
+        except Killed:
+            restarts.append(service.restart())
+            skip_to = sample.seq + KILLED_MIN
+            continue
+        if not killed_adoption and before not in (None, step.model_sha256):
+            killed_adoption = True
+            restarts.append(service.restart())
+    return service, restarts
+
+
+def error_of(outcomes, true_um):
+    """Return the error by minute since the last zero, µm, shape (n,); NaN where the service did not run."""
+    error, zero_um = np.full(true_um.size, math.nan), 0.0
+    for outcome in outcomes:
+        i = outcome.sample.seq
+        if any(note.kind == EventKind.ZERO for note in outcome.notes):
+            zero_um = true_um[i]
+        error[i] = true_um[i] - zero_um + number(outcome.offset.y_offset_um)
+    return error
+
+
+def whole(week):
+    """Return at which minutes every sensor is whole and has been for some hours: elsewhere faults make the error."""
+    found = np.ones(week.minutes, dtype=bool)
+    for trouble in week.troubles:
+        if trouble.channel != "y_um":
+            found[trouble.from_min : trouble.to_min + AFTER_FAULT_MIN] = False
+    for minute in week.visits:
+        found[minute : minute + LIMITED_MIN] = False
+    return found
+
+
+def undisturbed(week):
+    """Return at which minutes nothing is wrong beside the machine, or has been seen to."""
+    found = np.ones(week.minutes, dtype=bool)
+    for trouble in week.troubles:
+        after = [minute for minute in week.visits if minute >= trouble.to_min]
+        end = after[0] if after and trouble.kind not in ("break", "period", "hand") else trouble.to_min
+        found[trouble.from_min : end] = False
+    return found
+
+
+def rms(error):
+    good = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(good**2))) if good.size else math.nan
+
+
+def judged(case):
+    """Return the figures of a machine-week as a dict that JSON can hold."""
+    began = time.perf_counter()
+    result = asdict(case)
+    try:
+        return result | _figures(case.draw()) | {"seconds": time.perf_counter() - began}
+    except Exception as error:  # noqa: BLE001  a week that ends in an error is a wrong one, and the others go on
+        return result | {"failed": f"{type(error).__name__}: {error}", "seconds": time.perf_counter() - began}
+
+
+def _figures(week):
+    base = tc.load_model("quill") if week.published else tc.identify(week.calibration.columns).model
+    file = dump_model(base).encode()
+    config = config_of(week, file)
+    samples, healthy = samples_of(week, week.columns), samples_of(week, week.healthy)
+    diagnoses = Diagnoses(diagnosis_in_process(config), kill_at=(2,))
+    service, restarts = looped(config, file, samples, diagnoses)
+    steps = [step for _, _, step, _ in service.steps]
+    again, last, same = LoopRun(config, file, _recorded(diagnoses)), None, True
+    for sample, probe, step, is_visit in service.steps:
+        same = same and seen(advance(again, last, sample, probe, is_visit)) == seen(step)
+        last = sample.seq
+    errors = {
+        "loop": error_of([step.outcome for step in steps], week.true_um),
+        "best": error_of(run_alone(config, parse_model(file, source="base"), healthy), week.healthy_um),
+    }
+    files = {hashlib.sha256(data).hexdigest(): data for data in _files(file, diagnoses)}
+    used = list(dict.fromkeys(step.model_sha256 for step in steps))
+    for sha in used:
+        errors[sha] = error_of(run_alone(config, parse_model(files[sha], source=sha), samples), week.true_um)
+    base_sha = used[0]
+    for error in errors.values():
+        error[~whole(week)] = math.nan
+    return {
+        "whole": {"base": rms(errors[base_sha]), "loop": rms(errors["loop"]), "best": rms(errors["best"])},
+        "troubles": [asdict(trouble) for trouble in week.troubles],
+        "spells": [_spell(week, spell, diagnoses, steps, errors, base_sha) for spell in week.spells],
+        "changes": _changes(steps, errors),
+        "diagnoses": [[key[0], one.verdict, list(one.effects), one.text] for key, one in diagnoses.found.items()],
+        "events": [[s.outcome.sample.seq, n.kind, n.text] for s in steps for n in s.events if n.kind in KINDS],
+        "reproduced": same,
+        "restarts": restarts,
+        "diagnose_s": diagnoses.seconds,
+    }
+
+
+def _recorded(diagnoses):
+    """Return diagnoses that are only read."""
+    recorded = Diagnoses(lambda *_: Diagnosed("failed", (), None, "the first run did not ask for this diagnosis"))
+    recorded.found = dict(diagnoses.found)
+    return recorded
+
+
+def _files(base, diagnoses):
+    return [base, *(one.model for one in diagnoses.found.values() if one.model is not None)]
+
+
+def _changes(steps, errors):
+    """Return each change of the model: when, to what, and how the error compares with that of the model before."""
+    at = [i for i in range(1, len(steps)) if steps[i].model_sha256 != steps[i - 1].model_sha256]
+    found = []
+    for i, end in zip(at, [*at[1:], len(steps)][: len(at)], strict=True):
+        minutes = [step.outcome.sample.seq for step in steps[i:end]]
+        new, old = rms(errors["loop"][minutes]), rms(errors[steps[i - 1].model_sha256][minutes])
+        first = steps[0].model_sha256
+        found.append(
+            {
+                "minute": minutes[0],
+                "hours": len(minutes) / 60.0,
+                "to_calibrated": steps[i].model_sha256 == first,
+                "new_um": new,
+                "old_um": old,
+                "worse": new > 1.05 * old and new > old + 0.05,
+            }
+        )
+    return found
+
+
+def _spell(week, spell, diagnoses, steps, errors, base_sha):
+    begin, until = spell.from_min, spell.from_min + WITHIN_MIN
+    right = {":".join(filter(None, place)) for place in spell.places}
+    direct = {name.replace("TTF", "DTF") for name in right}
+    named = [
+        key[0]
+        for key, one in diagnoses.found.items()
+        if begin <= key[0] <= until and set(one.effects) & (right | direct)
+    ]
+    changed = [
+        steps[i].outcome.sample.seq
+        for i in range(1, len(steps))
+        if steps[i].model_sha256 != steps[i - 1].model_sha256 and begin <= steps[i].outcome.sample.seq <= until
+    ]
+    after = slice(until, spell.to_min)
+    base, loop, best = (rms(errors[name][after]) for name in (base_sha, "loop", "best"))
+    added = base**2 - best**2
+    counts = spell.deployable and added > 0.05 * base**2
+    return asdict(spell) | {
+        "found_h": (named[0] - begin) / 60.0 if named else None,
+        "adopted_h": (changed[0] - begin) / 60.0 if changed else None,
+        "fair": int(np.sum(undisturbed(week)[begin:until])) >= FAIR_MIN,
+        "base_um": base,
+        "loop_um": loop,
+        "best_um": best,
+        "removed_pct": 100.0 * (base**2 - loop**2) / added if counts else None,
+    }
+
+
+def run(cases, out, *, workers, resume=False):
+    """Judge weeks in parallel; after each, everything so far is written to `out`."""
+    results = json.loads(out.read_text(encoding="utf-8")) if resume and out.exists() else []
+    done = {(r["family"], r["seed"]) for r in results}
+    cases = [case for case in cases if (case.family, case.seed) not in done]
+    with ProcessPoolExecutor(workers) as pool:
+        for future in as_completed([pool.submit(judged, case) for case in cases]):
+            results.append(future.result())
+            for cells in lines(results[-1]):
+                sys.stdout.write(" | ".join(cells) + "\n")
+            sys.stdout.flush()
+            out.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    return sorted(results, key=lambda r: r["seed"])
+
+
+HEAD = ("machine", "effect", "days", "found h", "adopted h", "removed %", "base, loop, best µm", "changes", "s")
+
+
+def lines(r):
+    """Yield a week as rows of cells, one for each effect."""
+    what = f"{r['family']} {r['seed']}{' probed' if r['probed'] else ''}"
+    if "failed" in r:
+        yield [what, r["failed"], "", "", "", "", "", "", f"{r['seconds']:.0f}"]
+        return
+    changes = " ".join(
+        f"{c['minute'] / 1440:.1f}{'←' if c['to_calibrated'] else '→'}{'WORSE' if c['worse'] else ''}"
+        for c in r["changes"]
+    )
+    flags = ("" if r["reproduced"] else " NOT REPRODUCED") + ("" if all(r["restarts"]) else " RESTART DIFFERS")
+    blank = {"effect": "none", "from_min": 0, "to_min": 0, "found_h": None, "adopted_h": None, "removed_pct": None}
+    blank |= {"size_um": 0.0, "fair": True, "deployable": False}
+    blank |= {f"{name}_um": value for name, value in r["whole"].items()}
+    for spell in r["spells"] or [blank]:
+        numbers = [
+            f"{spell[key]:.0f}" if spell[key] is not None else "–" for key in ("found_h", "adopted_h", "removed_pct")
+        ]
+        size = f"{spell['effect']} {spell['size_um']:.1f} µm" + ("" if spell["fair"] else " (unfair)")
+        days = f"{spell['from_min'] / 1440:.1f}–{spell['to_min'] / 1440:.1f}"
+        errors = " ".join(f"{spell[f'{name}_um']:.2f}" for name in ("base", "loop", "best"))
+        yield [what, size, days, *numbers, errors, changes + flags, f"{r['seconds']:.0f}"]
+
+
+def summary(results):
+    """Yield the figures of the set."""
+    good = [r for r in results if "failed" not in r]
+    spells = [spell for r in good for spell in r["spells"] if spell["deployable"]]
+    changes = [change for r in good for change in r["changes"]]
+    for name, group in (("all", spells), ("sensors whole for 36 of the 48 h", [s for s in spells if s["fair"]])):
+        counted = [s for s in group if s["removed_pct"] is not None]
+        found = (
+            f"{len(group)}: found {sum(s['found_h'] is not None for s in group)}, "
+            f"model adopted {sum(s['adopted_h'] is not None for s in group)}; of {len(counted)} that add to the error "
+            f"80 % removed {sum(s['removed_pct'] >= 80.0 for s in counted)}, 50 % "
+            f"{sum(s['removed_pct'] >= 50.0 for s in counted)}"
+        )
+        yield told(Figure(what=f"loop, deployable effects within 48 h, {name}", found=found, wanted="90 %"))
+    adoptions = [c for c in changes if not c["to_calibrated"]]
+    found = (
+        f"{len(adoptions)} in {len(good)} weeks, {len(changes) - len(adoptions)} back to the calibrated model; "
+        f"{sum(c['worse'] for c in changes)} made it worse by more than 5 %"
+    )
+    yield told(Figure(what="loop, adoptions", found=found, wanted="none worse"))
+    restarts = [same for r in good for same in r["restarts"]]
+    found = (
+        f"{sum(r['reproduced'] for r in good)} of {len(good)} weeks; {sum(restarts)} of {len(restarts)} restarts after "
+        f"a kill; failed {len(results) - len(good)}"
+    )
+    yield told(Figure(what="loop, decisions reproduced", found=found, wanted="all"))
+
+
+def report(cases=DEVELOPMENT_WEEKS, out=Path("loop-development.json"), *, workers=None, resume=True):
+    """Yield the figures; every week is printed."""
+    results = run(cases, out, workers=workers, resume=resume)
+    rows("machine-weeks, one by one", HEAD, [cells for r in results for cells in lines(r)])
+    yield from summary(results)
+
+
+def main(words):
+    """Run what the options say."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench loop", description=__doc__.splitlines()[0])
+    parser.add_argument("--set", choices=SETS, default="development")
+    parser.add_argument("--part", default="1/1", help="such as 3/10: the third tenth")
+    parser.add_argument("--seed", type=int, help="only this week of the development set")
+    parser.add_argument("--out", type=Path, help="JSON with what is known so far; loop-SET.json")
+    parser.add_argument("--resume", action="store_true", help="leave out what is in that file")
+    parser.add_argument("--workers", type=int)
+    asked = parser.parse_args(words)
+    if asked.set == "sealed":
+        if asked.seed is not None:
+            parser.error("no single week of the sealed set is run")
+        if SEALED_WEEK_RUNS:
+            parser.error(f"the sealed set has been run: {SEALED_WEEK_RUNS[0]}")
+        sys.stdout.write("Enter this run in SEALED_WEEK_RUNS of sim_hardware/drawn_machines/weeks.py.\n")
+    part, parts = (int(word) for word in asked.part.split("/"))
+    cases = [case for case in SETS[asked.set] if asked.seed in (None, case.seed)][part - 1 :: parts]
+    out = asked.out or Path(f"loop-{asked.set}.json")
+    list(report(cases, out, workers=asked.workers, resume=asked.resume))

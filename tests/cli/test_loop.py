@@ -1,0 +1,142 @@
+"""`compensator loop`: what the loop makes of the recordings of a shop, one folder for each machine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from compensator.api import shop
+from compensator.cli import main
+from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, LoopAction, LoopData
+from compensator.service.loop.run import Diagnosed
+from tests.audit.made import CONFIG, QUILL, Service, readings
+
+LOOP = b'\n[loop]\npolicy = "propose"\n'
+BETTER = ComparisonData(
+    verdict=ComparisonVerdict.BETTER, measured_by="sensor", hours=12.0, present_rms_um=6.0, candidate_rms_um=1.0
+)
+#: What a loop did: minute, kind, text, data.
+TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
+    (60, "diagnosis", "found", DiagnosisData(verdict="explained", effects=["gain:DTF"]).table()),
+    (60, "loop", "begins", LoopData(step=LoopAction.SHADOW, effects=["gain:DTF"], role="candidate").table()),
+    (300, "loop", "proposed", LoopData(step=LoopAction.PROPOSE, effects=["gain:DTF"], comparison=BETTER).table()),
+)
+
+
+def recorded(folder: Path, minutes: int, *, config: bytes = CONFIG, told: tuple[Any, ...] = (), hold: int = -1) -> Path:
+    service = Service(folder, config=config)
+    for i, values in enumerate(readings(minutes)):
+        for minute, kind, text, data in told:
+            if minute == i:
+                service.note(kind, text, data)
+        if i == hold:
+            service.command("hold")
+        service.take(values)
+    service.stop()
+    return folder
+
+
+def result(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    assert main(["loop", *arguments, "--json"]) == 0
+    machines: list[dict[str, Any]] = json.loads(capsys.readouterr().out)["machines"]
+    return machines
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Path:
+    return recorded(tmp_path / "live", 400, config=CONFIG + LOOP, told=TOLD)
+
+
+def test_decisions_of_a_machine_with_a_loop_are_those_of_its_recordings(
+    told: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (one,) = result([str(told)], capsys)
+    assert one["is_recorded"] and one["diagnoses"] == 1
+    assert one["found"] == one["proposed"] == ["gain:DTF"]
+    assert (one["adopted"], one["gone_back"]) == (0, 0)
+    assert "decide on the proposal" in one["needs"]
+    assert one["measured_by"] == "sensor" and one["now_um"] > 0.0 and one["first_um"] is None
+
+
+def test_a_proposal_that_was_withdrawn_asks_nothing_of_a_person(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    withdrawn = (350, "loop", "withdrawn", LoopData(step=LoopAction.WITHDRAW).table())
+    folder = recorded(tmp_path / "live", 400, config=CONFIG + LOOP, told=(*TOLD, withdrawn))
+    (one,) = result([str(folder)], capsys)
+    assert one["proposed"] == [] and one["needs"] == ""
+
+
+def finds_nothing(seen: list[Any]) -> Any:
+    """Diagnoses that find nothing, and are counted with what they were given."""
+
+    def of(_config: Any) -> Any:
+        def diagnose(record: Any, model: bytes) -> Diagnosed:
+            seen.append((len(record), model))
+            return Diagnosed("adequate", (), None, "nothing that the model lacks")
+
+        return diagnose
+
+    return of
+
+
+def test_the_loop_is_run_over_recordings_of_a_machine_without_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(shop, "diagnosis_in_process", finds_nothing(seen))
+    folder = recorded(tmp_path / "plain", 1500)
+    (one,) = result([str(folder)], capsys)
+    assert not one["is_recorded"] and one["diagnoses"] == len(seen) > 0
+    assert all(model == QUILL for _, model in seen)
+    # Nothing was adopted, so the loop leaves what the model alone leaves.
+    assert one["now_um"] == pytest.approx(one["first_um"])
+    assert one["needs"] == "" and one["error"] == ""
+
+
+def test_samples_during_a_hold_by_hand_are_not_diagnosed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Any] = []
+    monkeypatch.setattr(shop, "diagnosis_in_process", finds_nothing(seen))
+    (one,) = result([str(recorded(tmp_path / "held", 1500, hold=30))], capsys)
+    assert one["diagnoses"] == 0 and not seen
+
+
+def test_a_shop_is_a_folder_of_folders_and_one_bad_machine_stops_no_other(
+    tmp_path: Path, told: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("compensator.commands.workers.os.cpu_count", lambda: 1)
+    bad = tmp_path / "rubbish"
+    bad.mkdir()
+    (bad / "torn.mcap").write_bytes(b"no recording")
+    page = tmp_path / "shop.html"
+    assert main(["loop", str(tmp_path), "--page", str(page)]) == 0
+    text = capsys.readouterr().out
+    assert "2 machine(s): 2 need(s) a person, 1 of them for a proposal; 1 could not be read." in text
+    assert "torn.mcap" in text and str(page) in text
+    shown = page.read_text(encoding="utf-8")
+    assert "gain:DTF" in shown and "Failed" in shown
+
+
+def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["loop", str(tmp_path / "nowhere")]) == 2
+    assert "nowhere: no folder" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert main(["loop", str(tmp_path / "empty")]) == 2
+    assert "empty" in (error := capsys.readouterr().err) and error.count("\n") == 1
+
+
+def test_processes_of_their_own_find_what_one_process_finds(
+    tmp_path: Path, told: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded(tmp_path / "second", 200)
+    found = []
+    for cores in (1, 2):
+        monkeypatch.setattr("compensator.commands.workers.os.cpu_count", lambda cores=cores: cores)
+        found.append(result([str(told), str(tmp_path / "second")], capsys))
+    assert found[0] == found[1]
+    assert [one["machine"] for one in found[0]] == ["vmc-07", "vmc-07"]

@@ -1,0 +1,69 @@
+"""A candidate is at the level that it would have if it had run since the zero, however short the record is."""
+
+import dataclasses
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from compensator.model.model_file import parse_model
+from compensator.service.compensation import Compensation
+from compensator.service.loop.core import is_rest, warmed_on
+from compensator.service.outcome import Outcome
+from tests.service.looping import extended, machine, settings
+
+RECORD = 3000
+
+
+def raised(i: int, values: dict[str, float]) -> None:
+    """The coolant is 4 K warmer from the second day on than it was at the zero."""
+    values["coolant_degc"] += 4.0 if i > 1440 else 0.0
+
+
+def outcomes(samples: int, **changes: Any) -> list[Outcome]:
+    present = Compensation(settings(), parse_model(extended(0.5), source="present"))
+    return [present.process(one) for one in machine(samples, change=raised, **changes)]
+
+
+@pytest.fixture(scope="module")
+def record() -> list[Outcome]:
+    return outcomes(5800)
+
+
+def predicted(compensation: Compensation) -> float:
+    return -compensation.status.target_um
+
+
+def test_a_candidate_counts_its_channel_from_the_zero_at_rest_before_the_record(record: list[Outcome]) -> None:
+    model = parse_model(extended(3.0), source="candidate")
+    (at_rest,) = [outcome for outcome in record if is_rest(outcome)]
+    whole = warmed_on(settings(), model, record)
+    short = warmed_on(settings(), model, record[-RECORD:], at_rest)
+    assert predicted(short) == pytest.approx(predicted(whole), abs=0.3)
+    assert short.status.is_known
+    # Without the zero its level is another one: the effect then counts from where the record happens to begin.
+    assert abs(predicted(warmed_on(settings(), model, record[-RECORD:])) - predicted(whole)) > 3.0
+
+
+def test_a_pause_in_the_record_counts(record: list[Outcome]) -> None:
+    model = parse_model(extended(3.0), source="candidate")
+    gap = [outcome for outcome in record if not 5600 <= outcome.sample.seq < 5700]
+    paused = warmed_on(settings(), model, gap)
+    by_hand = Compensation(settings(), model)
+    for outcome in gap:
+        if outcome.sample.seq == 5700:
+            by_hand.pause(100)
+        by_hand.process(outcome.sample)
+    assert predicted(paused) == pytest.approx(predicted(by_hand), abs=1e-9)
+    squeezed = [
+        dataclasses.replace(outcome, sample=_moved(outcome.sample, i), estimate=outcome.estimate)
+        for i, outcome in enumerate(gap)
+    ]
+    assert not np.isclose(predicted(warmed_on(settings(), model, squeezed)), predicted(paused), atol=1e-6)
+
+
+def _moved(sample: Any, i: int) -> Any:
+    """The sample as if no other one were missing before it."""
+    start_ns = sample.time_utc_ns - sample.seq * 60_000_000_000
+    return msgspec.structs.replace(sample, time_utc_ns=start_ns + i * 60_000_000_000)
