@@ -98,7 +98,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `identify`."""
     add = parser.add_argument
     add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
-    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html is written next to it")
+    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; its page is written next to it")
     _page(parser)
     _column(parser)
     _y_std(parser)

@@ -13,6 +13,7 @@ from compensator.atomic_write import atomic_write
 from compensator.clock import duration
 from compensator.codes import ProbeSourceRemark, Remark
 from compensator.errors import ConfigError, UsageError
+from compensator.input_file import read_file
 from compensator.probes.probe import Probe
 from compensator.probes.sender import Outcome, Report, pause
 from compensator.probes.settings import Folder, convention
@@ -20,6 +21,8 @@ from compensator.probes.table import BadLine, NoFeature, Row, columns, row
 
 #: Longest file, bytes; 100 000 lines.
 LONGEST = 10_000_000
+#: Longest state file, bytes.
+STATE_BYTES = 50_000_000
 #: So many lines and files are read before the other sources have their turn.
 READ_AT_ONCE = 200
 
@@ -55,7 +58,7 @@ class Handled:
         if not path.parent.is_dir():
             raise ConfigError(f"{path}: no such folder for the state of folders")
         try:
-            kept = json.loads(path.read_text(encoding="utf-8"))["handled"] if path.exists() else {}
+            kept = json.loads(read_file(path, STATE_BYTES))["handled"] if path.exists() else {}
             if not all(isinstance(part, str) for pair in kept.items() for part in pair):
                 raise TypeError("expected texts")
             for identity in kept:
@@ -219,9 +222,7 @@ class WatchedFolder:
     def _read_file(self, path: Path) -> Iterator[None]:
         """Handle the lines of a file, one with each step."""
         try:
-            if path.stat().st_size > LONGEST:
-                raise OSError(27, f"longer than {LONGEST} bytes")
-            content = path.read_bytes()
+            content = read_file(path, LONGEST)
         except OSError as error:
             self._read.pop(path, None)
             self._trouble(path, error)

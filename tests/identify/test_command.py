@@ -35,7 +35,7 @@ def test_model_page_and_summary(tmp_path, calibration, capsys):
     assert model.provenance["data"][0]["sha256"] == hashlib.sha256(calibration.read_bytes()).hexdigest()
     assert model.dtf.covariance is not None
     assert model.validity["heat_w"][1] > 90.0
-    page = (out.parent / "report.html").read_text(encoding="utf-8")
+    page = (out.parent / "model-calibration.html").read_text(encoding="utf-8")
     for words in (
         "step response",
         "poles and zeros",
@@ -70,7 +70,7 @@ def test_json_and_a_direct_model_where_nobody_knows_the_heat(tmp_path, capsys):
 def test_the_pdf_is_named_as_well(tmp_path, calibration, capsys):
     out, page = tmp_path / "model.toml", tmp_path / "p.pdf"
     assert main(["identify", str(calibration), "--out", str(out), "--order", "1", "1", "1", "--page", str(page)]) == 0
-    assert capsys.readouterr().out.endswith(f"page: {tmp_path / 'report.html'}\npage: {page}\n")
+    assert capsys.readouterr().out.endswith(f"page: {tmp_path / 'model-calibration.html'}\npage: {page}\n")
     assert page.read_bytes().startswith(b"%PDF-")
 
 
