@@ -235,3 +235,5 @@ def watch(parser: argparse.ArgumentParser) -> None:
     add("--record", type=Path, metavar="FOLDER", help=words)
     add("--foxglove", action="store_true", help="serve Foxglove on 127.0.0.1 (needs the extra foxglove)")
     add("--foxglove-port", type=int, default=8765, metavar="PORT", help="port for Foxglove (8765)")
+    words = "let pages of this origin connect to Foxglove's port, besides Foxglove itself; may be repeated"
+    add("--foxglove-origin", action="append", default=[], metavar="ORIGIN", help=words)
