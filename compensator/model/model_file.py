@@ -44,6 +44,8 @@ _TOP = (
 )
 #: Largest number of coefficients of a polynomial, of effects, of alternatives, and of ranges.
 COEFFICIENTS, EFFECTS, ALTERNATIVES, RANGES = 20, 100, 20, 200
+#: Largest sum of all delays, samples; each sample is part of the state in every recording.
+DELAY_SAMPLES = 20_000
 #: Temperatures that any part of a machine can have, °C.
 _COLDEST, _HOTTEST = -273.15, 2000.0
 _ESTIMATOR = ("method", "t_q_noise_std_k", "at_noise_std_k", "at_walk_std_k")
@@ -145,7 +147,7 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
         inputs=top.text("inputs", ("changes", "absolute"), "changes"),  # type: ignore[arg-type]
         validity=_validity(table.get("validity", {})),
         y_std_um=_uncertainty(table.get("uncertainty", {"y_std_um": 0.0})),
-        effects=_effects(top.text("name"), table.get("effect", [])),
+        effects=_effects(top.text("name"), table.get("effect", []), period_s),
         alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
         provenance=provenance,
         held_out_rms_um=held_out,
@@ -218,7 +220,7 @@ def _validity(value: object) -> dict[str, tuple[float, float]]:
     return ranges
 
 
-def _effects(model_name: str, value: object) -> tuple[Effect, ...]:
+def _effects(model_name: str, value: object, period_s: float) -> tuple[Effect, ...]:
     if not isinstance(value, list):
         raise ModelError("effect: expected a list of tables, [[effect]]")
     if len(value) > EFFECTS:
@@ -231,6 +233,9 @@ def _effects(model_name: str, value: object) -> tuple[Effect, ...]:
             known = ", ".join(sorted(kinds()))
             raise ModelError(f"model {model_name}: effect {i} has kind {kind!r}, expected one of: {known}")
         result.append(effect_from(kind, {key: value for key, value in table.table.items() if key != "kind"}))
+    delays = sum(getattr(effect, "delay_min", 0.0) for effect in result) * 60.0 / period_s
+    if delays > DELAY_SAMPLES:
+        raise ModelError(f"effect: delays of {delays:.0f} samples in all, expected at most {DELAY_SAMPLES}")
     return tuple(result)
 
 
