@@ -48,6 +48,8 @@ COEFFICIENTS, EFFECTS, ALTERNATIVES, RANGES = 20, 100, 20, 200
 DELAY_SAMPLES = 20_000
 #: Temperatures that any part of a machine can have, °C.
 _COLDEST, _HOTTEST = -273.15, 2000.0
+#: Largest of any other quantity that a range bounds, such as W or rpm, and largest error of a model, µm.
+_LARGEST, _LARGEST_UM = 1e9, 10_000.0
 _ESTIMATOR = ("method", "t_q_noise_std_k", "at_noise_std_k", "at_walk_std_k")
 _FORMS = {"continuous": ("numerator", "denominator"), "sampled": ("b", "a")}
 
@@ -193,7 +195,7 @@ def _estimator(value: object, kind: str) -> Estimator:
 
 
 def _uncertainty(value: object) -> float:
-    return TomlTable("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0)
+    return TomlTable("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0, high=_LARGEST_UM)
 
 
 def _provenance(value: object) -> tuple[float | None, dict[str, float], dict[str, Any]]:
@@ -212,7 +214,7 @@ def _validity(value: object) -> dict[str, tuple[float, float]]:
     table = TomlTable("validity", value, most=RANGES)
     ranges: dict[str, tuple[float, float]] = {}
     for key in table.table:
-        bounds = (_COLDEST, _HOTTEST) if key.endswith("_degc") else (-math.inf, math.inf)
+        bounds = (_COLDEST, _HOTTEST) if key.endswith("_degc") else (-_LARGEST, _LARGEST)
         low, high = table.numbers(key, *bounds, length=2)
         if low >= high:
             raise ModelError(f"validity: {key} = [{low:g}, {high:g}], expected the lower bound first")

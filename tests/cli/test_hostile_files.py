@@ -201,3 +201,26 @@ def test_a_pipe_as_a_key_ends_at_once(tmp_path: Path) -> None:
         check=False,
     )
     assert "not a regular file" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("identify", "t.csv", "--out", "m.toml", "--folds", "100000"),
+        ("identify", "t.csv", "--out", "m.toml", "--ttf", "9", "9", "0"),
+        ("demo", "--hours", "inf", "--out", "d"),
+        ("demo", "--hours", "1e308", "--out", "d"),
+        ("watch", "--once", "--wait", "inf", "--connect", "tcp/127.0.0.1:1"),
+    ],
+)
+def test_numbers_of_the_command_line_are_bounded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.csv").write_text(TABLE)
+    try:
+        code = main(list(arguments))
+    except SystemExit as ended:  # argparse
+        code = int(str(ended.code))
+    said = capsys.readouterr().err
+    assert code == 2 and "expected" in said and said.count("\n") == 1 and "Traceback" not in said

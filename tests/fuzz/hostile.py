@@ -125,7 +125,7 @@ def table(rng: random.Random, folder: Path) -> None:
         columns = int(10 ** rng.uniform(0, 5.3))
         data = data.replace(b"heat_w\n", b",".join(b"c%d" % i for i in range(columns)) + b"\n")
     elif way == 1:
-        line = data.split(b"\n")[-2] + b"\n"
+        line = data.rpartition(b"\n")[0].rpartition(b"\n")[2] + b"\n"
         data += line * int(10 ** rng.uniform(0, 4))
     elif way == 2:
         data = data.replace(b"20.1", rng.choice(_NUMBERS).encode(), rng.choice((1, -1)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -306,6 +307,22 @@ async def test_payloads_that_are_no_model_are_refused_in_words(tmp_path: Path, d
 
     await machine.run(100, answered)
     assert not asked.answer["ok"] and asked.answer["text"] and "Traceback" not in asked.answer["text"]
+
+
+@pytest.mark.parametrize("count", [2000, 20_000])
+async def test_an_order_too_large_is_refused_at_once_and_keeps_no_other_waiting(tmp_path: Path, count: int) -> None:
+    machine = Machine(tmp_path)
+    values = ", ".join(["0.001"] * count)
+    head, _, rest = QUILL.decode().partition("[paths.DTF]")
+    path = f'[paths.DTF]\nunit = "um/W"\nform = "sampled"\nb = [{values}]\na = [1.0, {values}]\n\n['
+    large = (head + path + rest.partition("\n[")[2]).encode()
+    first = machine.at_sample[10] = Asked(machine, "adopt", payload(large))
+    second = machine.at_sample[14] = Asked(machine, "adopt", payload(STRONGER, force=True))
+    began = time.monotonic()
+    await machine.run(20)
+    assert time.monotonic() - began < 20.0
+    assert not first.answer["ok"] and f"b has {count} values, expected at most 20" in first.answer["text"]
+    assert second.answer["ok"], second.answer
 
 
 async def test_a_service_that_ends_meanwhile_still_answers(tmp_path: Path) -> None:
