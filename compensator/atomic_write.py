@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from compensator.errors import UsageError
+from compensator.input_file import resolved
 
 
 @contextmanager
@@ -41,7 +42,7 @@ def atomic_write(path: Path) -> Iterator[TextIO]:
     ...     os.listdir(folder)
     ['a.csv']
     """
-    path = path.resolve()
+    path = resolved(path)
     require_folder(path)
     if path.exists() and not path.is_file():
         with path.open("w", newline="", encoding="utf-8") as file:

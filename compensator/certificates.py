@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from compensator.codes import Remark, ServiceWarning
 from compensator.errors import ConfigError
+from compensator.input_file import KEY_BYTES, read_file
 
 #: Number of days before the expiry of a certificate from which a warning is given.
 SOON_DAYS = 30.0
@@ -139,7 +140,7 @@ def remarks(certificate: Certificate | None, now: datetime.datetime) -> list[Rem
 
 def _read(source: str, name: str, path: Path, load: Callable[[bytes], Any]) -> Any:
     try:
-        return load(path.read_bytes())
+        return load(read_file(path, KEY_BYTES))
     except OSError as error:
         raise ConfigError(f"{source}: {name} = {str(path)!r}: {error.strerror or error}") from error
     except (ValueError, TypeError) as error:

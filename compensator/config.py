@@ -6,21 +6,35 @@ Physical limits have no default: they are set when the machine is commissioned.
 from __future__ import annotations
 
 import re
-import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 from msgspec import Meta
 
-from compensator.errors import ConfigError
+from compensator.errors import ConfigError, UsageError
+from compensator.input_file import SETTINGS_BYTES, parse_toml, read_file, resolved
 
-Positive = Annotated[float, Meta(gt=0)]
+#: Above 0, with the largest value that a machine can have: a limit beyond it is a slip of the pen, and no limit.
+Micrometres = Annotated[float, Meta(gt=0, le=5000)]
+MicrometresPerMin = Annotated[float, Meta(gt=0, le=1000)]
+Kelvins = Annotated[float, Meta(gt=0, le=200)]
+Minutes = Annotated[float, Meta(gt=0, le=100_000)]
+#: Of a channel of any unit, such as rpm/min.
+Rate = Annotated[float, Meta(gt=0, le=1e9)]
+#: Megabytes, or days.
+Amount = Annotated[float, Meta(gt=0, le=1e9)]
+Text = Annotated[str, Meta(max_length=4096)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
 #: Roles that the model and the residual need; every other channel is auxiliary.
 ROLES = ("t_q_degc", "at_degc", "y_um", "heat_w")
 
+#: Largest rate of a temperature, K/min, and the temperatures that any part of a machine can have, °C.
+_RATE_MAX, _TEMPERATURES = 10_000.0, (-273.15, 2000.0)
+#: Largest magnitude of a value of a channel of any unit.
+_VALUE_MAX = 1e12
 _LOOPBACK = re.compile(r"unixsock-stream/|[a-z]+/(127\.[0-9.]+|localhost|\[::1\]):")
 #: Transports on which participants authenticate by certificates.
 _SECURED = ("tls/", "quic/")
@@ -43,15 +57,15 @@ class ModelChoice(_Table, frozen=True, kw_only=True):
     `store`: folder of adopted models, relative to the configuration; by default `models` in the recording folder.
     """
 
-    file: str
-    alternative: str | None = None
-    store: str | None = None
+    file: Text
+    alternative: Text | None = None
+    store: Text | None = None
 
 
 class Sampling(_Table, frozen=True, kw_only=True):
     """`[sampling]`: how often devices are polled, and how many readings make a sample."""
 
-    poll_interval_s: Positive = 1.0
+    poll_interval_s: Annotated[float, Meta(ge=0.01, le=3600)] = 1.0
     min_good_fraction: Annotated[float, Meta(gt=0, le=1)] = 0.5
 
 
@@ -62,17 +76,17 @@ class Channel(_Table, frozen=True, kw_only=True):
     """
 
     name: Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
-    device: str
-    input: Annotated[int, Meta(ge=0)]
+    device: Text
+    input: Annotated[int, Meta(ge=0, le=65535)]
     range: tuple[float, float] | None = None
-    rate_max_per_min: Positive | None = None
-    stuck_after_min: Positive | None = None
+    rate_max_per_min: Rate | None = None
+    stuck_after_min: Minutes | None = None
 
 
 class Guards(_Table, frozen=True, kw_only=True):
     """`[guards]`: plausibility between channels."""
 
-    t_q_below_at_max_k: Positive
+    t_q_below_at_max_k: Kelvins
 
 
 class Validity(_Table, frozen=True, kw_only=True):
@@ -85,15 +99,15 @@ class Validity(_Table, frozen=True, kw_only=True):
 class Limits(_Table, frozen=True, kw_only=True):
     """`[limits]`: limits of the offset."""
 
-    offset_max_um: Positive
-    offset_rate_max_um_per_min: Positive
+    offset_max_um: Micrometres
+    offset_rate_max_um_per_min: MicrometresPerMin
     validity: Validity
 
 
 class Loss(_Table, frozen=True, kw_only=True):
     """`[loss]`: how long the model's own prediction replaces a lost temperature."""
 
-    predict_for_min: Positive
+    predict_for_min: Minutes
 
 
 class Zero(_Table, frozen=True, kw_only=True):
@@ -102,7 +116,7 @@ class Zero(_Table, frozen=True, kw_only=True):
     `rest_rate_um_per_min`: a machine that grows more slowly than this counts as at rest at the zero.
     """
 
-    rest_rate_um_per_min: Positive
+    rest_rate_um_per_min: MicrometresPerMin
     at_start: bool = True
 
 
@@ -112,7 +126,7 @@ class Restart(_Table, frozen=True, kw_only=True):
     `bridge_max_min`: longest interruption that is interpolated; by default the model's slowest time constant.
     """
 
-    bridge_max_min: Positive | None = None
+    bridge_max_min: Minutes | None = None
 
 
 class Rest(_Table, frozen=True, kw_only=True):
@@ -122,10 +136,10 @@ class Rest(_Table, frozen=True, kw_only=True):
     `t_q_at_max_k`: largest change of T_Q − AT since the zero after such a rest.
     """
 
-    channel: str
-    at_most: float
-    after_min: Positive
-    t_q_at_max_k: Positive
+    channel: Text
+    at_most: Annotated[float, Meta(ge=-1e12, le=1e12)]
+    after_min: Minutes
+    t_q_at_max_k: Kelvins
 
 
 class Plausibility(_Table, frozen=True, kw_only=True):
@@ -138,11 +152,11 @@ class Plausibility(_Table, frozen=True, kw_only=True):
     `residual_hold_um`: during an alarm, a residual beyond this holds the offset.
     """
 
-    t_q_below_at_after_min: Positive | None = None
-    false_alarm_days: Annotated[float, Meta(ge=1)] | None = None
-    residual_std_um: Positive | None = None
+    t_q_below_at_after_min: Minutes | None = None
+    false_alarm_days: Annotated[float, Meta(ge=1, le=100_000)] | None = None
+    residual_std_um: Micrometres | None = None
     residual_correlation_min: Annotated[float, Meta(ge=10, le=1440)] = 60.0
-    residual_hold_um: Positive | None = None
+    residual_hold_um: Micrometres | None = None
     rest: Rest | None = None
 
 
@@ -157,11 +171,11 @@ class Probe(_Table, frozen=True, kw_only=True):
     """
 
     std_um: Annotated[float, Meta(ge=0.01, le=100)]
-    measured_max_um: Positive
-    largest_um: Positive
-    tolerance_um: Positive | None = None
+    measured_max_um: Micrometres
+    largest_um: Micrometres
+    tolerance_um: Micrometres | None = None
     oldest_min: Annotated[float, Meta(ge=1, le=240)] = 30.0
-    match_um: Positive = 1.0
+    match_um: Micrometres = 1.0
 
 
 class Loop(_Table, frozen=True, kw_only=True):
@@ -177,13 +191,13 @@ class Loop(_Table, frozen=True, kw_only=True):
 
     policy: Literal["off", "propose", "adopt"] = "off"
     at_utc: Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$")] = "02:00"
-    misfit_h: Annotated[float, Meta(ge=1)] = 6.0
+    misfit_h: Annotated[float, Meta(ge=1, le=10_000)] = 6.0
     record_h: Annotated[float, Meta(ge=6, le=336)] = 36.0
     shadow_h: Annotated[float, Meta(ge=6, le=168)] = 12.0
     probes: Annotated[int, Meta(ge=8, le=100)] = 8
     deviations: Annotated[float, Meta(ge=3, le=20)] = 4.0
     watch_h: Annotated[float, Meta(ge=24, le=1000)] = 168.0
-    memory_mb: Annotated[float, Meta(ge=256)] = 1500.0
+    memory_mb: Annotated[float, Meta(ge=256, le=1e6)] = 1500.0
     time_limit_min: Annotated[float, Meta(ge=1, le=720)] = 120.0
 
     @property
@@ -209,8 +223,8 @@ class Zenoh(_Table, frozen=True, kw_only=True):
 
     prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$")]
     mode: Literal["peer", "client", "router"] = "peer"
-    listen: list[str] = []
-    connect: list[str] = []
+    listen: Annotated[list[Text], Meta(max_length=50)] = []
+    connect: Annotated[list[Text], Meta(max_length=50)] = []
     tls_ca: str | None = None
     tls_certificate: str | None = None
     tls_key: str | None = None
@@ -244,9 +258,9 @@ class Recording(_Table, frozen=True, kw_only=True):
     outside the folder.
     """
 
-    folder: str
-    keep_days: Positive | None = None
-    keep_mb: Positive | None = None
+    folder: Text
+    keep_days: Amount | None = None
+    keep_mb: Amount | None = None
     signing_key: str | None = None
 
 
@@ -261,9 +275,9 @@ class Config(_Table, frozen=True, kw_only=True):
     guards: Guards
     zenoh: Zenoh
     recording: Recording
-    line: list[dict[str, Any]]
-    device: list[dict[str, Any]]
-    channel: list[Channel]
+    line: Annotated[list[dict[str, Any]], Meta(max_length=100)]
+    device: Annotated[list[dict[str, Any]], Meta(max_length=200)]
+    channel: Annotated[list[Channel], Meta(max_length=500)]
     sampling: Sampling = Sampling()
     restart: Restart = Restart()
     plausibility: Plausibility | None = None
@@ -289,8 +303,17 @@ class LoadedConfig(msgspec.Struct, frozen=True, kw_only=True):
     data: bytes
 
     def resolve(self, name: str) -> Path:
-        """Return a path of the file relative to the file's folder."""
-        return (self.path.parent / name).resolve()
+        """Return a path of the file relative to the file's folder.
+
+        Raises
+        ------
+        ConfigError
+            For a loop of links.
+        """
+        try:
+            return resolved(self.path.parent / name)
+        except UsageError as error:
+            raise ConfigError(f"{self.path}: {error}") from error
 
     def store(self) -> Path:
         """Return the folder of adopted models."""
@@ -313,14 +336,15 @@ def load_config(path: str | Path) -> LoadedConfig:
     """
     path = Path(path)
     try:
-        data = path.read_bytes()
+        data = read_file(path, SETTINGS_BYTES)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}; expected a configuration file") from error
     config = parse_config(data, source=str(path))
+    loaded = LoadedConfig(config=config, path=path, data=data)
     files = {key: getattr(config.zenoh, key) for key in _TLS_KEYS}
-    files = {key: str((path.parent / name).resolve()) for key, name in files.items() if name is not None}
-    config = msgspec.structs.replace(config, zenoh=msgspec.structs.replace(config.zenoh, **files))
-    return LoadedConfig(config=config, path=path, data=data)
+    files = {key: str(loaded.resolve(name)) for key, name in files.items() if name is not None}
+    zenoh = msgspec.structs.replace(config.zenoh, **files)
+    return msgspec.structs.replace(loaded, config=msgspec.structs.replace(config, zenoh=zenoh))
 
 
 def parse_config(data: bytes, *, source: str) -> Config:
@@ -332,9 +356,11 @@ def parse_config(data: bytes, *, source: str) -> Config:
         As `load_config`.
     """
     try:
-        table = tomllib.loads(data.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        table = parse_toml(data)
+    except ValueError as error:
         raise ConfigError(f"{source}: not a TOML file: {error}") from error
+    if (place := _with_nul(table)) is not None:
+        raise ConfigError(f"{source}: {place}: contains \\u0000, expected a text without it")
     try:
         config = msgspec.convert(table, Config)
     except msgspec.ValidationError as error:
@@ -346,13 +372,29 @@ def parse_config(data: bytes, *, source: str) -> Config:
     return config
 
 
+def _with_nul(value: Any, where: str = "") -> str | None:
+    """Return the place of a text with the character 0, which no file, port or host can have in its name."""
+    if isinstance(value, str):
+        return where if "\0" in value else None
+    if not isinstance(value, (dict, list)):
+        return None
+    items = value.items() if isinstance(value, dict) else ((f"[{i}]", one) for i, one in enumerate(value))
+    found = (_with_nul(one, f"{where}.{key}".lstrip(".").replace(".[", "[")) for key, one in items)
+    return next((place for place in found if place is not None), None)
+
+
 def _keys_at(where: str) -> list[str]:
     """Return the keys of a table, such as `limits` or `channel[1]`."""
     table: Any = Config
     for part in re.findall(r"[^.\[\]]+", re.sub(r"\[\d+\]", "", where)):
         of = {field.encode_name: field.type for field in msgspec.structs.fields(table)}[part]
-        (table,) = (one for one in (of, *get_args(of)) if isinstance(one, type) and issubclass(one, msgspec.Struct))
+        (table,) = (one for one in _types_in(of) if isinstance(one, type) and issubclass(one, msgspec.Struct))
     return [field.encode_name for field in msgspec.structs.fields(table)]
+
+
+def _types_in(annotation: Any) -> list[Any]:
+    """Return a type and those that it is made of."""
+    return [annotation, *(one for part in get_args(annotation) for one in _types_in(part))]
 
 
 def _in_words(message: str, table: object) -> str:
@@ -374,14 +416,14 @@ def _in_words(message: str, table: object) -> str:
         except (KeyError, IndexError, ValueError, TypeError):
             value = None
             break
-    shown = "" if value is None or isinstance(value, (dict, list)) else f" = {value!r}"
+    shown = "" if value is None or isinstance(value, (dict, list)) else f" = {repr(value)[:60]}"
     return f"{where}{shown}: {text}"
 
 
 def _check(config: Config) -> None:
     names = [channel.name for channel in config.channel]
-    for name in names:
-        if names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if count > 1:
             raise ConfigError(f"channel: name {name!r} occurs twice")
     for role in ("t_q_degc", "at_degc"):
         if role not in names:
@@ -402,7 +444,7 @@ def _check(config: Config) -> None:
             f"loop.policy = {config.loop.policy!r}: nothing measures Y, expected a channel 'y_um' or the table [probe]"
         )
     for key in ("t_q_degc", "at_degc"):
-        _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key))
+        _check_range(f"limits.validity.{key}", getattr(config.limits.validity, key), _TEMPERATURES)
     _check_zenoh(config.zenoh)
 
 
@@ -439,10 +481,17 @@ def _check_channel(channel: Channel, devices: set[str]) -> None:
         for key in ("range", "rate_max_per_min", "stuck_after_min"):
             if getattr(channel, key) is None:
                 raise ConfigError(f"{where}: {key} is missing; a limit of {channel.name} has no default")
+    is_temperature = channel.name in ROLES[:2]
+    if is_temperature and channel.rate_max_per_min is not None and channel.rate_max_per_min > _RATE_MAX:
+        raise ConfigError(f"{where}: rate_max_per_min = {channel.rate_max_per_min:g}, expected at most {_RATE_MAX:g}")
     if channel.range is not None:
-        _check_range(f"{where}: range", channel.range)
+        possible = _TEMPERATURES if is_temperature else (-_VALUE_MAX, _VALUE_MAX)
+        _check_range(f"{where}: range", channel.range, possible)
 
 
-def _check_range(where: str, bounds: tuple[float, float]) -> None:
+def _check_range(where: str, bounds: tuple[float, float], possible: tuple[float, float]) -> None:
+    if not all(possible[0] <= bound <= possible[1] for bound in bounds):
+        expected = f"expected values from {possible[0]:g} to {possible[1]:g}"
+        raise ConfigError(f"{where} = [{bounds[0]:g}, {bounds[1]:g}], {expected}")
     if not bounds[0] < bounds[1]:
         raise ConfigError(f"{where} = [{bounds[0]:g}, {bounds[1]:g}], expected the lower bound first")

@@ -17,6 +17,7 @@ from compensator.bridge.register import Register
 from compensator.bridge.settings import OpcUa
 from compensator.codes import BridgeTrouble, Remark
 from compensator.errors import ConfigError
+from compensator.input_file import KEY_BYTES, read_file
 from compensator.receiver import Applied, Receiver
 from compensator.receiver.subscriber import monotonic_s
 
@@ -89,7 +90,7 @@ class Bridge:
         client = Client(settings.endpoint, timeout=settings.timeout_s)
         if settings.user:
             client.set_user(settings.user)
-            client.set_password(Path(settings.password_file).read_text(encoding="utf-8").strip())
+            client.set_password(read_file(Path(settings.password_file), KEY_BYTES).decode("utf-8").strip())
         if settings.security_policy:
             # A server compares the application URI in the certificate with the one that the application sends.
             client.application_uri = _application_uri(Path(settings.certificate)) or client.application_uri
@@ -174,7 +175,7 @@ class Bridge:
 
 
 def _application_uri(path: Path) -> str:
-    data = path.read_bytes()
+    data = read_file(path, KEY_BYTES)
     try:
         read = x509.load_pem_x509_certificate if data.startswith(b"-----") else x509.load_der_x509_certificate
         names = read(data).extensions.get_extension_for_class(x509.SubjectAlternativeName).value

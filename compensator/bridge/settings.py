@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from compensator.errors import ConfigError
+from compensator.input_file import resolved
 from compensator.receiver import ReceiverError, Settings, load_settings
 from compensator.receiver.settings import read_table
 
@@ -105,7 +106,7 @@ def load_bridge(path: str | Path) -> tuple[Settings, OpcUa]:
         raise ConfigError(str(error)) from error
     folder = Path(path).parent
     given = {key: getattr(opcua, key) for key in _FILES}
-    files: dict[str, Any] = {key: str((folder / name).resolve()) for key, name in given.items() if name}
+    files: dict[str, Any] = {key: str(resolved(folder / name)) for key, name in given.items() if name}
     for key, file in files.items():
         if not Path(file).is_file():
             raise ConfigError(f"{path}: opcua.{key} = {given[key]!r}: no such file")

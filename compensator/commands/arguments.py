@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 _OPERATOR = "Zenoh configuration with the operator's certificate, such as operator.json5; needed over TLS"
@@ -28,11 +29,23 @@ def _page(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _number(low: float, high: float) -> Callable[[str], float]:
+    """Return what reads a number between two bounds (inclusive)."""
+
+    def number(text: str) -> float:
+        value = float(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text}: expected a number from {low:g} to {high:g}")
+        return value
+
+    return number
+
+
 def demo(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `demo`."""
     add = parser.add_argument
     add("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="folder for the results")
-    add("--hours", type=float, default=24.0, help="length of the simulated run, h (default 24)")
+    add("--hours", type=_number(0.1, 10_000.0), default=24.0, help="length of the simulated run, h (default 24)")
     add("--seed", type=int, default=1, help="seed of the simulated day (default 1)")
     add(
         "--live",
@@ -111,7 +124,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `identify`."""
     add = parser.add_argument
     add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
-    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; report.html is written next to it")
+    add("--out", type=Path, required=True, metavar="MODEL", help="the model file; its page is written next to it")
     _page(parser)
     _column(parser)
     _y_std(parser)
@@ -241,10 +254,12 @@ def watch(parser: argparse.ArgumentParser) -> None:
     words = "watch this machine, or all machines below this prefix (default: that of the configuration, or everything)"
     add("--prefix", help=words)
     add("--once", action="store_true", help="show the state once and exit, as --json does")
-    add("--wait", type=float, default=0.0, metavar="S", help="with --once: how long to listen, s (0)")
+    add("--wait", type=_number(0.0, 86_400.0), default=0.0, metavar="S", help="with --once: how long to listen, s (0)")
     add("--page", action="store_true", help="serve a live page on 127.0.0.1 instead of the terminal view")
     add("--port", type=int, default=8710, help="port of the page (8710; 0: any free port)")
     words = "record all messages of all machines as MCAP in this folder"
     add("--record", type=Path, metavar="FOLDER", help=words)
     add("--foxglove", action="store_true", help="serve Foxglove on 127.0.0.1 (needs the extra foxglove)")
     add("--foxglove-port", type=int, default=8765, metavar="PORT", help="port for Foxglove (8765)")
+    words = "let pages of this origin connect to Foxglove's port, besides Foxglove itself; may be repeated"
+    add("--foxglove-origin", action="append", default=[], metavar="ORIGIN", help=words)

@@ -13,6 +13,7 @@ from compensator.commands.progress import progress_bar
 from compensator.data.table import roles_of
 from compensator.errors import UsageError
 from compensator.model.model_file import BUILT_IN
+from compensator.report.results import calibration_page
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -20,7 +21,9 @@ def run(arguments: argparse.Namespace) -> Answer:
     given = arguments
     if str(given.out) in BUILT_IN:
         raise UsageError(f"--out {given.out}: is the name of the published model, expected a name that ends in .toml")
-    checked_file(given.out, "--out", read=(*given.data, *given.etve, *given.validate), ending=".toml")
+    reference = () if given.reference is None or given.reference in BUILT_IN else (Path(given.reference),)
+    read = (*given.data, *given.etve, *given.validate, *reference)
+    checked_file(given.out, "--out", read=read, ending=".toml")
     page = checked_page(given.page)
     with progress_bar("fitting") as progress:
         found = identify(
@@ -46,9 +49,9 @@ def run(arguments: argparse.Namespace) -> Answer:
 
 
 def write(found: IdentificationResult, out: Path, *, also: Path | None = None) -> Answer:
-    """Write the model file, and the page into its folder."""
+    """Write the model file, and beside it the page, named after it: several models may be in one folder."""
     out.parent.mkdir(parents=True, exist_ok=True)
     found.save(out)
-    page = found.write_page(out.parent / "report.html", also=also)
+    page = found.write_page(calibration_page(out), also=also)
     files = {"model": str(out), "model_sha256": found.model.sha256, "report": str(page)}
     return Answer(files | found.to_dict(), f"{found.summary()}\n\nmodel: {out}\n{pages_text(page, also)}")

@@ -43,12 +43,13 @@ def main() -> int:
 
 def _diagnose(job: Job, folder: Path) -> Result:
     from compensator.api.loop import diagnoses_of_table, summarised
+    from compensator.input_file import MODEL_BYTES, read_file
     from compensator.service.loop.job import read_record
     from compensator.service.loop.record import table_of_rows
 
     rows, probes = read_record(job)
     table = table_of_rows(rows, probes, job.machine)
-    model = (folder / CALIBRATED).read_bytes()
+    model = read_file(folder / CALIBRATED, MODEL_BYTES)
     found, whole = diagnoses_of_table(table, model, probe_std_um=job.probe_std_um)
     found.save_all(folder)
     short = summarised(found, whole, model)

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from compensator.errors import UsageError
+from compensator.input_file import resolved
 
 #: Suffixes that are probably mistakes.
 _ENDINGS = {".csv", ".html", ".json", ".mcap", ".pdf", ".png", ".toml", ".xlsx"}
@@ -36,7 +37,7 @@ def checked_file(path: Path, option: str, *, read: Iterable[Path] = (), ending: 
     """
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder, expected the name of a file in it")
-    if path.resolve() in {one.resolve() for one in read}:
+    if resolved(path) in {resolved(one) for one in read}:
         raise UsageError(
             f"{option} {path}: is an input of this command and would be overwritten, expected another name"
         )
@@ -65,9 +66,9 @@ def checked_folder(path: Path, option: str, *, read: Iterable[Path] = (), names:
     """
     if path.exists() and not path.is_dir():
         raise UsageError(f"{option} {path}: is a file, expected a folder")
-    files = [one.resolve() for one in read]
+    files = [resolved(one) for one in read]
     for name in names:
-        if (path / name).resolve() in files:
+        if resolved(path / name) in files:
             raise UsageError(f"{option} {path}: its {name} is an input of this command, expected another folder")
     _check_parent(path / "file", option)
     return path

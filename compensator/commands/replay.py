@@ -16,6 +16,7 @@ from compensator.commands.outputs import checked_file, checked_page
 from compensator.commands.progress import progress_bar
 from compensator.commands.workers import workers
 from compensator.errors import UsageError
+from compensator.input_file import resolved
 from compensator.model.model_file import load_model
 from compensator.recording.reading import recordings_in
 
@@ -42,7 +43,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     public_key = arguments.public_key
     if arguments.scheduler is not None:
         # Workers may run in other folders, so paths must be absolute.
-        paths, public_key = [path.resolve() for path in paths], public_key and public_key.resolve()
+        paths, public_key = [resolved(path) for path in paths], public_key and resolved(public_key)
     worth = len(paths) if sum(path.stat().st_size for path in paths if path.exists()) > ALONE else 1
     with progress_bar("auditing") as progress, workers(worth, arguments.scheduler) as executor:
         found = audit(paths, public_key=public_key, progress=progress, executor=executor)

@@ -9,6 +9,7 @@ from pathlib import Path
 from compensator.commands import Answer
 from compensator.commands.progress import progress_bar
 from compensator.errors import UsageError
+from compensator.input_file import resolved
 
 
 def run(arguments: argparse.Namespace) -> Answer:
@@ -38,7 +39,7 @@ def _results(folder: Path, out: Path) -> Answer:
     from compensator.report.formats import write
     from compensator.report.results import overview, pages_in
 
-    pages = [page for page in pages_in(folder) if page.path.resolve() != out.resolve()]
+    pages = [page for page in pages_in(folder) if resolved(page.path) != resolved(out)]
     if not pages:
         raise UsageError(f"{folder}: contains neither recordings (*.mcap) nor pages (report.html)")
     write(out, overview(folder, pages, relative_to=out.parent))
@@ -52,5 +53,5 @@ def _results(folder: Path, out: Path) -> Answer:
 
 def _name(path: Path) -> str:
     """Return the name for the page, from the file or the folder."""
-    whole = path.resolve()
+    whole = resolved(path)
     return whole.stem if whole.suffix == ".mcap" else whole.name or "all"

@@ -68,7 +68,9 @@ def run(arguments: argparse.Namespace) -> Answer | None:
         if arguments.foxglove:
             from compensator.watch.foxglove import FoxgloveServer
 
-            sinks.append(stack.enter_context(FoxgloveServer(source.prefix, arguments.foxglove_port)))
+            sinks.append(
+                stack.enter_context(FoxgloveServer(source.prefix, arguments.foxglove_port, arguments.foxglove_origin))
+            )
         if arguments.page:
             from compensator.watch.server import PageServer
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from compensator.codes import DataRemark, ProbeCode, Remark
 from compensator.config import ROLES
-from compensator.data.table import TIMES, Table, table_of, time_names
+from compensator.data.table import TIMES, Table, check_columns, table_of, time_names
 from compensator.errors import DataError
 from compensator.messages import Probe, number
 from compensator.recording.reading import messages
@@ -30,6 +30,8 @@ _OTHER_FILES = (
     (b"\xff\xfe", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
     (b"\xfe\xff", "text in UTF-16, expected UTF-8; save it as CSV in UTF-8"),
 )
+#: Largest table: bytes of its file, rows, and cells; each cell takes some hundred bytes while it is read.
+TABLE_BYTES, ROWS, CELLS = 1_000_000_000, 10_000_000, 50_000_000
 #: What scipy raises for a damaged MAT file, besides its own error.
 _DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
 #: How to save what only MATLAB can read.
@@ -49,6 +51,9 @@ def read_csv(path: Path, data: bytes, roles: Mapping[str, str]) -> Table:
     for begin, kind in _OTHER_FILES:
         if data.startswith(begin):
             raise DataError(f"{path}: {kind}")
+    cells, rows = data.count(b",") + data.count(b"\n"), data.count(b"\n")
+    if cells > CELLS or rows > ROWS:
+        raise DataError(f"{path}: {rows} rows of {cells} cells, expected at most {ROWS} and {CELLS}; split the table")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -63,21 +68,22 @@ def read_csv(path: Path, data: bytes, roles: Mapping[str, str]) -> Table:
         found = "a header without data" if lines else "empty"
         raise DataError(f"{path}: {found}, expected a header and data")
     header = _header(path, lines[0], roles)
-    rows = [(row, cells) for row, cells in enumerate(lines[1:], start=2) if cells]
-    for row, cells in rows:
-        if len(cells) != len(header):
-            raise DataError(f"{path}: row {row}: {len(cells)} cells, expected {len(header)}")
-    columns = zip(*(cells for _, cells in rows), strict=True) if rows else ([] for _ in header)
+    numbered = [(row, cells) for row, cells in enumerate(lines[1:], start=2) if cells]
+    for row, line in numbered:
+        if len(line) != len(header):
+            raise DataError(f"{path}: row {row}: {len(line)} cells, expected {len(header)}")
+    columns = zip(*(line for _, line in numbered), strict=True) if numbered else ([] for _ in header)
     # Keep cells as text: numpy would truncate or convert them.
     arrays = {name: np.array(cells, dtype=object) for name, cells in zip(header, columns, strict=True)}
-    return table_of(str(path), arrays, roles=roles, rows=[row for row, _ in rows], has="the header has")
+    return table_of(str(path), arrays, roles=roles, rows=[row for row, _ in numbered], has="the header has")
 
 
 def _header(path: Path, cells: Sequence[str], roles: Mapping[str, str]) -> list[str]:
+    check_columns(str(path), len(cells))
     header = [name.strip() for name in cells]
-    for name in header:
-        if header.count(name) > 1:
-            raise DataError(f"{path}: the header names column {name!r} twice, expected each name once")
+    for name, count in Counter(header).items():
+        if count > 1:
+            raise DataError(f"{path}: the header names column {name[:64]!r} twice, expected each name once")
     if not time_names(roles) & set(header):
         for separator, word in ((";", "semicolons"), ("\t", "tabs")):
             if cells and separator in cells[0]:

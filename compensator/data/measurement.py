@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from compensator import display
 from compensator.codes import Remark
-from compensator.data.files import read_csv, read_mat, read_recordings
+from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
 from compensator.data.record import SampledData, require
@@ -23,6 +23,7 @@ from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.screening import check_y_std
 from compensator.data.table import Table
 from compensator.errors import DataError, UsageError
+from compensator.input_file import read_file, sha256_of_file
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -217,7 +218,7 @@ def measurements(
             )
     if recordings:
         table, left_out = read_recordings(recordings, roles)
-        origins = tuple(_origin(path, path.read_bytes()) for path in recordings)
+        origins = tuple(_origin(path, sha256_of_file(path)) for path in recordings)
         label = recordings[0].name
         found.append(Measurement(table=table, label=label, origins=origins, roles=roles, remarks=left_out))
     return found
@@ -225,7 +226,7 @@ def measurements(
 
 def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
     try:
-        data = path.read_bytes()
+        data = read_file(path, TABLE_BYTES)
     except OSError as error:
         raise DataError(f"{path}: {error.strerror or error}; expected a table or a recording") from error
     left_out: tuple[Remark, ...] = ()
@@ -234,7 +235,7 @@ def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
     else:
         table = read_csv(path, data, roles)
     table, remarks = table.measurements_only()
-    table, origins = table.with_roles(roles), (_origin(path, data),)
+    table, origins = table.with_roles(roles), (_origin(path, hashlib.sha256(data).hexdigest()),)
     return Measurement(table=table, label=path.name, origins=origins, roles=roles, remarks=(*left_out, *remarks))
 
 
@@ -252,8 +253,8 @@ def _in_memory(name: str, source: Any, roles: Mapping[str, str]) -> Measurement:
     )
 
 
-def _origin(path: Path, data: bytes) -> Origin:
-    return Origin(name=path.name, sha256=hashlib.sha256(data).hexdigest(), path=path)
+def _origin(path: Path, sha256: str) -> Origin:
+    return Origin(name=path.name, sha256=sha256, path=path)
 
 
 def runs_in(

@@ -17,6 +17,8 @@ from compensator.errors import DataError, UsageError
 
 #: Columns that hold the time: s from the start, or date and time. With both, the first is used.
 TIMES = ("t_s", "time_utc")
+#: Largest number of columns.
+COLUMNS = 1000
 #: Columns of an exported recording that the service computed.
 EXPORTED = (
     "seq",
@@ -128,6 +130,7 @@ def table_of(
     >>> table.t_s, table.columns["y_um"]
     (array([ 0., 60.]), array([1.5, nan]))
     """
+    check_columns(name, len(cells))
     cells = _with_time(name, cells, roles or {})
     time_column = next((column for column in TIMES if column in cells), None)
     if time_column is None:
@@ -153,6 +156,18 @@ def table_of(
         raise DataError(f"{name}: row {rows[int(np.argmax(np.isnan(time)))]}: time is missing")
     start = float(time[0]) if time_column == "time_utc" else None
     return Table(name=name, t_s=time - time[0], columns=numbers, rows=rows, start_utc_s=start)
+
+
+def check_columns(name: str, count: int) -> None:
+    """Refuse a table of too many columns.
+
+    Raises
+    ------
+    DataError
+        If there are more than `COLUMNS`.
+    """
+    if count > COLUMNS:
+        raise DataError(f"{name}: {count} columns, expected at most {COLUMNS}")
 
 
 def time_names(roles: Mapping[str, str]) -> set[str]:

@@ -11,6 +11,9 @@ Kind = Literal["auto", "heat", "direct"]
 Method = Literal["I", "II", "III", "IV"]
 Drive = Literal["ttf", "known"]
 
+#: Largest order of a path, and number of held-out blocks: each block is a fit.
+LARGEST_ORDER, MOST_FOLDS = 8, 100
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
@@ -58,19 +61,21 @@ class Settings:
             raise DataError(
                 f"TTF structure nb {nb}, nf {nf}, nk {nk}: nk must be 0, otherwise its inverse is not causal"
             )
-        if nb < 1 or nf < 1 or nb > nf + 1:
-            raise DataError(f"TTF structure nb {nb}, nf {nf}, nk {nk}: expected nf >= 1 and nb from 1 to nf + 1")
-        if self.order is not None and (self.order[0] < 1 or min(self.order[1:]) < 1 or max(self.order) > 8):
-            raise DataError(f"order {self.order}: expected nf, nb of DTF, nb of TDTF, each from 1 to 8")
+        if nb < 1 or not 1 <= nf <= LARGEST_ORDER or nb > nf + 1:
+            raise DataError(
+                f"TTF structure nb {nb}, nf {nf}, nk {nk}: expected nf from 1 to {LARGEST_ORDER}, nb from 1 to nf + 1"
+            )
+        if self.order is not None and (self.order[0] < 1 or min(self.order[1:]) < 1 or max(self.order) > LARGEST_ORDER):
+            raise DataError(f"order {self.order}: expected nf, nb of DTF, nb of TDTF, each from 1 to {LARGEST_ORDER}")
         if (self.method == "I") != (self.given_tdtf is not None):
             raise DataError(
                 "method I, and only that, needs a given TDTF: its gain in µm/K and its time constant in min"
             )
         if self.given_tdtf is not None and self.given_tdtf[1] <= 0.0:
             raise DataError(f"given TDTF: time constant {self.given_tdtf[1]:g} min, expected a number above 0")
-        if self.folds < 2:
-            raise DataError(f"folds {self.folds}, expected at least 2")
-        if self.max_order < 1:
-            raise DataError(f"max order {self.max_order}, expected at least 1")
-        if self.etve_end_h <= 0.0:
+        if not 2 <= self.folds <= MOST_FOLDS:
+            raise DataError(f"folds {self.folds}, expected at least 2, at most {MOST_FOLDS}")
+        if not 1 <= self.max_order <= LARGEST_ORDER:
+            raise DataError(f"max order {self.max_order}, expected at least 1, at most {LARGEST_ORDER}")
+        if not self.etve_end_h > 0.0:
             raise DataError(f"ETVE end {self.etve_end_h:g} h, expected more than 0")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
@@ -16,6 +15,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from compensator.errors import CompensatorError, ModelError
+from compensator.input_file import MODEL_BYTES, parse_toml, read_file
 from compensator.model.effects import Effect, effect_from, kinds
 from compensator.model.table import TomlTable, shown
 from compensator.model.thermal_model import Estimator, Path, ThermalModel
@@ -42,6 +42,14 @@ _TOP = (
     "effect",
     "description",
 )
+#: Largest number of coefficients of a polynomial, of effects, of alternatives, and of ranges.
+COEFFICIENTS, EFFECTS, ALTERNATIVES, RANGES = 20, 100, 20, 200
+#: Largest sum of all delays, samples; each sample is part of the state in every recording.
+DELAY_SAMPLES = 20_000
+#: Temperatures that any part of a machine can have, °C.
+_COLDEST, _HOTTEST = -273.15, 2000.0
+#: Largest of any other quantity that a range bounds, such as W or rpm, and largest error of a model, µm.
+_LARGEST, _LARGEST_UM = 1e9, 10_000.0
 _ESTIMATOR = ("method", "t_q_noise_std_k", "at_noise_std_k", "at_walk_std_k")
 _FORMS = {"continuous": ("numerator", "denominator"), "sampled": ("b", "a")}
 
@@ -83,7 +91,7 @@ def read_model_bytes(name: str | FilePath) -> bytes:
     if str(name) in BUILT_IN:
         return resources.files("compensator.model").joinpath(f"{name}.toml").read_bytes()
     try:
-        return FilePath(name).read_bytes()
+        return read_file(FilePath(name), MODEL_BYTES)
     except OSError as error:
         known = ", ".join(BUILT_IN)
         raise ModelError(
@@ -107,8 +115,8 @@ def parse_model(data: bytes, *, source: str) -> ThermalModel:
         As `load_model`.
     """
     try:
-        table = tomllib.loads(data.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        table = parse_toml(data)
+    except ValueError as error:
         raise ModelError(f"{source}: not a TOML file, expected a model: {error}") from error
     try:
         return _model(table, hashlib.sha256(data).hexdigest())
@@ -141,7 +149,7 @@ def _model(table: Mapping[str, Any], sha256: str) -> ThermalModel:
         inputs=top.text("inputs", ("changes", "absolute"), "changes"),  # type: ignore[arg-type]
         validity=_validity(table.get("validity", {})),
         y_std_um=_uncertainty(table.get("uncertainty", {"y_std_um": 0.0})),
-        effects=_effects(top.text("name"), table.get("effect", [])),
+        effects=_effects(top.text("name"), table.get("effect", []), period_s),
         alternatives=_alternatives(table.get("alternatives", {}), names, period_s),
         provenance=provenance,
         held_out_rms_um=held_out,
@@ -155,7 +163,7 @@ def _path(where: str, value: object, period_s: float, extra: Sequence[str] = ())
     upper, lower = _FORMS[form]
     table = TomlTable(where, value, ("unit", "form", upper, lower, "covariance", *extra))
     unit = table.text("unit")
-    top, bottom = table.numbers(upper), table.numbers(lower)
+    top, bottom = table.numbers(upper, most=COEFFICIENTS), table.numbers(lower, most=COEFFICIENTS)
     try:
         if form == "continuous":
             return Path.from_continuous(TransferFunction(numerator=top, denominator=bottom, unit=unit), period_s)
@@ -187,7 +195,7 @@ def _estimator(value: object, kind: str) -> Estimator:
 
 
 def _uncertainty(value: object) -> float:
-    return TomlTable("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0)
+    return TomlTable("uncertainty", value, ("y_std_um",)).number("y_std_um", low=0.0, high=_LARGEST_UM)
 
 
 def _provenance(value: object) -> tuple[float | None, dict[str, float], dict[str, Any]]:
@@ -203,19 +211,22 @@ def _provenance(value: object) -> tuple[float | None, dict[str, float], dict[str
 
 
 def _validity(value: object) -> dict[str, tuple[float, float]]:
-    table = TomlTable("validity", value)
+    table = TomlTable("validity", value, most=RANGES)
     ranges: dict[str, tuple[float, float]] = {}
     for key in table.table:
-        low, high = table.numbers(key, length=2)
+        bounds = (_COLDEST, _HOTTEST) if key.endswith("_degc") else (-_LARGEST, _LARGEST)
+        low, high = table.numbers(key, *bounds, length=2)
         if low >= high:
             raise ModelError(f"validity: {key} = [{low:g}, {high:g}], expected the lower bound first")
         ranges[key] = (low, high)
     return ranges
 
 
-def _effects(model_name: str, value: object) -> tuple[Effect, ...]:
+def _effects(model_name: str, value: object, period_s: float) -> tuple[Effect, ...]:
     if not isinstance(value, list):
         raise ModelError("effect: expected a list of tables, [[effect]]")
+    if len(value) > EFFECTS:
+        raise ModelError(f"effect: {len(value)} effects, expected at most {EFFECTS}")
     result = []
     for i, entry in enumerate(value, start=1):
         table = TomlTable(f"effect {i}", entry)
@@ -224,12 +235,15 @@ def _effects(model_name: str, value: object) -> tuple[Effect, ...]:
             known = ", ".join(sorted(kinds()))
             raise ModelError(f"model {model_name}: effect {i} has kind {kind!r}, expected one of: {known}")
         result.append(effect_from(kind, {key: value for key, value in table.table.items() if key != "kind"}))
+    delays = sum(getattr(effect, "delay_min", 0.0) for effect in result) * 60.0 / period_s
+    if delays > DELAY_SAMPLES:
+        raise ModelError(f"effect: delays of {delays:.0f} samples in all, expected at most {DELAY_SAMPLES}")
     return tuple(result)
 
 
 def _alternatives(value: object, names: Sequence[str], period_s: float) -> dict[str, tuple[str, Path]]:
     result = {}
-    for name, entry in TomlTable("alternatives", value).table.items():
+    for name, entry in TomlTable("alternatives", value, most=ALTERNATIVES).table.items():
         where = f"alternatives.{name}"
         replaces = TomlTable(where, entry).text("replaces", names)
         result[name] = (replaces, _path(where, entry, period_s, ("replaces",)))

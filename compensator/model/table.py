@@ -9,6 +9,9 @@ from typing import Any, TypeGuard
 from compensator.arrays import LARGEST
 from compensator.errors import ModelError
 
+#: Largest number of values in a list, and of lists in a list, unless a key has a limit of its own.
+LIST_LENGTH = 1000
+
 
 class TomlTable:
     """Typed access to a table of the model file.
@@ -21,21 +24,27 @@ class TomlTable:
         What the file holds there.
     known : sequence of str, optional
         Keys that it may have; any where it is left out.
+    most : int
+        Largest number of keys.
 
     Raises
     ------
     ModelError
-        If it is no table, or has an unknown key.
+        If it is no table, or has an unknown key or too many.
     """
 
-    def __init__(self, where: str, table: object, known: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, where: str, table: object, known: Sequence[str] | None = None, *, most: int = LIST_LENGTH
+    ) -> None:
         if not isinstance(table, Mapping):
-            raise ModelError(f"{where}: expected a table, got {table!r}")
+            raise ModelError(f"{where}: expected a table, got {shown(table)}")
+        if len(table) > most:
+            raise ModelError(f"{where}: {len(table)} keys, expected at most {most}")
         self.where = where
         self.table: Mapping[str, Any] = table
         unknown = [key for key in table if known is not None and key not in known]
         if unknown:
-            raise ModelError(f"{where}: unknown key {unknown[0]!r}, expected one of: {', '.join(known or ())}")
+            raise ModelError(f"{where}: unknown key {shown(unknown[0])}, expected one of: {', '.join(known or ())}")
 
     def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
         """Return a finite number between two bounds (inclusive)."""
@@ -45,10 +54,16 @@ class TomlTable:
         return float(value)
 
     def numbers(
-        self, key: str, low: float = -math.inf, high: float = math.inf, *, length: int | None = None
+        self,
+        key: str,
+        low: float = -math.inf,
+        high: float = math.inf,
+        *,
+        length: int | None = None,
+        most: int = LIST_LENGTH,
     ) -> tuple[float, ...]:
         """Return a list of finite numbers between two bounds (inclusive)."""
-        values: Any = self.table.get(key)
+        values: Any = self._bounded(key, most)
         ok = isinstance(values, list) and values and all(_is_number(v, low, high) for v in values)
         if not ok or (length is not None and len(values) != length):
             count = f"{length} " if length else ""
@@ -58,7 +73,7 @@ class TomlTable:
 
     def rows(self, key: str, *, needed: bool = True) -> tuple[tuple[float, ...], ...]:
         """Return a list of lists of finite numbers; empty where it is left out and not needed."""
-        values: Any = self.table.get(key)
+        values: Any = self._bounded(key)
         if values is None and not needed:
             return ()
         if not isinstance(values, list) or not values or not all(isinstance(row, list) for row in values):
@@ -67,10 +82,16 @@ class TomlTable:
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Return a list of strings."""
-        values: Any = self.table.get(key)
+        values: Any = self._bounded(key)
         if not isinstance(values, list) or not values or not all(isinstance(value, str) for value in values):
             raise ModelError(f"{self.where}: {key} = {shown(values)}, expected a list of strings")
         return tuple(values)
+
+    def _bounded(self, key: str, most: int = LIST_LENGTH) -> object:
+        value = self.table.get(key)
+        if isinstance(value, list) and len(value) > most:
+            raise ModelError(f"{self.where}: {key} has {len(value)} values, expected at most {most}")
+        return value
 
     def text(self, key: str, choices: Sequence[str] = (), default: str | None = None) -> str:
         """Return a string, one of the choices where there are any."""

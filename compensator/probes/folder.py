@@ -11,6 +11,7 @@ from typing import NamedTuple
 from compensator.clock import duration
 from compensator.codes import ProbeSourceRemark
 from compensator.errors import UsageError
+from compensator.input_file import read_file
 from compensator.probes.handled import Handled
 from compensator.probes.probe import Probe
 from compensator.probes.reports import Report, lost, not_sent
@@ -153,9 +154,7 @@ class WatchedFolder:
     def _read_file(self, path: Path) -> Iterator[None]:
         """Handle the lines of a file, one with each step."""
         try:
-            if path.stat().st_size > LONGEST:
-                raise OSError(27, f"longer than {LONGEST} bytes")
-            content = path.read_bytes()
+            content = read_file(path, LONGEST)
         except OSError as error:
             self._read.pop(path, None)
             self._trouble(path, error)

@@ -7,7 +7,11 @@ from pathlib import Path
 
 from compensator.atomic_write import atomic_write
 from compensator.errors import ConfigError
+from compensator.input_file import read_file
 from compensator.probes.table import Row
+
+#: Longest state file, bytes.
+STATE_BYTES = 50_000_000
 
 
 class Handled:
@@ -33,7 +37,7 @@ class Handled:
         if not path.parent.is_dir():
             raise ConfigError(f"{path}: no such folder for the state of folders")
         try:
-            kept = json.loads(path.read_text(encoding="utf-8"))["handled"] if path.exists() else {}
+            kept = json.loads(read_file(path, STATE_BYTES))["handled"] if path.exists() else {}
             if not all(isinstance(part, str) for pair in kept.items() for part in pair):
                 raise TypeError("expected texts")
             for identity in kept:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from compensator.codes import ProbeSourceRemark
+from compensator.input_file import read_file
 from compensator.probes.probe import Probe
 from compensator.probes.reports import Report, lost, not_sent
 from compensator.probes.sender import pause
@@ -87,9 +88,7 @@ class ProbeFile:
     def _content(self) -> bytes | None:
         """Return the whole lines of the file; None if it cannot be read."""
         try:
-            if self._path.stat().st_size > LONGEST:
-                raise OSError(f"longer than {LONGEST} bytes")
-            content = self._path.read_bytes()
+            content = read_file(self._path, LONGEST)
         except FileNotFoundError:
             return b""
         except OSError as error:

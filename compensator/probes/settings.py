@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from compensator.errors import ConfigError
+from compensator.input_file import resolved
 from compensator.probes.probe import Convention
 from compensator.receiver import ReceiverError
 from compensator.receiver.settings import load_tables, read_table
@@ -320,4 +321,4 @@ def _within(settings: object, bounds: Mapping[str, tuple[float, float]], where: 
 
 
 def _absolute(path: Path, name: str) -> str:
-    return str((path.parent / name).resolve()) if name else ""
+    return str(resolved(path.parent / name)) if name else ""

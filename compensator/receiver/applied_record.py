@@ -6,6 +6,8 @@ import bisect
 import math
 from pathlib import Path
 
+from .settings import read_file
+
 #: A value is written when it has changed by this, µm, and at least this often, s.
 STEP_UM, EVERY_S = 0.02, 2.0
 #: Shortest time between two lines, s.
@@ -94,7 +96,7 @@ def applied_at(path: Path, time_utc_ns: int) -> float | None:
 def _values(path: Path) -> list[tuple[int, float | None]]:
     """Read the lines; half a line, as after a power cut, is left out."""
     try:
-        lines = path.read_bytes().split(b"\n")[:-1]
+        lines = read_file(path, 2 * LONGEST).split(b"\n")[:-1]
     except OSError:
         return []
     values: list[tuple[int, float | None]] = []

@@ -8,25 +8,35 @@ interruption of the program for an hour cannot make the offset jump.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from .errors import ReceiverError
 from .message import OffsetMessage, Rejected, parse_offset
-from .reasons import Reason
+from .reasons import Reason, printable
+from .restart import CountRestart
 
 #: Part of `valid_for_s` for which the published rate is followed: the rate holds until the next sample, and a message
 #: is valid for two to three samples.
 RATE_PART = 0.5
 #: Closer than this the offset counts as arrived, µm.
 ARRIVED_UM = 0.01
+#: Largest value of each limit: more is a slip of the pen, and no limit at all.
+LARGEST: Mapping[str, float] = {
+    "offset_max_um": 5000.0,
+    "offset_rate_max_um_per_min": 6000.0,
+    "valid_max_s": 10_000.0,
+    "step_max_s": 60.0,
+    "clock_tolerance_s": 600.0,
+}
 
 FollowerState = Literal["starting", "following", "holding", "fading"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of the applied offset.
+    """Limits of the applied offset; each at most the value in `LARGEST`.
 
     Parameters
     ----------
@@ -49,10 +59,10 @@ class Limits:
     clock_tolerance_s: float = 5.0
 
     def __post_init__(self) -> None:
-        for name in ("offset_max_um", "offset_rate_max_um_per_min", "valid_max_s", "step_max_s", "clock_tolerance_s"):
+        for name, largest in LARGEST.items():
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ReceiverError(f"{name} = {value}: expected a number above 0")
+            if not 0.0 < value <= largest:
+                raise ReceiverError(f"{name} = {value}: expected a number above 0, at most {largest:g}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,6 +161,8 @@ class Follower:
     _mode: Literal["follow", "hold", "fade"] = "follow"
     _fade_rate_um_per_min: float = 0.0
     _advanced_s: float | None = None
+    _restart: CountRestart = field(default_factory=CountRestart)
+    _restarted: Reason | None = None
 
     def __post_init__(self) -> None:
         self.rebase(self.applied_um)
@@ -194,8 +206,16 @@ class Follower:
 
     # ------------------------------------------------------------------ messages
 
-    def receive(self, now_s: float, payload: bytes, *, age_s: float | None = None, asked: bool = False) -> bool:
-        """Accept a message, or drop it with a reason.
+    def receive(
+        self,
+        now_s: float,
+        payload: bytes,
+        *,
+        age_s: float | None = None,
+        utc_ns: Callable[[], int] | None = None,
+        asked: bool = False,
+    ) -> bool:
+        """Accept a message, or drop it with a reason; no payload raises an error.
 
         Parameters
         ----------
@@ -206,6 +226,8 @@ class Follower:
         age_s : float, optional
             Wall clock minus the message's time, s, if it is to be checked; otherwise the message counts as measured
             now. After this only the monotonic clock is used, so setting the wall clock later has no effect.
+        utc_ns : callable, optional
+            Instead of `age_s`, the wall clock, ns since 1970 UTC.
         asked : bool
             Whether it is the answer to a query, which is not a replay even if a newer message arrived first.
 
@@ -216,22 +238,30 @@ class Follower:
         """
         try:
             message = parse_offset(payload)
-            accepted = self._check(message, age_s, asked)
+            if utc_ns is not None:
+                age_s = (utc_ns() - message.time_utc_ns) / 1e9
+            accepted = self._check(now_s, message, age_s, asked)
         except Rejected as rejected:
             self._rejected = rejected.reason
             self.dropped[rejected.reason.code] = self.dropped.get(rejected.reason.code, 0) + 1
             return False
         if not accepted:
             return False
-        valid_s = min(message.valid_for_s, self.limits.valid_max_s)
-        self._held = _Held(message, now_s - max(age_s or 0.0, 0.0), valid_s)
+        self._restarted = None
+        if message.seq < self.last_sequence:
+            self._restarted = Reason("count_restarted", f"number {message.seq} after {self.last_sequence}")
+        self._restart.clear()
+        self._held = _Held(message, now_s - max(age_s or 0.0, 0.0), self._valid_s(message))
         self.last_sequence = message.seq
         self._rejected = None
         return True
 
-    def _check(self, message: OffsetMessage, age_s: float | None, asked: bool) -> bool:
+    def _valid_s(self, message: OffsetMessage) -> float:
+        return min(message.valid_for_s, self.limits.valid_max_s)
+
+    def _check(self, now_s: float, message: OffsetMessage, age_s: float | None, asked: bool) -> bool:
         if message.machine != self.machine:
-            raise Rejected(Reason("other_machine", f"{message.machine[:64]}, expected {self.machine}"))
+            raise Rejected(Reason("other_machine", f"{printable(message.machine, 64)}, expected {self.machine}"))
         # The query at the start may return a message twice. After a restart the newest one may be queried again; its
         # age is checked as for any other message.
         again = message.seq == self.last_sequence
@@ -242,18 +272,33 @@ class Follower:
         if message.seq < self.last_sequence:
             if asked:
                 return False
-            raise Rejected(Reason("replayed", f"number {message.seq} after {self.last_sequence}"))
+            self._check_restart(now_s, message, age_s)
+        self._check_value(message, age_s)
+        return True
+
+    def _check_restart(self, now_s: float, message: OffsetMessage, age_s: float | None) -> None:
+        """Drop a message with a lower number, unless the service evidently counts from there."""
+        detail = f"number {message.seq} after {self.last_sequence}"
+        if self._held is not None and now_s - self._held.measured_s <= self._held.valid_s:
+            raise Rejected(Reason("replayed", detail))
+        try:
+            self._check_value(message, age_s)
+        except Rejected as rejected:
+            raise Rejected(Reason("replayed", detail)) from rejected
+        if not self._restart.is_shown_by(now_s, message, self._valid_s(message)):
+            raise Rejected(Reason("replayed", detail))
+
+    def _check_value(self, message: OffsetMessage, age_s: float | None) -> None:
         if age_s is not None:
             self._check_age(message, age_s)
         if message.y_offset_um is not None and abs(message.y_offset_um) > self.limits.offset_max_um:
             detail = f"{message.y_offset_um:.2f} µm, expected at most {self.limits.offset_max_um:g}"
             raise Rejected(Reason("beyond_limit", detail))
-        return True
 
     def _check_age(self, message: OffsetMessage, age_s: float) -> None:
         if not age_s >= -self.limits.clock_tolerance_s:
             raise Rejected(Reason("clock_disagrees", f"{-age_s:.1f} s ahead of the wall clock here"))
-        if age_s > min(message.valid_for_s, self.limits.valid_max_s):
+        if age_s > self._valid_s(message):
             raise Rejected(Reason("late", f"{age_s:.1f} s old by the wall clock, valid for {message.valid_for_s:g} s"))
 
     # ------------------------------------------------------------------ the applied offset
@@ -306,7 +351,7 @@ class Follower:
 
     def _wanted(self, now_s: float) -> tuple[FollowerState, float | None, list[Reason]]:
         """Return the state, the target of the offset (None: it is held), and the reasons so far."""
-        reasons = [] if self._rejected is None else [self._rejected]
+        reasons = [reason for reason in (self._rejected, self._restarted) if reason is not None]
         if self.alive is False:
             reasons.append(Reason("service_gone"))
         if self._mode == "fade":

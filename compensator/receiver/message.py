@@ -7,13 +7,17 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from .reasons import Reason
+from .reasons import Reason, printable
 
 #: Version of the messages that this receiver understands.
 SCHEMA = 1
 #: Longest payload, bytes; an offset has about 300.
 PAYLOAD_MAX_BYTES = 65_536
+#: Largest number of a message: ten samples a second for 300 years.
+SEQ_MAX = 100_000_000_000
 _STATES = ("starting", "ok", "degraded", "hold", "fault")
+#: Number of codes in a message, and their length.
+_CODES_MAX, _CODE_LENGTH = 100, 200
 _INT_MAX = 2**63 - 1
 
 
@@ -79,8 +83,7 @@ def parse_offset(payload: bytes) -> OffsetMessage:
         `malformed` or `other_schema`.
     """
     table = _decode(payload)
-    if _integer(table, "schema") != SCHEMA:
-        raise Rejected(Reason("other_schema", f"schema {table['schema']}, expected {SCHEMA}"))
+    _check_schema(table)
     state = table.get("state")
     if state not in _STATES:
         raise _malformed("state", state, f"one of {', '.join(_STATES)}")
@@ -88,7 +91,7 @@ def parse_offset(payload: bytes) -> OffsetMessage:
     if not isinstance(machine, str) or not machine:
         raise _malformed("machine", machine, "a name")
     reasons = table.get("reasons")
-    if not isinstance(reasons, list) or not all(isinstance(code, str) for code in reasons):
+    if not isinstance(reasons, list) or len(reasons) > _CODES_MAX or not all(map(_is_code, reasons)):
         raise _malformed("reasons", reasons, "a list of codes")
     valid_for_s = _number(table, "valid_for_s")
     if valid_for_s is None or valid_for_s <= 0.0:
@@ -101,7 +104,7 @@ def parse_offset(payload: bytes) -> OffsetMessage:
         raise _malformed("y_offset_std_um", std_um, "0 or more")
     return OffsetMessage(
         machine=machine,
-        seq=_integer(table, "seq"),
+        seq=_integer(table, "seq", SEQ_MAX),
         time_utc_ns=_integer(table, "time_utc_ns"),
         valid_for_s=valid_for_s,
         y_offset_um=offset_um,
@@ -131,8 +134,24 @@ class ProbeWanted:
     tolerance_um: float | None
 
 
-def parse_wanted(payload: bytes, machine: str) -> ProbeWanted | None:
-    """Read what a status says about probes; None for a service without probes.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusMessage:
+    """A checked status, as far as a control needs it.
+
+    Parameters
+    ----------
+    time_utc_ns : int
+        Time of the sample, ns since 1970 UTC.
+    wanted : ProbeWanted or None
+        What it says about probes; None for a service without probes.
+    """
+
+    time_utc_ns: int
+    wanted: ProbeWanted | None
+
+
+def parse_status(payload: bytes, machine: str) -> StatusMessage:
+    """Decode a status and check what it says about probes.
 
     Raises
     ------
@@ -140,10 +159,13 @@ def parse_wanted(payload: bytes, machine: str) -> ProbeWanted | None:
         `malformed`, `other_schema` or `other_machine`.
     """
     table = _decode(payload)
-    if _integer(table, "schema") != SCHEMA:
-        raise Rejected(Reason("other_schema", f"schema {table['schema']}, expected {SCHEMA}"))
+    _check_schema(table)
     if table.get("machine") != machine:
-        raise Rejected(Reason("other_machine", f"{str(table.get('machine'))[:64]}, expected {machine}"))
+        raise Rejected(Reason("other_machine", f"{_shown(table.get('machine'))}, expected {machine}"))
+    return StatusMessage(time_utc_ns=_integer(table, "time_utc_ns"), wanted=_wanted(table))
+
+
+def _wanted(table: dict[str, Any]) -> ProbeWanted | None:
     wanted = table.get("probe_wanted")
     if wanted is None:
         return None
@@ -182,13 +204,29 @@ def _pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return table
 
 
+def _check_schema(table: dict[str, Any]) -> None:
+    if _integer(table, "schema") != SCHEMA:
+        raise Rejected(Reason("other_schema", f"schema {table['schema']}, expected {SCHEMA}"))
+
+
+def _is_code(value: object) -> bool:
+    return isinstance(value, str) and len(value) <= _CODE_LENGTH and value.isprintable()
+
+
 def _malformed(key: str, value: object, expected: str) -> Rejected:
-    return Rejected(Reason("malformed", f"{key} = {str(value)[:40]}, expected {expected}"))
+    return Rejected(Reason("malformed", f"{key} = {_shown(value)}, expected {expected}"))
 
 
-def _integer(table: dict[str, Any], key: str) -> int:
+def _shown(value: object) -> str:
+    """Return a value as a reason quotes it; what is nested may be nested too deeply for that."""
+    if isinstance(value, (list, dict)):
+        return "a list" if isinstance(value, list) else "an object"
+    return printable(str(value), 40)
+
+
+def _integer(table: dict[str, Any], key: str, most: int = _INT_MAX) -> int:
     value = table.get(key)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _INT_MAX:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= most:
         raise _malformed(key, value, "a whole number")
     return value
 

@@ -41,7 +41,12 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "replayed": (
         "A message whose number was used before, or an older one, was dropped.",
         "Find out which programs publish below the prefix. If the machine's service was newly installed and counts "
-        "from a lower number, stop the receiver and delete its state file.",
+        "from a lower number, wait: the count restarts after the newest offset has expired.",
+    ),
+    "count_restarted": (
+        "The offset is followed again from a lower number: the highest one had expired, and three offsets in a row "
+        "followed each other as a service publishes them.",
+        "If the machine's service was not newly installed, find out which programs publish below the prefix.",
     ),
     "beyond_limit": (
         "An offset beyond the receiver's offset_max_um was dropped.",
@@ -77,6 +82,17 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "not_connected": ("No router or service has been reached yet.", "Check address, certificates and network."),
 }
+
+
+def printable(text: str, length: int) -> str:
+    r"""Return a text that a stranger wrote, shortened, so that it can be shown on every terminal.
+
+    Examples
+    --------
+    >>> printable("a\nb\ud800", 40)
+    'a\\nb\\ud800'
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[:length])
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import math
+import errno
+import os
 import re
+import stat
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
@@ -14,6 +16,10 @@ from .errors import ReceiverError
 from .follower import Limits
 
 T = TypeVar("T")
+#: Larger than any setting, and a float.
+_LARGEST = 1e30
+#: Largest files, bytes: settings, a Zenoh configuration, the state.
+SETTINGS_MAX_BYTES, ZENOH_MAX_BYTES, STATE_MAX_BYTES = 1_000_000, 1_000_000, 10_000
 _PREFIX = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")
 
 
@@ -96,6 +102,42 @@ def load_settings(path: str | Path) -> tuple[Settings, dict[str, Any]]:
     return settings_from(table, source=str(path), folder=path.parent), tables
 
 
+def read_file(path: Path, most: int) -> bytes:
+    """Return the bytes of a regular file.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+    most : int
+        Largest size, bytes.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, is a device, a pipe or a folder, or is larger.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe would wait for its writer
+    except ValueError as error:
+        raise OSError(errno.EINVAL, "no name of a file") from error
+    with open(descriptor, "rb") as file:  # noqa: PTH123  a descriptor
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "not a regular file")
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"larger than {most} bytes")
+    return data
+
+
+def _absolute(path: Path) -> str:
+    """Return an absolute path; one that leads nowhere is reported where it is opened."""
+    try:
+        return str(path.resolve())
+    except (OSError, RuntimeError, ValueError):  # a loop of links; a name that is none
+        return str(path.absolute())
+
+
 def load_tables(path: Path) -> dict[str, Any]:
     """Read a TOML file.
 
@@ -105,10 +147,10 @@ def load_tables(path: Path) -> dict[str, Any]:
         If it cannot be read.
     """
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
+        return tomllib.loads(read_file(path, SETTINGS_MAX_BYTES).decode("utf-8"))
     except OSError as error:
         raise ReceiverError(f"{path}: {error.strerror or error}; expected a settings file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or an integer of thousands of digits
         raise ReceiverError(f"{path}: not a TOML file: {error}") from error
 
 
@@ -133,7 +175,7 @@ def settings_from(table: Mapping[str, Any], *, source: str, folder: Path | None 
     _check(settings, source)
     folder = Path() if folder is None else folder
     absolute: dict[str, Any] = {
-        key: str((folder / getattr(settings, key)).resolve()) if getattr(settings, key) else ""
+        key: _absolute(folder / getattr(settings, key)) if getattr(settings, key) else ""
         for key in ("zenoh_config", "state_file", "applied_file")
     }
     return replace(settings, **absolute)
@@ -189,10 +231,10 @@ def _value(value: Any, kind: str, where: str) -> Any:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if kind == "tuple[str, ...]" and isinstance(value, list) and all(isinstance(item, str) for item in value):
         return tuple(value)
-    if kind == "float" and number and math.isfinite(value):
+    if kind == "float" and number and -_LARGEST < value < _LARGEST:
         return float(value)
     if (kind == "int" and number and isinstance(value, int)) or (kind == "bool" and isinstance(value, bool)):
         return value
     if kind == "str" and isinstance(value, str):
         return value
-    raise ReceiverError(f"{where} = {value!r}: expected {_EXPECTED[kind]}")
+    raise ReceiverError(f"{where} = {repr(value)[:60]}: expected {_EXPECTED[kind]}")

@@ -11,7 +11,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -22,9 +22,9 @@ import zenoh
 from .applied_record import AppliedRecord
 from .errors import ReceiverError
 from .follower import Applied, Follower
-from .message import ProbeWanted, Rejected, parse_wanted
+from .message import PAYLOAD_MAX_BYTES, SEQ_MAX, ProbeWanted, Rejected, parse_status
 from .reasons import Reason
-from .settings import Settings
+from .settings import STATE_MAX_BYTES, ZENOH_MAX_BYTES, Settings, read_file
 
 #: One attempt to reach the router, ms, and the pause before the next, s.
 CONNECT_TIMEOUT_MS = 1000
@@ -49,6 +49,10 @@ def client_config(settings: Settings) -> Any:
         Where the file cannot be used.
     """
     if settings.zenoh_config:
+        try:
+            read_file(Path(settings.zenoh_config), ZENOH_MAX_BYTES)  # of a device Zenoh would never come back
+        except OSError as error:
+            raise ReceiverError(f"{settings.zenoh_config}: {error.strerror}; expected a Zenoh configuration") from error
         try:
             config = zenoh.Config.from_file(settings.zenoh_config)
         except zenoh.ZError as error:
@@ -120,6 +124,7 @@ class Receiver:
         self._opened: list[Any] = []
         self._ended = threading.Event()
         self._opener = threading.Thread(target=self._open, name="thermal-receiver-connect", daemon=True)
+        self._accepted = False
         self._offsets: Any = None
         self._tokens: Any = None
         self._statuses: Any = None
@@ -165,30 +170,30 @@ class Receiver:
             self._receive_tokens()
             self._receive_answers(now_s)
             self._receive_statuses(now_s)
-            while (sample := self._offsets.try_recv()) is not None:
+            for sample in _waiting(self._offsets):
                 self._receive(now_s, sample, check_age=paused or self._settings.check_clock, asked=False)
+            self._save()
         applied = self.follower.advance(now_s)
         own = (self._remark, self._record_remark, None if self.connected else _CONNECTING)
         remarks = tuple(r for r in own if r is not None)
         return replace(applied, reasons=applied.reasons + remarks)
 
     def _receive(self, now_s: float, sample: Any, *, check_age: bool, asked: bool) -> None:
-        payload = sample.payload.to_bytes() if sample.kind == zenoh.SampleKind.PUT else b""
-        age_s = (self._utc_ns() - _time_of(payload)) / 1e9 if check_age else None
-        if self.follower.receive(now_s, payload, age_s=age_s, asked=asked):
-            self._save()
+        payload = _bytes_of(sample) if sample.kind == zenoh.SampleKind.PUT else b""
+        utc_ns = self._utc_ns if check_age else None
+        self._accepted |= self.follower.receive(now_s, payload, utc_ns=utc_ns, asked=asked)
 
     def _receive_answers(self, now_s: float) -> None:
         for answers in list(self._answers):
             try:
-                while (reply := answers.try_recv()) is not None:
+                for reply in _waiting(answers):
                     if reply.ok is not None:
                         self._receive(now_s, reply.ok, check_age=True, asked=True)
             except zenoh.ZError:  # all answers were received
                 self._answers.remove(answers)
 
     def _receive_tokens(self) -> None:
-        while (token := self._tokens.try_recv()) is not None:
+        for token in _waiting(self._tokens):
             self.follower.alive = token.kind == zenoh.SampleKind.PUT
             if self.follower.alive:  # a new service, or a new route to it: it may have published meanwhile
                 self._query_latest()
@@ -223,24 +228,26 @@ class Receiver:
     def _receive_statuses(self, now_s: float) -> None:
         for answers in list(self._status_answers):
             try:
-                while (reply := answers.try_recv()) is not None:
+                for reply in _waiting(answers):
                     if reply.ok is not None:
-                        payload = reply.ok.payload.to_bytes()
-                        # A service whose sampling hangs still answers.
-                        self._receive_status(payload, now_s - (self._utc_ns() - _time_of(payload)) / 1e9)
+                        self._receive_status(now_s, reply.ok, asked=True)
             except zenoh.ZError:  # all answers were received
                 self._status_answers.remove(answers)
-        while (sample := self._statuses.try_recv()) is not None:
-            self._receive_status(sample.payload.to_bytes(), now_s)
+        for sample in _waiting(self._statuses):
+            self._receive_status(now_s, sample, asked=False)
 
-    def _receive_status(self, payload: bytes, measured_s: float) -> None:
+    def _receive_status(self, now_s: float, sample: Any, *, asked: bool) -> None:
         try:
-            wanted = parse_wanted(payload, self._settings.machine)
+            status = parse_status(_bytes_of(sample), self._settings.machine)
         except Rejected:  # the messages of the offset show what is wrong
             return
-        time_utc_ns = _time_of(payload)
-        if self._wanted is None or time_utc_ns >= self._wanted[1]:
-            self._wanted = (wanted, time_utc_ns, min(measured_s, self._clock()))
+        time_utc_ns, measured_s = status.time_utc_ns, now_s
+        if asked:
+            if self._wanted is not None and time_utc_ns < self._wanted[1]:
+                return  # overtaken by a message
+            # A service whose sampling hangs still answers.
+            measured_s -= max((self._utc_ns() - time_utc_ns) / 1e9, 0.0)
+        self._wanted = (status.wanted, time_utc_ns, measured_s)
 
     # ------------------------------------------------------------------ connecting
 
@@ -280,22 +287,24 @@ class Receiver:
         if self._state_file is None or not self._state_file.exists():
             return -1
         try:
-            kept = json.loads(self._state_file.read_text(encoding="utf-8"))
+            kept = json.loads(read_file(self._state_file, STATE_MAX_BYTES))
             machine, last = kept["machine"], kept["last_sequence"]
-        except (OSError, ValueError, TypeError, KeyError):
+        except (OSError, ValueError, TypeError, KeyError, RecursionError):
             machine, last = None, None
-        if not isinstance(last, int) or isinstance(last, bool):
+        if not isinstance(last, int) or isinstance(last, bool) or not -1 <= last <= SEQ_MAX:
             self._remark = Reason("state_damaged", str(self._state_file))
             return -1
         if machine != self._settings.machine:
             raise ReceiverError(
-                f"{self._state_file}: machine = {machine!r}: expected {self._settings.machine!r}; "
+                f"{self._state_file}: machine = {str(machine)[:64]!r}: expected {self._settings.machine!r}; "
                 f"each receiver needs its own state file"
             )
         return last
 
     def _save(self) -> None:
-        if self._state_file is None:
+        """Save the last number if messages were accepted; once for all, because each time waits for the disk."""
+        accepted, self._accepted = self._accepted, False
+        if self._state_file is None or not accepted:
             return
         part = self._state_file.with_name(self._state_file.name + ".part")
         try:
@@ -310,10 +319,15 @@ class Receiver:
             self._remark = None
 
 
-def _time_of(payload: bytes) -> int:
-    """Return the message's own time, ns; 0 (too old) if there is none: the check of the message gives the reason."""
-    try:
-        value = json.loads(payload)["time_utc_ns"]
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return 0
-    return value if isinstance(value, int) else 0
+def _waiting(channel: Any) -> Iterator[Any]:
+    """Yield what has arrived, at most a buffer full: a flood must not keep the caller's loop."""
+    for _ in range(_BUFFER):
+        if (item := channel.try_recv()) is None:
+            return
+        yield item
+
+
+def _bytes_of(sample: Any) -> bytes:
+    """Return the payload; the part of a payload that is too long suffices to drop it."""
+    payload = sample.payload
+    return payload.to_bytes() if len(payload) <= PAYLOAD_MAX_BYTES else bytes(PAYLOAD_MAX_BYTES + 1)

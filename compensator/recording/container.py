@@ -19,6 +19,7 @@ from typing import BinaryIO, NamedTuple, TypeVar
 import zstandard
 
 from compensator.errors import DataError
+from compensator.input_file import open_file
 from compensator.recording.framing import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
@@ -182,7 +183,7 @@ class Container:
         self.index = Index()
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         try:
-            self._file: BinaryIO = path.open("rb")
+            self._file: BinaryIO = open_file(path)
             self._size = self._file.seek(0, 2)
             self._file.seek(0)
         except OSError as error:

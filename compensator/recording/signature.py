@@ -8,6 +8,7 @@ from typing import Any, Literal
 import msgspec
 
 from compensator.errors import ConfigError, UsageError
+from compensator.input_file import KEY_BYTES, read_file
 from compensator.messages import Seal
 from compensator.recording.chain import signed_bytes
 
@@ -83,7 +84,7 @@ def _read_key(path: Path, half: Literal["private", "public"], error_kind: type[C
     except ImportError as error:
         raise error_kind(_MISSING) from error
     try:
-        data = path.read_bytes()
+        data = read_file(path, KEY_BYTES)
     except OSError as error:
         raise error_kind(f"{path}: {error.strerror or error}; expected a key") from error
     kind: type[Any] = getattr(ed25519, f"Ed25519{half.title()}Key")

@@ -162,7 +162,7 @@ def _loop(loop: Mapping[str, Any], second_day: Mapping[str, tuple[Vector, Vector
 def _pages(days: Sequence[MachineDay]) -> Table:
     rows: list[list[Cell]] = [
         [
-            Link(f"{day.name}/calibration/report.html", f"{day.name}/calibration/report.html"),
+            Link(f"{day.name}/calibration/model-calibration.html", f"{day.name}/calibration/model-calibration.html"),
             f"calibration of the {_KINDS.get(day.name, day.name)}",
         ]
         for day in days
@@ -173,7 +173,8 @@ def _pages(days: Sequence[MachineDay]) -> Table:
             "diagnosis of the conduction machine",
         ]
     )
-    rows.append([Link("paper/report.html", "paper/report.html"), "calibration of the paper's case"])
+    paper = "paper/model-calibration.html"
+    rows.append([Link(paper, paper), "calibration of the paper's case"])
     return Table(title="Pages of this demo", head=["page", "subject"], rows=rows)
 
 

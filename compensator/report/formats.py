@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from compensator.errors import CompensatorError, UsageError
+from compensator.input_file import resolved
 from compensator.report.page import Figure, Page, Row, html_of, write_page
 
 SUFFIXES = (".html", ".pdf", ".png")
@@ -102,7 +103,7 @@ def write(path: Path, page: Page) -> Path:
     suffix = path.suffix.lower()
     if suffix == ".html":
         return write_page(path, page)
-    path = path.resolve()
+    path = resolved(path)
     # In the target's folder: sandboxed browsers (snap) cannot read /tmp, and the last step is a rename.
     with tempfile.TemporaryDirectory(
         dir=path.parent, prefix=f"{path.stem}-printing-", ignore_cleanup_errors=True

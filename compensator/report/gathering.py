@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 import math
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -16,6 +15,7 @@ import numpy as np
 
 from compensator.codes import RecordingEnd, State
 from compensator.errors import DataError
+from compensator.input_file import parse_toml
 from compensator.messages import EstimateMessage, Event, Offset, Probe, Sample, number
 from compensator.model.effects.base import label_of
 from compensator.recording.container import Container, Contents, Damaged, Torn
@@ -132,8 +132,8 @@ class _Reader:
         self.history.machine = contents.metadata.get("run", {}).get("machine", "") or self.history.machine
         part = contents.attachments.get("model.toml")
         try:
-            table = tomllib.loads(part.data.decode()) if part else {}
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+            table = parse_toml(part.data) if part else {}
+        except ValueError:
             table = {}
         self._model = str(table.get("name", ""))
         self._effects = [label_of(effect) for effect in table.get("effect", [])]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tomllib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,10 +12,14 @@ from urllib.parse import quote
 
 from compensator.diagnose.summary import verdict as diagnosis_verdict
 from compensator.identify.summary import verdict as calibration_verdict
+from compensator.input_file import MODEL_BYTES, RESULT_BYTES, parse_toml, read_file, resolved
 from compensator.model.model_file import HELD_OUT_KEY
 from compensator.report.diagnosis import tone_of as diagnosis_tone
 from compensator.report.identification import tone_of
 from compensator.report.page import Block, Cell, Link, Page, Table, Tone
+
+#: End of the name of the page of a calibration, after the name of its model.
+_CALIBRATION = "-calibration.html"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,25 +32,40 @@ class PageFile:
     tone: Tone = "good"
 
 
+def calibration_page(model: Path) -> Path:
+    """Return the path of the page of a calibration, from that of its model file.
+
+    Examples
+    --------
+    >>> calibration_page(Path("machine-model.toml")).name
+    'machine-model-calibration.html'
+    """
+    return model.with_name(f"{model.name.removesuffix('.toml')}{_CALIBRATION}")
+
+
 def pages_in(folder: Path) -> list[PageFile]:
-    """Return the pages `report.html` of a folder and its subfolders, the topmost first."""
-    paths = sorted(folder.rglob("report.html"), key=lambda path: (len(path.parts), path))
+    """Return the pages of results in a folder and its subfolders, the topmost first."""
+    found = {*folder.rglob("report.html"), *folder.rglob(f"*{_CALIBRATION}")}
+    paths = sorted(found, key=lambda path: (len(path.parts), path))
     return [_diagnosis(path) or _calibration(path) or PageFile(path=path, title=path.parent.name) for path in paths]
 
 
 def _diagnosis(page: Path) -> PageFile | None:
     """Return the page of a diagnosis, from its `diagnosis.json`."""
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        found = json.loads(page.with_name("diagnosis.json").read_text(encoding="utf-8"))
+    if page.name.endswith(_CALIBRATION):
+        return None
+    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+        found = json.loads(read_file(page.with_name("diagnosis.json"), RESULT_BYTES))
         return PageFile(path=page, title="Diagnosis", verdict=diagnosis_verdict(found), tone=diagnosis_tone(found))
     return None
 
 
 def _calibration(page: Path) -> PageFile | None:
     """Return the page of a calibration, from the model file with its errors."""
-    for path in sorted(page.parent.glob("*.toml")):
+    own = page.with_name(f"{page.name.removesuffix(_CALIBRATION)}.toml")
+    for path in [own] if page.name.endswith(_CALIBRATION) else sorted(page.parent.glob("*.toml")):
         with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
-            model = tomllib.loads(path.read_text(encoding="utf-8"))
+            model = parse_toml(read_file(path, MODEL_BYTES))
             origin = model["provenance"]
             errors = {"parts": origin["parts"], "folds_rms_um": origin[HELD_OUT_KEY]}
             title = f"Calibration: {model['name']}"
@@ -84,5 +102,5 @@ def overview(folder: Path, pages: Sequence[PageFile], *, relative_to: Path) -> P
                 note="`compensator report FOLDER` makes a page from one of them.",
             )
         )
-    title = f"{folder.resolve().name}: {first.title}"
+    title = f"{resolved(folder).name}: {first.title}"
     return Page(title=title, verdict=first.verdict or f"{len(pages)} page(s).", tone=first.tone, blocks=blocks)

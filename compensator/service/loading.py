@@ -205,10 +205,17 @@ def _numbered_port(line: Mapping[str, Any]) -> Remark | None:
     port = str(line.get("port", ""))
     if not _NUMBERED.fullmatch(port):
         return None
-    lasting = [link for link in sorted(_BY_ID.glob("*")) if link.resolve() == Path(port).resolve()]
+    lasting = [link for link in sorted(_BY_ID.glob("*")) if _same_file(link, Path(port))]
     name = f" Its permanent name is {lasting[0]}." if lasting else ""
     figures = f"Line {line.get('name')!r}: port {port} is numbered in the order of connection; after a restart it may "
     return Remark(ServiceWarning.NUMBERED_PORT, f"{figures}be another adapter.{name}")
+
+
+def _same_file(link: Path, port: Path) -> bool:
+    try:
+        return link.resolve() == port.resolve()
+    except (OSError, RuntimeError, ValueError):  # a loop of links
+        return False
 
 
 def _exposures(zenoh: Zenoh) -> list[Remark]:

@@ -16,6 +16,7 @@ from compensator.certificates import TlsFiles
 from compensator.codes import Remark, ServiceWarning
 from compensator.config import Zenoh
 from compensator.errors import ConfigError
+from compensator.input_file import SETTINGS_BYTES, read_file, resolved
 
 log = logging.getLogger("compensator")
 
@@ -160,8 +161,11 @@ def read_config_file(path: Path) -> ConfigFile:
     ConfigError
         If the file cannot be used; the message names the file and the error.
     """
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such file, expected a Zenoh configuration")
+    try:
+        read_file(path, SETTINGS_BYTES)  # of a device Zenoh would never come back
+    except OSError as error:
+        words = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
+        raise ConfigError(f"{path}: {words}, expected a Zenoh configuration") from error
     try:
         config = zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:
@@ -170,7 +174,7 @@ def read_config_file(path: Path) -> ConfigFile:
     for name in _FILES:
         value = get(config, f"{_TLS}/{name}")
         if value is not None:
-            tls[name] = str((path.parent / value).resolve())
+            tls[name] = str(resolved(path.parent / value))
             set_key(config, f"{_TLS}/{name}", tls[name])
     return ConfigFile(config, tls)
 

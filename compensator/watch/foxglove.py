@@ -7,13 +7,16 @@ Needs the extra `foxglove`. The topics of the watched machine are those of its r
 from __future__ import annotations
 
 import json
+import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 from compensator.errors import ServiceError
 from compensator.messages import shipped_schema
 from compensator.watch.machine import KINDS, Malformed, decoded
+from compensator.watch.origin_gate import VIEWERS, OriginGate
 
 #: The only address to which the server is bound.
 HOST = "127.0.0.1"
@@ -46,6 +49,8 @@ class FoxgloveServer:
         Watched prefix.
     port : int
         0 selects a free port.
+    origins : sequence of str
+        Further origins of pages that may connect, such as a viewer that a company hosts itself.
 
     Raises
     ------
@@ -53,42 +58,49 @@ class FoxgloveServer:
         If the extra is not installed, or the port is in use.
     """
 
-    def __init__(self, prefix: str, port: int) -> None:
+    def __init__(self, prefix: str, port: int, origins: Sequence[str] = ()) -> None:
         try:
             import foxglove
         except ImportError as error:
             raise ServiceError("--foxglove: not installed: pip install quill-compensator[foxglove]") from error
         self._foxglove: Any = foxglove
         self._prefix, self._port = prefix, port
+        self._origins = (*VIEWERS, *origins)
         self._context: Any = foxglove.Context()
         self._lock = threading.Lock()
         self._channels: dict[str, Any] = {}
         #: Messages for a new viewer, by topic: the latest message, the last events.
         self._latest: dict[str, list[tuple[bytes, int]]] = {}
-        self._server: Any = None
+        self._gate: OriginGate | None = None
+        self._stack = ExitStack()
 
     @property
     def port(self) -> int:
         """Port of the server."""
-        return int(self._server.port) if self._server is not None else self._port
+        return self._gate.port if self._gate is not None else self._port
 
     def __enter__(self) -> FoxgloveServer:
+        # Behind the gate: at an address of loopback that no page can guess.
+        inner = ".".join(("127", *(str(1 + secrets.randbelow(254)) for _ in range(3))))
         try:
-            self._server = self._foxglove.start_server(
+            server = self._foxglove.start_server(
                 name="thermal compensation",
-                host=HOST,
-                port=self._port,
+                host=inner,
+                port=0,
                 context=self._context,
                 server_listener=_Listener(self._join),
             )
+            self._stack.callback(server.stop)
+            gate = OriginGate((HOST, self._port), (inner, int(server.port)), self._origins)
+            self._gate = self._stack.enter_context(gate)
         except (RuntimeError, OSError, OverflowError) as error:
+            self._stack.close()
             raise ServiceError(f"--foxglove-port {self._port}: {error}; 0 selects a free port") from error
         return self
 
     def __exit__(self, *_: object) -> None:
-        server, self._server = self._server, None
-        if server is not None:
-            server.stop()
+        self._gate = None
+        self._stack.close()
 
     def receive(self, key: str, payload: bytes, *, asked: bool = False) -> None:
         """Forward a message with its own time; malformed messages are dropped."""

@@ -26,6 +26,7 @@ from compensator.service.session import (
     get,
     local_endpoints,
 )
+from compensator.watch.machine import LONGEST
 
 #: Largest number of messages that wait to be processed.
 WAITING = 65_536
@@ -209,7 +210,7 @@ class Listener:
         key = str(sample.key_expr)
         if sample.kind != zenoh.SampleKind.PUT or key.endswith("/alive"):
             return
-        payload = sample.payload.to_bytes()
+        payload = sample.payload.to_bytes() if len(sample.payload) <= LONGEST else bytes(LONGEST + 1)
         for sink in self._sinks:
             sink.receive(key, payload, asked=asked)
 

@@ -10,6 +10,7 @@ import base64
 import hashlib
 import html
 import json
+import re
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -28,6 +29,8 @@ from compensator.watch.shop import Shop, headline
 
 #: The only address to which the server is bound.
 HOST = "127.0.0.1"
+#: A time in a request, s since 1970: no more digits than any has.
+_SECONDS = re.compile(r"[0-9]{1,12}(\.[0-9]{0,9})?", re.ASCII)
 #: Largest number of intervals in one state on the page.
 INTERVALS = 30
 #: Values of a machine that the table of a shop does not need.
@@ -85,7 +88,7 @@ class PageServer:
         if path == "/machine.json":
             prefix, since = query.get("prefix", [""])[0], query.get("since_s", ["0"])[0]
             machine = self._shop.one(prefix)
-            if machine is None or not since.replace(".", "", 1).isdigit():
+            if machine is None or not _SECONDS.fullmatch(since):
                 return None
             history = self._shop.history(prefix, int(float(since)) * NS)
             found = {"now_s": self._shop.now_ns() / NS, "status": self._status(), "machine": machine}

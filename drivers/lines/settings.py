@@ -43,7 +43,10 @@ class SerialLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def endpoints(self) -> tuple[str, ...]:
         """Name the port or addresses of the line, so that no two lines share one."""
-        return (str(Path(self.port).resolve()),)
+        try:
+            return (str(Path(self.port).resolve()),)
+        except (OSError, RuntimeError, ValueError):  # a loop of links, or no path at all: it is refused at opening
+            return (self.port,)
 
 
 class TcpLine(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

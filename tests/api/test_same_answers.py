@@ -104,7 +104,7 @@ def test_identify(tmp_path: Path, folder: Path, form: str, identified: tuple[dic
         assert (tmp_path / "saved.toml").read_bytes() == out.read_bytes()
         assert found.model.sha256 == files["model_sha256"] == tc.load_model(out).sha256
         found.page(tmp_path / "saved.html")
-        assert (tmp_path / "saved.html").read_bytes() == (out.parent / "report.html").read_bytes()
+        assert (tmp_path / "saved.html").read_bytes() == (out.with_name(f"{out.stem}-calibration.html")).read_bytes()
     else:
         assert without_names(as_json(found.to_dict())) == without_names(printed)
         assert content(tmp_path / "saved.toml") == content(out)

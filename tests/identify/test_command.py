@@ -35,7 +35,7 @@ def test_model_page_and_summary(tmp_path, calibration, capsys):
     assert model.provenance["data"][0]["sha256"] == hashlib.sha256(calibration.read_bytes()).hexdigest()
     assert model.dtf.covariance is not None
     assert model.validity["heat_w"][1] > 90.0
-    page = (out.parent / "report.html").read_text(encoding="utf-8")
+    page = (out.parent / "model-calibration.html").read_text(encoding="utf-8")
     for words in (
         "step response",
         "poles and zeros",
@@ -67,10 +67,26 @@ def test_json_and_a_direct_model_where_nobody_knows_the_heat(tmp_path, capsys):
     assert result["model_sha256"] == load_model(out).sha256
 
 
+def test_two_models_in_a_folder_have_a_page_each(tmp_path, calibration, capsys):
+    (tmp_path / "report.html").write_text("a page of another command")
+    for name in ("first", "second"):
+        assert (
+            main(["identify", str(calibration), "--out", str(tmp_path / f"{name}.toml"), "--order", "1", "1", "1"]) == 0
+        )
+    pages = {name: (tmp_path / f"{name}-calibration.html").read_text(encoding="utf-8") for name in ("first", "second")}
+    assert all(name in page for name, page in pages.items()) and pages["first"] != pages["second"]
+    assert (tmp_path / "report.html").read_text() == "a page of another command"
+    capsys.readouterr()
+    (tmp_path / "report.html").unlink()
+    assert main(["report", str(tmp_path), "--out", str(tmp_path / "all.html"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["pages"]
+    assert [page["title"] for page in found] == ["Calibration: first", "Calibration: second"]
+
+
 def test_the_pdf_is_named_as_well(tmp_path, calibration, capsys):
     out, page = tmp_path / "model.toml", tmp_path / "p.pdf"
     assert main(["identify", str(calibration), "--out", str(out), "--order", "1", "1", "1", "--page", str(page)]) == 0
-    assert capsys.readouterr().out.endswith(f"page: {tmp_path / 'report.html'}\npage: {page}\n")
+    assert capsys.readouterr().out.endswith(f"page: {tmp_path / 'model-calibration.html'}\npage: {page}\n")
     assert page.read_bytes().startswith(b"%PDF-")
 
 

@@ -205,4 +205,4 @@ def test_the_command_takes_the_standard_deviation(tmp_path, capsys):
     assert main(["identify", str(data), "--out", str(out), "--order", "3", "3", "2"]) == 2
     assert "--y-std UM" in capsys.readouterr().err
     assert main(["identify", str(data), "--out", str(out), "--order", "3", "3", "2", "--y-std", "1.5"]) == 0
-    assert "measured values" in (tmp_path / "m" / "report.html").read_text()
+    assert "measured values" in (tmp_path / "m" / "model-calibration.html").read_text()

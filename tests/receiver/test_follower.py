@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compensator.receiver import Applied, Follower, Limits, ReceiverError
-from tests.receiver.offsets import MACHINE, offset
+from tests.receiver.offsets import MACHINE, T0_NS, offset
 
 MAX_UM, RATE = 50.0, 6.0
 LIMITS = Limits(offset_max_um=MAX_UM, offset_rate_max_um_per_min=RATE)
@@ -289,7 +289,8 @@ def test_it_never_jumps_never_leaves_the_limit_and_uses_nothing_bad(
             f.fade(4.0) if tell == "fade" else getattr(f, tell)()
         if payload is not None and f.receive(now, payload, age_s=age_s, asked=asked):
             message = json.loads(payload)
-            assert message["machine"] == MACHINE and message["seq"] > used
+            assert message["machine"] == MACHINE
+            assert message["seq"] > used or "count_restarted" in codes(f.advance(now))
             assert message["y_offset_um"] is None or abs(message["y_offset_um"]) <= MAX_UM
             used = message["seq"]
         applied = f.advance(now)
@@ -305,8 +306,80 @@ def test_it_never_jumps_never_leaves_the_limit_and_uses_nothing_bad(
     assert applied.state in ("starting", "holding", "fading")
 
 
+# ---------------------------------------------------------------------- a lower number
+
+
+def locked_out() -> tuple[Follower, float]:
+    """A follower after a forged number far above the service's, which has expired."""
+    f, t = settled(3.0)
+    assert f.receive(t, offset(90_000_000_000, 3.0, time_utc_ns=T0_NS))
+    assert f.advance(t + 150.0).state == "following" and f.advance(t + 151.0).state == "holding"
+    return f, t + 151.0
+
+
+def test_a_service_that_counts_from_a_lower_number_is_followed_after_three_of_its_messages() -> None:
+    f, t = locked_out()
+    assert not f.receive(t, offset(3, 9.0)) and not f.receive(t + 61.0, offset(4, 9.0))
+    waiting = f.advance(t + 61.0)
+    assert waiting.state == "holding" and waiting.offset_um == f.applied_um and "replayed" in codes(waiting)
+    assert f.receive(t + 120.0, offset(5, 9.0))
+    now = f.advance(t + 121.0)
+    assert now.state == "following" and codes(now) == {"count_restarted", "catching_up"}
+    assert "number 5 after 90000000000" in now.text and f.snapshot()["last_sequence"] == 5
+    assert f.receive(t + 180.0, offset(6, 9.0)) and "count_restarted" not in codes(f.advance(t + 180.0))
+
+
+def test_no_lower_number_counts_while_the_newest_message_is_valid() -> None:
+    f, t = settled(3.0)
+    f.receive(t, offset(90, 3.0, valid_for_s=600.0))
+    assert not any(f.receive(t + 60.0 * i, offset(3 + i, 9.0)) for i in range(10))
+    assert f.advance(t + 599.0).state == "following" and f.advance(t + 599.0).seq == 90
+
+
+@pytest.mark.parametrize(
+    ("numbers", "apart_s", "changes"),
+    [
+        ((3, 4, 5, 6, 7, 8), 1.0, {}),  # a burst
+        ((3, 4, 5, 6, 7, 8), 31.0, {}),  # a recording replayed at twice its speed
+        ((8, 7, 6, 5, 4, 3), 60.0, {}),
+        ((3, 4, 3, 4, 3, 4), 60.0, {}),
+        ((3, 4, 5, 6, 7, 8), 60.0, {"time_utc_ns": 1}),
+        ((3, 4, 5, 6, 7, 8), 151.0, {}),  # each has expired when the next arrives
+        ((3, 4, 5, 6, 7, 8), 60.0, {"y_um": 50.1}),
+        ((3, 4, 5, 6, 7, 8), 60.0, {"machine": "vmc-08"}),
+    ],
+)
+def test_what_does_not_look_like_a_service_restarts_no_count(
+    numbers: tuple[int, ...], apart_s: float, changes: dict[str, Any]
+) -> None:
+    f, t = locked_out()
+    for i, number in enumerate(numbers):
+        assert not f.receive(
+            t + i * apart_s,
+            offset(number, changes.get("y_um", 9.0), **{key: value for key, value in changes.items() if key != "y_um"}),
+        )
+        assert f.advance(t + i * apart_s).state == "holding"
+
+
+def test_old_messages_restart_no_count_where_the_clock_is_checked() -> None:
+    f, t = locked_out()
+    assert not any(f.receive(t + 60.0 * i, offset(3 + i, 9.0), age_s=151.0) for i in range(5))
+    assert [f.receive(t + 300.0 + 60.0 * i, offset(8 + i, 9.0), age_s=1.0) for i in range(3)] == [False, False, True]
+
+
+def test_messages_in_between_do_not_prevent_it() -> None:
+    f, t = locked_out()
+    for i, number in enumerate((3, 4, 5)):
+        accepted = f.receive(t + 60.0 * i, offset(number, 9.0))
+        for j in range(5 if not accepted else 0):
+            assert not f.receive(t + 60.0 * i + 1.0 + j, offset(number + 10 + j, -9.0))
+    assert f.advance(t + 130.0).seq == 5
+
+
 def test_limits_have_no_default_and_no_nonsense() -> None:
-    for bad in (0.0, -1.0, math.nan, math.inf):
+    with pytest.raises(ReceiverError, match=r"offset_rate_max_um_per_min = 1e\+308: .* at most 6000"):
+        Limits(offset_max_um=1.0, offset_rate_max_um_per_min=1e308)
+    for bad in (0.0, -1.0, math.nan, math.inf, 5001.0):
         with pytest.raises(ReceiverError, match="offset_max_um"):
             Limits(offset_max_um=bad, offset_rate_max_um_per_min=1.0)
     with pytest.raises(TypeError):

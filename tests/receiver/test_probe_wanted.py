@@ -9,7 +9,7 @@ import pytest
 
 from compensator.receiver import ProbeWanted, Receiver, Rejected
 from compensator.receiver.applied_record import applied_at
-from compensator.receiver.message import parse_wanted
+from compensator.receiver.message import parse_status
 from tests.receiver.test_subscriber import settings
 from tests.receiver.wire import ScriptedService, free_port, router, until
 
@@ -66,7 +66,7 @@ def test_an_old_answer_is_old() -> None:
 )
 def test_a_status_that_is_not_understood_is_dropped(payload: bytes) -> None:
     with pytest.raises(Rejected):
-        parse_wanted(payload, "vmc-07")
+        parse_status(payload, "vmc-07")
 
 
 def test_what_the_control_had_is_recorded(tmp_path: Path) -> None:

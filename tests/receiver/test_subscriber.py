@@ -26,7 +26,7 @@ def settings(port: int, **changes: Any) -> Settings:
         "prefix": PREFIX,
         "connect": (f"tcp/127.0.0.1:{port}",),
         "offset_max_um": 100.0,
-        "offset_rate_max_um_per_min": 60_000.0,
+        "offset_rate_max_um_per_min": 6_000.0,
     }
     return Settings(**{**usual, **changes})
 
@@ -161,7 +161,7 @@ machine = "{MACHINE}"
 prefix = "{PREFIX}"
 connect = ["tcp/127.0.0.1:{port}"]
 offset_max_um = 100.0
-offset_rate_max_um_per_min = 60000.0
+offset_rate_max_um_per_min = 6000.0
 """)
     programs = (
         ["-m", "compensator.receiver", "--config", str(path)],

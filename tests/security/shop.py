@@ -190,7 +190,7 @@ class Plant:
                 machine="vmc-07",
                 prefix=PREFIX,
                 offset_max_um=200.0,
-                offset_rate_max_um_per_min=1e6,
+                offset_rate_max_um_per_min=6000.0,
                 valid_max_s=600.0,
                 zenoh_config=str(shop.client_file("receiver-cnc-07")),
             ),

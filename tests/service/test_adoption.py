@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -17,6 +18,7 @@ from compensator.messages import number
 from compensator.recording.reading import recordings
 from compensator.service.compensation import Outcome
 from compensator.service.replay import opening_of
+from compensator.service.transfer import adoption
 from compensator.service.transfer.adoption import Adoption
 from compensator.service.transfer.model_store import ModelStore, sha256_of
 from tests.service.living import MACHINE, Machine, check_files, largest_step, settings
@@ -307,6 +309,22 @@ async def test_payloads_that_are_no_model_are_refused_in_words(tmp_path: Path, d
     assert not asked.answer["ok"] and asked.answer["text"] and "Traceback" not in asked.answer["text"]
 
 
+@pytest.mark.parametrize("count", [2000, 20_000])
+async def test_an_order_too_large_is_refused_at_once_and_keeps_no_other_waiting(tmp_path: Path, count: int) -> None:
+    machine = Machine(tmp_path)
+    values = ", ".join(["0.001"] * count)
+    head, _, rest = QUILL.decode().partition("[paths.DTF]")
+    path = f'[paths.DTF]\nunit = "um/W"\nform = "sampled"\nb = [{values}]\na = [1.0, {values}]\n\n['
+    large = (head + path + rest.partition("\n[")[2]).encode()
+    first = machine.at_sample[10] = Asked(machine, "adopt", payload(large))
+    second = machine.at_sample[14] = Asked(machine, "adopt", payload(STRONGER, force=True))
+    began = time.monotonic()
+    await machine.run(20)
+    assert time.monotonic() - began < 20.0
+    assert not first.answer["ok"] and f"b has {count} values, expected at most 20" in first.answer["text"]
+    assert second.answer["ok"], second.answer
+
+
 async def test_a_service_that_ends_meanwhile_still_answers(tmp_path: Path) -> None:
     machine = Machine(tmp_path)
     asked = machine.at_sample[20] = Asked(machine, "adopt", payload(STRONGER))
@@ -314,6 +332,42 @@ async def test_a_service_that_ends_meanwhile_still_answers(tmp_path: Path) -> No
     await machine.run(2)
     assert isinstance(asked.reply, Future) and asked.reply.done()
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
+
+
+@pytest.mark.parametrize("notices", [True, False])
+async def test_a_model_that_takes_for_ever_does_not_keep_the_service_from_ending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, notices: bool
+) -> None:
+    """Whether its thread looks for the end of the service, or is inside a computation that does not return."""
+    monkeypatch.setattr(adoption, "GRACE_S", 0.2)
+    monkeypatch.setattr(adoption, "NOTICE_S", 20.0 if notices else 0.2)
+    released, at_work = threading.Event(), threading.Event()
+
+    def for_ever(*_: Any, between_samples: Callable[[], None], **__: Any) -> Any:
+        at_work.set()
+        while not released.wait(0.01):
+            if notices:
+                between_samples()
+        raise ServiceError("not reached")
+
+    monkeypatch.setattr(adoption, "warm_up", for_ever)
+    machine = Machine(tmp_path)
+    asked = Asked(machine, "adopt", payload(STRONGER, force=True))
+
+    def ask() -> None:
+        asked()
+        machine.promised.clear()  # simulated time does not wait for it
+
+    machine.at_sample[20] = ask
+    machine.at_sample[22] = lambda: at_work.wait(20.0)
+    try:
+        await machine.run(24)
+        assert at_work.is_set()
+        assert not asked.answer["ok"] and asked.answer["text"] == "the service is ending"
+    finally:
+        released.set()
+    assert machine.store.in_use() == QUILL
+    check_files(machine)
 
 
 async def test_before_the_first_zero_there_is_nothing_to_warm_up(tmp_path: Path) -> None:

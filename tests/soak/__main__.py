@@ -1,4 +1,4 @@
-"""`make soak`: 200 kills of the service and a month of everything that can happen; ends with a table of figures."""
+"""`make soak`: 200 kills of the service, a month of everything that can happen, hostile inputs; a table of figures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 from compensator.audit.series import summary
-from tests.soak import kills, month
+from tests.soak import hostile, kills, month
 
 #: The month writes no faster than the disk syncs; what it shows has nothing to do with that.
 MEMORY = Path("/dev/shm")
@@ -62,11 +62,24 @@ def report_kills(count: int, machines: int, seed: int) -> None:
     row("seconds", f"{max(result.seconds for result in results):.0f}")
 
 
+def report_hostile(count: int, seed: int) -> bool:
+    results = hostile.run(count, seed)
+    print(f"\nhostile inputs, seeds {seed} to {seed + count - 1} (tests/fuzz/hostile.py: attempt(kind, seed, folder))")
+    for result in results:
+        survived = result.tried - len(result.failed)
+        figures = f"tried {result.tried}, survived {survived}, failed {len(result.failed)}"
+        row(result.kind, f"{figures}; slowest {result.slowest_s:.1f} s")
+        for one, why in result.failed.items():
+            print(f"  seed {one}: {why}")
+    return not any(result.failed for result in results)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description="Endurance of the service.")
     parser.add_argument("--kills", type=int, default=200, help="number of kills (default 200)")
     parser.add_argument("--machines", type=int, default=4, help="machines side by side (default 4)")
     parser.add_argument("--days", type=float, default=30.0, help="length of the month (default 30)")
+    parser.add_argument("--hostile", type=int, default=300, help="hostile inputs of each kind (default 300)")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     # What the service says of defects that were put in on purpose would bury the table.
@@ -74,6 +87,8 @@ def main() -> int:
     good = report_month(given.days, given.seed) if given.days else True
     if given.kills:
         report_kills(given.kills, given.machines, given.seed)
+    if given.hostile:
+        good &= report_hostile(given.hostile, given.seed)
     return 0 if good else 1
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 import struct
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from tests.watch.heard import START_NS, estimate, event, offset, sample
 
 pytest.importorskip("foxglove")
 connect = pytest.importorskip("websockets.sync.client").connect
+Refused = pytest.importorskip("websockets.exceptions").InvalidStatus
 
 
 class Viewer:
@@ -112,3 +114,31 @@ def test_every_path_of_the_layout_is_a_field_of_a_message() -> None:
         return {part} if isinstance(part, str) else named(part["first"]) | named(part["second"])
 
     assert named(layout["layout"]) == set(panels)
+
+
+@pytest.mark.parametrize(
+    "origin", ["https://elsewhere.example", "null", "http://127.0.0.1:8765", "https://app.foxglove.dev.evil.example"]
+)
+def test_a_page_of_another_site_cannot_connect(origin: str) -> None:
+    with FoxgloveServer("shop", 0) as server, pytest.raises(Refused, match="403"):
+        connect(f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"], proxy=None, origin=origin)
+
+
+def test_the_viewer_and_a_viewer_of_ones_own_can() -> None:
+    own = "https://viewer.factory.example"
+    with FoxgloveServer("shop", 0, [own]) as server:
+        for origin in (None, "https://app.foxglove.dev", "file://", own):
+            address = f"ws://127.0.0.1:{server.port}"
+            with connect(address, subprotocols=["foxglove.sdk.v1"], proxy=None, origin=origin) as viewer:
+                assert json.loads(viewer.recv(timeout=30))["op"] == "serverInfo"
+
+
+def test_what_is_no_request_does_not_keep_others_out() -> None:
+    with FoxgloveServer("shop", 0) as server:
+        address = ("127.0.0.1", server.port)
+        with socket.create_connection(address) as silent, socket.create_connection(address) as endless:
+            silent.sendall(b"GET")
+            endless.sendall(b"x" * 40_000)
+            with Viewer(server.port) as viewer:
+                server.receive("shop/vmc-07/thermal/y/offset", offset(5))
+                viewer.until_advertised("/vmc-07/offset")

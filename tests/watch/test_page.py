@@ -105,6 +105,8 @@ def test_what_is_not_there_is_not_there(server: PageServer) -> None:
         "/machine.json",
         "/machine.json?prefix=shop/none",
         "/machine.json?prefix=shop%2Fvmc-07&since_s=x",
+        "/machine.json?prefix=shop%2Fvmc-07&since_s=" + "9" * 400,
+        "/machine.json?prefix=shop%2Fvmc-07&since_s=%C2%B2",
         "/../../etc/passwd",
         "/live.js",
     ):

@@ -24,6 +24,8 @@ from compensator.model.effects.seen import Seen
 from compensator.model.effects.signals import RecordSignals, Signals
 from compensator.model.table import TomlTable
 
+#: Largest number of coefficients or time constants of an effect.
+MODES = 64
 #: `step` or `filter` of a block.
 Run = Callable[..., S]
 #: Keys that a diagnosis gives every effect in the model file.
@@ -37,7 +39,7 @@ def number(low: float = -math.inf, high: float = math.inf) -> Any:
 
 def numbers(low: float = -math.inf, high: float = math.inf) -> Any:
     """Return a parameter that the model file holds: a list of numbers between two bounds."""
-    return dataclasses.field(metadata={"read": lambda table, key: table.numbers(key, low, high)})
+    return dataclasses.field(metadata={"read": lambda table, key: table.numbers(key, low, high, most=MODES)})
 
 
 def text(*choices: str) -> Any:

@@ -8,6 +8,7 @@ import msgspec
 
 from compensator.atomic_write import replace_file
 from compensator.errors import DataError
+from compensator.input_file import RESULT_BYTES, read_file
 from compensator.messages import Offset, Probe, Sample
 from compensator.recording.reading import messages, recordings
 
@@ -64,7 +65,7 @@ def read_job(path: Path) -> Job:
         If it is none.
     """
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Job)
+        return msgspec.json.decode(read_file(path, RESULT_BYTES), type=Job)
     except (OSError, msgspec.MsgspecError) as error:
         raise DataError(f"{path}: {error}") from error
 

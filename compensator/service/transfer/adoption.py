@@ -9,11 +9,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -36,8 +38,12 @@ from compensator.service.transfer.turns import give_way
 
 log = logging.getLogger("compensator")
 
+#: How long the end of the service waits for a model that is being prepared, and for its thread to notice the end, s.
+GRACE_S, NOTICE_S = 5.0, 5.0
 #: Longest payload of a command that contains a model, bytes.
 LONGEST_MODEL = 1_000_000
+T = TypeVar("T")
+_ENDING = "the service is ending"
 _ADVICE = "wait, zero the machine at rest, or use --force"
 
 
@@ -145,6 +151,8 @@ class Adoption:
         self._loop = loop
         self._order: _Order | None = None
         self._ended = False
+        #: Set when a model that is being prepared must no longer be stored.
+        self._given_up = threading.Event()
 
     def begin(self, action: str, request: ModelRequest, reply: Future[dict[str, Any]], sender: Sender) -> None:
         """Begin to prepare a model; the reply comes once it is ready or refused. In the loop only."""
@@ -205,17 +213,27 @@ class Adoption:
         return new
 
     async def end(self) -> None:
-        """Wait until a command in progress is answered: a stored model is used at the next start."""
+        """Wait briefly until a command in progress is answered, then refuse it: the service must end.
+
+        A model that was stored is used at the next start.
+        """
         self._ended = True
         await asyncio.sleep(0)  # a command that has just arrived is refused
         order = self._order
-        if order is not None and order.task is not None:
-            await asyncio.gather(order.task, return_exceptions=True)
+        if order is None or order.task is None:
+            return
+        for grace_s in (GRACE_S, NOTICE_S):
+            done, _ = await asyncio.wait({order.task}, timeout=grace_s)
+            if done:
+                return
+            self._given_up.set()
+        order.task.cancel()
+        await asyncio.wait({order.task})
 
     async def _prepare(self, store: ModelStore, order: _Order) -> None:
         """Prepare the model on another thread, then answer; the swap follows at the next sample."""
         running, now_ns = self._running(), self._clock.utc_ns()
-        order.ready = await asyncio.to_thread(self._prepared, store, order, running.model, running.status.zero, now_ns)
+        order.ready = await _in_thread(lambda: self._prepared(store, order, running.model, running.status.zero, now_ns))
         candidate, comparison = order.ready.candidate, order.ready.comparison
         model = candidate.compensation.model
         how = f"warmed up on {candidate.samples} sample(s) of {candidate.minutes / 60.0:.1f} h"
@@ -236,7 +254,8 @@ class Adoption:
 
     def _answer_refusal(self, task: asyncio.Task[None]) -> None:
         """Answer with the reason if a model could not be prepared; the running one remains."""
-        order, error = self._order, None if task.cancelled() else task.exception()
+        order = self._order
+        error = ServiceError(_ENDING) if task.cancelled() else task.exception()
         if order is None or error is None:
             return
         self._order = None
@@ -265,6 +284,7 @@ class Adoption:
         candidate = self._candidate(model, zero, order.request.force)
         comparison = order.comparison = self._compared(running, model, zero)
         refuse_if_worse(comparison, model, force=order.request.force or order.action == CommandName.BACK)
+        self._check_not_given_up()
         if order.action == CommandName.BACK:
             store.back(name=model.name, time_utc_ns=now_ns)
         else:
@@ -274,13 +294,27 @@ class Adoption:
     def _compared(self, running: ThermalModel, model: ThermalModel, zero: Zero | None) -> ComparisonData:
         if zero is None:
             return not_judged(NotJudged.NO_ZERO)
-        return second_opinion(self._recordings, self._config, running, model, between_samples=give_way())
+        return second_opinion(self._recordings, self._config, running, model, between_samples=self._turns())
+
+    def _turns(self) -> Callable[[], None]:
+        """Return what lets the thread of the service run first, and ends the work when the service ends."""
+        pause = give_way()
+
+        def turn() -> None:
+            pause()
+            self._check_not_given_up()
+
+        return turn
+
+    def _check_not_given_up(self) -> None:
+        if self._given_up.is_set():
+            raise ServiceError(_ENDING)
 
     def _candidate(self, model: ThermalModel, zero: Zero | None, force: bool) -> ModelCandidate:
         if zero is None:
             return ModelCandidate(compensation=Compensation(self._config, model))
         try:
-            candidate = warm_up(self._recordings, self._config, model, between_samples=give_way())
+            candidate = warm_up(self._recordings, self._config, model, between_samples=self._turns())
         except DataError as error:
             if not force:
                 raise ServiceError(f"model {model.name}: no warm-up: {error}; {_ADVICE}") from error
@@ -295,6 +329,33 @@ class Adoption:
                 f"{_ADVICE}"
             )
         return candidate
+
+
+async def _in_thread(work: Callable[[], T]) -> T:
+    """Run work on a thread that does not keep the process from ending, as those of `asyncio.to_thread` do."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[T] = loop.create_future()
+
+    def finish(result: T | None, error: BaseException | None) -> None:
+        if done.done():
+            return
+        if error is not None:
+            done.set_exception(error)
+        else:
+            done.set_result(result)  # type: ignore[arg-type]
+
+    def run() -> None:
+        result: T | None = None
+        error: BaseException | None = None
+        try:
+            result = work()
+        except Exception as raised:  # noqa: BLE001  the task that waits raises it
+            error = raised
+        with suppress(RuntimeError):  # the loop is closed: the work was given up
+            loop.call_soon_threadsafe(finish, result, error)
+
+    threading.Thread(target=run, name="prepares a model", daemon=True).start()
+    return await done
 
 
 def _model_file(store: ModelStore, order: _Order) -> bytes:

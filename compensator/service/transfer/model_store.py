@@ -16,6 +16,7 @@ from msgspec import UNSET, UnsetType
 from compensator.atomic_write import replace_file
 from compensator.config import Config
 from compensator.errors import CompensatorError, ModelError, ServiceError
+from compensator.input_file import MODEL_BYTES, RESULT_BYTES, read_file
 from compensator.model.model_file import parse_model
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation
@@ -91,7 +92,7 @@ class ModelStore:
             raise ServiceError(f"adopted model: sha256 = {sha256[:70]!r}, expected 64 hexadecimal digits")
         path = self.folder / f"{sha256}.toml"
         try:
-            data = path.read_bytes()
+            data = read_file(path, MODEL_BYTES)
         except OSError as error:
             raise ServiceError(f"{path}: {error.strerror or error}; expected an adopted model") from error
         if sha256_of(data) != sha256:
@@ -123,7 +124,7 @@ class ModelStore:
     def _read(self) -> _Contents:
         path = self.folder / _FILE
         try:
-            contents = msgspec.json.decode(path.read_bytes(), type=_Contents)
+            contents = msgspec.json.decode(read_file(path, RESULT_BYTES), type=_Contents)
         except FileNotFoundError:
             return _Contents(configured_sha256=self._configured_sha256)
         except OSError as error:

@@ -1,0 +1,245 @@
+"""Hostile inputs, each from a kind and a seed alone: payloads, configurations, models, tables, files that are none.
+
+`attempt(kind, seed, folder)` tries one and raises AssertionError, with what was wrong, where it was not survived:
+survived is a result or a refusal of one line, in time, with an exit code that says so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import random
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from compensator.cli import main
+from compensator.config import Config, parse_config
+from compensator.errors import CompensatorError
+from compensator.model.model_file import parse_model, read_model_bytes
+from compensator.service.transfer.model_store import check_model
+from tests.audit.made import CONFIG
+from tests.fuzz.attacked_receiver import Attack
+from tests.fuzz.mutation import mutated
+from tests.fuzz.payloads import number
+
+#: No input may take longer, s, on a busy computer either.
+PATIENCE_S = 30.0
+QUILL = read_model_bytes("quill")
+TABLE = b"t_s,t_q_degc,at_degc,y_um,heat_w\n" + b"".join(
+    f"{60 * i},{20 + 0.01 * i:.2f},20.1,{0.02 * i:.3f},{30 if i > 20 else 0}\n".encode() for i in range(150)
+)
+#: Numbers that TOML can hold and no machine has.
+_NUMBERS = (
+    "inf",
+    "-inf",
+    "nan",
+    "1e308",
+    "-1e308",
+    "5e-324",
+    "0.0",
+    "-0.0",
+    "-1.0",
+    "1e30",
+    "0",
+    "9" * 400,
+    "9" * 5000,
+)
+_TEXTS = (
+    '""',
+    '"\\u0000"',
+    '"a\\u0000b"',
+    '"../../../../etc/passwd"',
+    '"/dev/zero"',
+    '"\\n"',
+    '"%s"',
+    '"' + "x" * 9000 + '"',
+)
+_VALUE = re.compile(rb"= *([^\n,\]}]+)")
+
+
+def changed(rng: random.Random, text: bytes) -> bytes:
+    """Return a TOML file with one to three of its values replaced by what no engineer writes, or corrupted."""
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        places = list(_VALUE.finditer(text))
+        place = rng.choice(places)
+        way = rng.randrange(8)
+        if way < 3:
+            new = rng.choice(_NUMBERS)
+        elif way == 3:
+            new = number(rng)
+        elif way == 4:
+            new = rng.choice(_TEXTS)
+        elif way == 5:
+            new = "[" + ", ".join([rng.choice(("1.0", "inf", '"a"', "[]"))] * int(10 ** rng.uniform(0, 4.5))) + "]"
+        elif way == 6:
+            new = rng.choice(("[", "{a = ")) * int(10 ** rng.uniform(0, 4.5))
+        else:
+            new = "1\n" + ".".join(["k"] * int(10 ** rng.uniform(0, 4.7))) + " = 1"
+        text = text[: place.start(1)] + new.encode() + text[place.end(1) :]
+    return mutated(rng.randrange(2**32), text) if rng.randrange(5) == 0 else text
+
+
+def one_line(work: Callable[[], Any]) -> Any:
+    """Return the result of some work, None where it is refused in one line."""
+    try:
+        return work()
+    except CompensatorError as error:
+        assert "\n" not in str(error) and len(str(error)) < 2000, str(error)[:3000]
+    return None
+
+
+def configuration(rng: random.Random, folder: Path) -> None:
+    """A configuration is refused, or every limit in it is finite and the service can begin with it."""
+    data = changed(rng, CONFIG)
+    config = one_line(lambda: parse_config(data, source="machine.toml"))
+    if config is None:
+        return
+    limits = config.limits
+    assert 0.0 < limits.offset_max_um <= 5000.0 and 0.0 < limits.offset_rate_max_um_per_min <= 1000.0
+    one_line(lambda: check_model(config, QUILL, source="quill"))
+    (folder / "machine.toml").write_bytes(data)
+    command(folder, "check", "--config", "machine.toml")
+
+
+def model(rng: random.Random, folder: Path) -> None:
+    """A model is refused, or a service can run it."""
+    data = changed(rng, QUILL)
+    if one_line(lambda: parse_model(data, source="model.toml")) is not None:
+        one_line(lambda: check_model(_CONFIG, data, source="model.toml"))
+    (folder / "model.toml").write_bytes(data)
+    (folder / "table.csv").write_bytes(TABLE)
+    command(folder, "simulate", "table.csv", "--model", "model.toml", "--out", "out.csv")
+
+
+def table(rng: random.Random, folder: Path) -> None:
+    """A table gives a result or is refused."""
+    data = mutated(rng.randrange(2**32), TABLE)
+    way = rng.randrange(4)
+    if way == 0:
+        columns = int(10 ** rng.uniform(0, 5.3))
+        data = data.replace(b"heat_w\n", b",".join(b"c%d" % i for i in range(columns)) + b"\n")
+    elif way == 1:
+        line = data.rpartition(b"\n")[0].rpartition(b"\n")[2] + b"\n"
+        data += line * int(10 ** rng.uniform(0, 4))
+    elif way == 2:
+        data = data.replace(b"20.1", rng.choice(_NUMBERS).encode(), rng.choice((1, -1)))
+    (folder / "table.csv").write_bytes(data)
+    command(folder, "simulate", "table.csv", "--model", "quill", "--out", "out.csv")
+
+
+def no_file(rng: random.Random, folder: Path) -> None:
+    """What is no regular file of a sensible size is refused wherever a file is named."""
+    path = folder / ("it" + rng.choice(("", ".toml", ".csv", ".mcap", ".mat", ".json5", ".pem")))
+    way = rng.randrange(7)
+    if way == 0:
+        os.mkfifo(path)
+    elif way == 1:
+        path.symlink_to(rng.choice(("/dev/zero", "/dev/urandom", "/dev/full", "/dev/null", "/proc/self/mem")))
+    elif way == 2:
+        path.symlink_to(path.name)
+    elif way == 3:
+        path.mkdir()
+    elif way == 4:
+        with path.open("wb") as file:
+            file.truncate(int(10 ** rng.uniform(8.5, 11)))
+    elif way == 5:
+        path.write_bytes(b"x" * rng.choice((0, 1, 1_000_001)))
+    else:
+        path.symlink_to("nowhere")
+    (folder / "table.csv").write_bytes(TABLE)
+    (folder / "c.toml").write_bytes(CONFIG.replace(b'file = "quill"', b'file = "./' + path.name.encode() + b'"'))
+    command(
+        folder,
+        *rng.choice(
+            (
+                ("check", "--config", path.name),
+                ("check", "--config", "c.toml"),
+                ("simulate", "table.csv", "--model", path.name, "--out", "out.csv"),
+                ("simulate", path.name, "--model", "quill", "--out", "out.csv"),
+                ("identify", "table.csv", path.name, "--out", "out.toml"),
+                ("export", path.name, "--out", "out.csv"),
+                ("replay", path.name),
+                ("replay", "table.csv", "--public-key", path.name),
+                ("watch", "--once", "--zenoh", path.name),
+                ("bridge", "opcua", "--check", "--config", path.name),
+                ("bridge", "probes", "--check", "--config", path.name),
+                ("router", "--config", path.name),
+            )
+        ),
+    )
+
+
+def payloads(rng: random.Random, folder: Path) -> None:
+    """A receiver survives what is published, and follows the service again."""
+    Attack(rng, folder, check_clock=rng.random() < 0.5).run(20)
+
+
+KINDS: dict[str, Callable[[random.Random, Path], None]] = {
+    "payloads to a receiver": payloads,
+    "configurations": configuration,
+    "models": model,
+    "tables": table,
+    "files that are none": no_file,
+}
+
+
+def attempt(kind: str, seed: int, folder: Path) -> None:
+    """Try the input of a kind and a seed.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    seed : int
+        Makes the input; the same seed makes the same one.
+    folder : pathlib.Path
+        An empty folder.
+    """
+    began = time.monotonic()
+    with alarm(PATIENCE_S):
+        KINDS[kind](random.Random(seed), folder)
+    assert time.monotonic() - began < PATIENCE_S, f"took {time.monotonic() - began:.0f} s"
+
+
+def command(folder: Path, *arguments: str) -> None:
+    """Run a command in a folder, as its user does."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main(list(arguments))
+        except SystemExit as ended:
+            code = ended.code if isinstance(ended.code, int) else 1
+    said = err.getvalue()
+    assert code in (0, 1, 2, 3), (arguments, code)
+    assert "Traceback" not in said, said[-3000:]
+    if code in (1, 2):
+        last = said.rpartition("compensator: ")[2]
+        assert last.strip().count("\n") == 0 and len(last) < 2000, (arguments, said[-3000:])
+
+
+@contextlib.contextmanager
+def alarm(seconds: float) -> Iterator[None]:
+    """Raise TimeoutError where something does not come back; in the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ring(*_: object) -> None:
+        raise TimeoutError(f"not back after {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+_CONFIG: Config = parse_config(CONFIG, source="made")
