@@ -473,6 +473,11 @@ class DataRemark(Code):
         "Rows of the table were out of order and have been sorted by time.",
         "Find out why the logger wrote them in this order: a clock that was set, or joined files.",
     )
+    TIMES_EQUAL = (
+        "times_equal",
+        "Rows of the table have the time of another row; they are averaged like all rows of a sample.",
+        "Find out why the logger wrote a time twice: joined files, a clock that stood still, or too few digits.",
+    )
     GAP_BRIDGED = (
         "gap_bridged",
         "Samples are missing; the gap is short compared with the machine's time constants and is interpolated.",
@@ -487,6 +492,11 @@ class DataRemark(Code):
         "temperature_missing",
         "T_Q or AT is missing for too long to interpolate: the gap is not fitted, and predictions are less certain.",
         "Check the sensor and the logger.",
+    )
+    TEMPERATURE_SPARSE = (
+        "temperature_sparse",
+        "T_Q or AT is empty in many rows; a sample is the mean of the others, or interpolated between its neighbours.",
+        "Check the sensor and the logger; a column that is logged less often than the others is in order.",
     )
     FEATURES_LEFT_OUT = (
         "features_left_out",

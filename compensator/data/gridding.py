@@ -17,6 +17,8 @@ from compensator.errors import DataError
 MOST_SAMPLES = 6_000_000
 #: Number of stretches that a remark lists.
 _SHOWN = 3
+#: Share of rows without a temperature, outside long gaps, from which it is remarked on.
+_SPARSE = 0.1
 
 
 def to_grid(table: Table, period_s: float) -> SampledData:
@@ -45,6 +47,14 @@ def to_grid(table: Table, period_s: float) -> SampledData:
             Remark(DataRemark.ROWS_SORTED, f"{table.name}: row {row}: {count} row(s) out of order; sorted by time.")
         )
     t_s = t_s[order] - t_s.min()
+    again = np.diff(t_s) == 0
+    if again.any():
+        row, count = table.rows[int(order[int(np.argmax(again)) + 1])], int(np.sum(again))
+        remarks.append(
+            Remark(
+                DataRemark.TIMES_EQUAL, f"{table.name}: row {row}: {count} row(s) with the time of another; averaged."
+            )
+        )
     slot = (
         np.round(t_s / period_s).astype(int)
         if _spacing(t_s) >= period_s
@@ -66,6 +76,7 @@ def to_grid(table: Table, period_s: float) -> SampledData:
             start = last
     records.append((start, n))
     remarks += _missing_inputs(table.name, columns, records, period_s)
+    remarks += _sparse_inputs(table, slot, order, columns)
     return SampledData(
         records=tuple(
             SampledRecord(
@@ -91,6 +102,18 @@ def _missing_inputs(
             more = f" and {len(long) - _SHOWN} more" if len(long) > _SHOWN else ""
             words = f"{name}: {column} is missing for {hours:.1f} h from t_s = {where}{more}; not interpolated."
             yield Remark(DataRemark.TEMPERATURE_MISSING, words)
+
+
+def _sparse_inputs(table: Table, slot: Indices, order: Indices, columns: Mapping[str, Vector]) -> Iterator[Remark]:
+    """Yield a remark on each temperature that is missing in many rows, long gaps apart."""
+    for column in [c for c in ("t_q_degc", "at_degc") if c in columns]:
+        in_long_gap = np.zeros(columns[column].size, dtype=bool)
+        for first, last in _gaps(~np.isnan(columns[column])):
+            in_long_gap[first:last] = last - first > SHORT_GAP_SAMPLES
+        empty = np.isnan(table.columns[column][order])[~in_long_gap[slot]]
+        if empty.size and np.mean(empty) > _SPARSE:
+            words = f"{table.name}: {column} is empty in {100.0 * np.mean(empty):.0f} % of the rows."
+            yield Remark(DataRemark.TEMPERATURE_SPARSE, words)
 
 
 def _check_size(table: Table, period_s: float) -> None:
