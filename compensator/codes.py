@@ -792,8 +792,13 @@ class AuditRemark(Code):
     )
     UNSIGNED_BEHIND = (
         "unsigned_behind",
-        "The last signature of the file does not cover the records after it.",
+        "The last signature of the newest file does not cover the records after it; the next one is not due yet.",
         "Audit it again once the file is finished or the next one exists.",
+    )
+    OUTSIDE_CHAIN = (
+        "outside_chain",
+        "Bytes that carry no records differ from what the recorder writes; no record is affected.",
+        "Find out which program has written the file again.",
     )
     BEGINS_NEW_CHAIN = (
         "begins_new_chain",
@@ -878,7 +883,12 @@ class AuditFinding(Code):
         "Check disk and copy; use a copy from a backup.",
     )
     MISSING_FILE = "missing_file", "A recording between two others is missing.", "Add it, and audit again."
-    UNSIGNED = "unsigned", "A required signature is missing.", "Check [recording] signing_key of the machine."
+    UNSIGNED = (
+        "unsigned",
+        "Records are not covered by a valid signature: the service had no key, it was killed and had no head of the "
+        "chain, or somebody has removed the signatures.",
+        "Compare with the events and with a copy from a backup; check [recording] signing_key and head of the machine.",
+    )
     FALSE_SIGNATURE = (
         "false_signature",
         "A signature was not made with the given key.",
