@@ -792,7 +792,7 @@ class AuditRemark(Code):
     )
     UNSIGNED_BEHIND = (
         "unsigned_behind",
-        "The last signature of the newest file does not cover the records after it; the next one is not due yet.",
+        "Records follow the last valid signature of the newest file, or a false signature follows them.",
         "Audit it again once the file is finished or the next one exists.",
     )
     OUTSIDE_CHAIN = (

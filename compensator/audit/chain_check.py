@@ -326,8 +326,8 @@ class ChainCheck:
             return
         result.signed += 1
         result.keys.add(seal.public_key)
-        result.sealed_signed = self._verifier is None or self._verifier.holds(seal)
-        if not result.sealed_signed:
+        result.sealed_signed = True
+        if self._verifier is not None and not self._verifier.holds(seal):
             result.find(Fault.FALSE_SIGNATURE, record)
             self._add_unsigned(record.topic, record.log_time_ns)
         elif (seal.sha256, seal.sequence) == (before.hex(), record.sequence - 1):

@@ -45,8 +45,8 @@ class RecordingAudit:
     keys : set of str
         Public keys in the seals.
     seal, sealed_signed : str, bool
-        Reason of the seal that is the last record, empty if there is none, and whether it has a signature that holds,
-        or that was not checked.
+        Reason of the seal that is the last record, empty if there is none, and whether it has a signature, valid or
+        not.
     period_s : float
         Sample period, s; 0 if its samples could not be replayed.
     samples, skipped : int

@@ -205,7 +205,7 @@ def combine(
     """
     # By the names at their creation, which show the order even if the clock was set back.
     files = sorted(map(_named, audits), key=lambda f: (f.machine, f.original.removesuffix(".mcap")))
-    series = _Series(files, signed)
+    series = _Series(files, signed, newest)
     for before, after in zip([None, *files[:-1]], files, strict=True):
         series.check_file(after)
         series.check_link(before if before is not None and before.machine == after.machine else None, after)
@@ -236,12 +236,12 @@ def _started(original: str) -> str:
 class _Series:
     """Checks files one after the other, and the links between them."""
 
-    def __init__(self, files: Sequence[RecordingAudit], signed: bool) -> None:
+    def __init__(self, files: Sequence[RecordingAudit], signed: bool, newest: str) -> None:
         self._names = {file.original: file for file in files}
         self._removed = {name for file in files for name in file.removed}
         self._newest = {file.machine: file.file for file in files}
-        #: Only the file that was started last may still be without its next seal.
-        self._live = max(files, key=lambda file: _started(file.original)).file if files else ""
+        #: Only the file that was started last may still be without its next seal; a head states which one that is.
+        self._live = newest or (max(files, key=lambda file: _started(file.original)).file if files else "")
         self._signed = signed
         #: Findings of whole files; they come before those within a file.
         self.own = {file.file: RecordingAudit(file=file.file) for file in files}
@@ -294,11 +294,12 @@ class _Series:
             if not file.unsigned_behind:
                 return
             records, samples, minutes = file.unsigned_behind, file.unsigned_samples, file.unsigned_min
-            if name != self._live or not file.may_be_live:
+            # A false signature at the end is a finding of its own.
+            if not file.sealed_signed and (name != self._live or not file.may_be_live):
                 self._find(Fault.NOT_SIGNED, file, records=records, samples=samples, minutes=minutes)
                 return
             figures = f"{records} record(s) after the last signature: {samples} sample(s), {minutes:.0f} min"
-            remark(Remark(AuditRemark.UNSIGNED_BEHIND, f"{name}: {figures}; nothing proves them yet."))
+            remark(Remark(AuditRemark.UNSIGNED_BEHIND, f"{name}: {figures}; no signature proves them."))
         elif file.signed:
             keys = ", ".join(key[:16] for key in sorted(file.keys))
             remark(

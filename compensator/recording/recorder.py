@@ -244,7 +244,7 @@ class McapRecorder:
         except OSError as error:
             why = error.strerror or type(error).__name__
             if why != self._unkept:  # a failing disk is tried again with every sample
-                text = f"the head of the chain is not kept, so after a kill the end would not be signed: {self._keeper.path}: {why}"
+                text = f"{self._keeper.path}: {why}; the end that a kill leaves would not be signed"
                 self._finisher.remark(text, RecordingData(code=RecordingCode.HEAD_NOT_KEPT))
             self._unkept = why
 
