@@ -1,13 +1,17 @@
-"""`make soak`: 200 kills of the service and a month of everything that can happen; ends with a table of figures."""
+"""`make soak`: 200 kills, a month of everything that can happen, 300 forgeries; ends with tables of figures."""
 
 from __future__ import annotations
 
 import argparse
 import logging
+import shutil
 import tempfile
+import time
+from collections import Counter
 from pathlib import Path
 
 from compensator.audit.series import summary
+from tests.fuzz import forgery
 from tests.soak import kills, month
 
 #: The month writes no faster than the disk syncs; what it shows has nothing to do with that.
@@ -62,11 +66,41 @@ def report_kills(count: int, machines: int, seed: int) -> None:
     row("seconds", f"{max(result.seconds for result in results):.0f}")
 
 
+def report_forgeries(count: int, seed: int) -> bool:
+    kinds, found = Counter[str](), Counter[str]()
+    wrong = []
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as place:
+        folder = Path(place)
+        (folder / "originals").mkdir()
+        originals = forgery.Originals(folder / "originals")
+        for number in range(seed, seed + count):
+            one = folder / str(number)
+            one.mkdir()
+            tried = forgery.attacked(originals, one, number)
+            shutil.rmtree(one)
+            kinds[tried.kind] += 1
+            found[tried.kind] += tried.found
+            if tried.deceived:
+                wrong.append(f"seed {number}: {tried.kind}: {tried.deceived}")
+    print(
+        f"\nforged recordings, seeds {seed} to {seed + count - 1}, each audited with the key, the head, after a restart"
+    )
+    for kind in sorted(kinds):
+        row(f"{kind}: tried, all three audits found it", f"{kinds[kind]}, {found[kind]}")
+    row("audits that believed a changed record which was signed", len(wrong))
+    for line in wrong:
+        print(f"  {line}")
+    row("seconds", f"{time.monotonic() - began:.0f}")
+    return not wrong
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description="Endurance of the service.")
     parser.add_argument("--kills", type=int, default=200, help="number of kills (default 200)")
     parser.add_argument("--machines", type=int, default=4, help="machines side by side (default 4)")
     parser.add_argument("--days", type=float, default=30.0, help="length of the month (default 30)")
+    parser.add_argument("--forgeries", type=int, default=300, help="number of forged recordings (default 300)")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     # What the service says of defects that were put in on purpose would bury the table.
@@ -74,6 +108,8 @@ def main() -> int:
     good = report_month(given.days, given.seed) if given.days else True
     if given.kills:
         report_kills(given.kills, given.machines, given.seed)
+    if given.forgeries:
+        good = report_forgeries(given.forgeries, given.seed) and good
     return 0 if good else 1
 
 
