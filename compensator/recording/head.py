@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 
 from compensator.atomic_write import replace_file
-from compensator.errors import UsageError
+from compensator.errors import DataError, UsageError
 from compensator.recording.reading import last_value, recordings, values_of
 from compensator.recording.signature import Signer, Verifier
 
@@ -206,11 +206,6 @@ def previous_end(folder: Path, machine: str, keeper: HeadKeeper | None) -> Previ
         Name of the machine.
     keeper : HeadKeeper, optional
         The head.
-
-    Raises
-    ------
-    DataError
-        If there is no head and the newest recording is not an MCAP file.
     """
     there = recordings(folder, machine)
     newest = there[-1] if there else None
@@ -221,9 +216,7 @@ def previous_end(folder: Path, machine: str, keeper: HeadKeeper | None) -> Previ
                 continue
             return Previous(end.file, bytes.fromhex(end.synced), "is missing")
         if newest is not None and newest.name != end.file:
-            return Previous(
-                newest.name, last_value(newest), f"is newer than {end.file}, the last recording of the head"
-            )
+            return Previous(newest.name, _value(newest), f"is newer than {end.file}, the last recording of the head")
         values = values_of(path)
         if not values:
             if not end.synced:
@@ -235,4 +228,12 @@ def previous_end(folder: Path, machine: str, keeper: HeadKeeper | None) -> Previ
         if bytes.fromhex(end.synced) in values:
             return Previous(end.file, last, "goes on after the head")
         return Previous(end.file, bytes.fromhex(end.synced), "does not contain the head: it was cut off or rewritten")
-    return Previous(newest.name, last_value(newest)) if newest is not None else Previous("", b"")
+    return Previous(newest.name, _value(newest)) if newest is not None else Previous("", b"")
+
+
+def _value(path: Path) -> bytes:
+    """Return the last value of a recording; empty if it is none, which an audit reports and no start depends on."""
+    try:
+        return last_value(path)
+    except DataError:
+        return b""

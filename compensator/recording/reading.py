@@ -340,9 +340,15 @@ def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> 
 
 
 def last_sequence(folder: Path, machine: str) -> int:
-    """Return the highest recorded sequence number; −1 if there is none."""
+    """Return the highest recorded sequence number; −1 if there is none.
+
+    A file that cannot be read does not keep a service from starting: `first_sequence` does not depend on it.
+    """
     for path in reversed(recordings(folder, machine)):
-        highest = max((message.seq for message in messages(path, ("sample", "offset"))), default=-1)
+        highest = -1
+        with suppress(DataError):
+            for message in messages(path, ("sample", "offset")):
+                highest = max(highest, message.seq)
         if highest >= 0:
             return highest
     return -1

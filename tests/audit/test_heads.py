@@ -14,7 +14,7 @@ from compensator.audit.series import Audit, audit, summary
 from compensator.config import load_config
 from compensator.errors import ConfigError, UsageError
 from compensator.recording.head import LONGEST, read_head
-from compensator.recording.reading import recordings
+from compensator.recording.reading import first_sequence, recordings
 from compensator.recording.signature import Signer, Verifier
 from compensator.service.loading import head_file
 from tests.audit.attacks import edited_offset, rechained, rechained_all, unsigned_seals, without_seals
@@ -275,6 +275,17 @@ def test_a_head_that_cannot_be_written_stops_no_recording(shop: Shop, tmp_path: 
     assert remarks_of(service) == ["head_not_kept"]
     service.run(5).stop()
     assert shop.audit().clean
+
+
+@pytest.mark.parametrize("data", [b"no recording", bytes(3000)])
+def test_rubbish_under_the_newest_name_stops_no_recording(shop: Shop, data: bytes) -> None:
+    shop.start().run(5).stop()
+    (shop.rec / "vmc-07_20991231T000000Z.mcap").write_bytes(data)
+    assert first_sequence(shop.rec, MACHINE, 0, 60.0) == 5
+    service = shop.start(5).run(5)
+    assert "not_as_written" in remarks_of(service)
+    service.stop()
+    assert len(shop.files) == 3
 
 
 def test_a_head_needs_the_key(shop: Shop) -> None:
