@@ -1,18 +1,14 @@
-"""`make soak`: 200 kills, a month of everything that can happen, 300 forgeries; ends with tables of figures."""
+"""`make soak`: 200 kills of the service and a month of everything that can happen; ends with a table of figures."""
 
 from __future__ import annotations
 
 import argparse
 import logging
-import shutil
 import tempfile
-import time
-from collections import Counter
 from pathlib import Path
 
 from compensator.audit.series import summary
-from tests.fuzz import forgery
-from tests.soak import kills, month
+from tests.soak import forgeries, kills, month
 
 #: The month writes no faster than the disk syncs; what it shows has nothing to do with that.
 MEMORY = Path("/dev/shm")
@@ -66,35 +62,6 @@ def report_kills(count: int, machines: int, seed: int) -> None:
     row("seconds", f"{max(result.seconds for result in results):.0f}")
 
 
-def report_forgeries(count: int, seed: int) -> bool:
-    kinds, found = Counter[str](), Counter[str]()
-    wrong = []
-    began = time.monotonic()
-    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as place:
-        folder = Path(place)
-        (folder / "originals").mkdir()
-        originals = forgery.Originals(folder / "originals")
-        for number in range(seed, seed + count):
-            one = folder / str(number)
-            one.mkdir()
-            tried = forgery.attacked(originals, one, number)
-            shutil.rmtree(one)
-            kinds[tried.kind] += 1
-            found[tried.kind] += tried.found
-            if tried.deceived:
-                wrong.append(f"seed {number}: {tried.kind}: {tried.deceived}")
-    print(
-        f"\nforged recordings, seeds {seed} to {seed + count - 1}, each audited with the key, the head, after a restart"
-    )
-    for kind in sorted(kinds):
-        row(f"{kind}: tried, all three audits found it", f"{kinds[kind]}, {found[kind]}")
-    row("audits that believed a changed record which was signed", len(wrong))
-    for line in wrong:
-        print(f"  {line}")
-    row("seconds", f"{time.monotonic() - began:.0f}")
-    return not wrong
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description="Endurance of the service.")
     parser.add_argument("--kills", type=int, default=200, help="number of kills (default 200)")
@@ -109,7 +76,7 @@ def main() -> int:
     if given.kills:
         report_kills(given.kills, given.machines, given.seed)
     if given.forgeries:
-        good = report_forgeries(given.forgeries, given.seed) and good
+        good = forgeries.report(given.forgeries, given.seed) and good
     return 0 if good else 1
 
 
