@@ -478,6 +478,11 @@ class DataRemark(Code):
         "Rows of the table were out of order and have been sorted by time.",
         "Find out why the logger wrote them in this order: a clock that was set, or joined files.",
     )
+    TIMES_EQUAL = (
+        "times_equal",
+        "Rows of the table have the time of another row; they are averaged like all rows of a sample.",
+        "Find out why the logger wrote a time twice: joined files, a clock that stood still, or too few digits.",
+    )
     GAP_BRIDGED = (
         "gap_bridged",
         "Samples are missing; the gap is short compared with the machine's time constants and is interpolated.",
@@ -492,6 +497,11 @@ class DataRemark(Code):
         "temperature_missing",
         "T_Q or AT is missing for too long to interpolate: the gap is not fitted, and predictions are less certain.",
         "Check the sensor and the logger.",
+    )
+    TEMPERATURE_SPARSE = (
+        "temperature_sparse",
+        "T_Q or AT is empty in many rows; a sample is the mean of the others, or interpolated between its neighbours.",
+        "Check the sensor and the logger; a column that is logged less often than the others is in order.",
     )
     FEATURES_LEFT_OUT = (
         "features_left_out",
@@ -787,8 +797,13 @@ class AuditRemark(Code):
     )
     UNSIGNED_BEHIND = (
         "unsigned_behind",
-        "The last signature of the file does not cover the records after it.",
+        "Records follow the last valid signature of the newest file, or a false signature follows them.",
         "Audit it again once the file is finished or the next one exists.",
+    )
+    OUTSIDE_CHAIN = (
+        "outside_chain",
+        "Bytes that carry no records differ from what the recorder writes; no record is affected.",
+        "Find out which program has written the file again.",
     )
     BEGINS_NEW_CHAIN = (
         "begins_new_chain",
@@ -873,7 +888,12 @@ class AuditFinding(Code):
         "Check disk and copy; use a copy from a backup.",
     )
     MISSING_FILE = "missing_file", "A recording between two others is missing.", "Add it, and audit again."
-    UNSIGNED = "unsigned", "A required signature is missing.", "Check [recording] signing_key of the machine."
+    UNSIGNED = (
+        "unsigned",
+        "Records are not covered by a valid signature: the service had no key, it was killed and had no head of the "
+        "chain, or somebody has removed the signatures.",
+        "Compare with the events and with a copy from a backup; check [recording] signing_key and head of the machine.",
+    )
     FALSE_SIGNATURE = (
         "false_signature",
         "A signature was not made with the given key.",

@@ -255,13 +255,15 @@ class Recording(_Table, frozen=True, kw_only=True):
 
     `keep_days`, `keep_mb`: finished files beyond that age, or beyond that size of all of them, are removed, the oldest
     first; by default everything is kept. `signing_key`: Ed25519 private key, PEM, that signs the seals; it must be
-    outside the folder.
+    outside the folder. `head`: file for the head of the chain, outside the folder, too; by default `MACHINE.head.json`
+    beside the folder. It is kept if there is a key.
     """
 
     folder: Text
     keep_days: Amount | None = None
     keep_mb: Amount | None = None
     signing_key: str | None = None
+    head: str | None = None
 
 
 class Config(_Table, frozen=True, kw_only=True):

@@ -323,6 +323,8 @@ class RecordingCode(StrEnum):
     NOT_COMPACTED = "not_compacted"
     NOT_REMOVED = "not_removed"
     NOT_FINISHED = "not_finished"
+    NOT_AS_WRITTEN = "not_as_written"
+    HEAD_NOT_KEPT = "head_not_kept"
 
 
 class RecordingData(_Data, frozen=True, kw_only=True):

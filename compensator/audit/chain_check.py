@@ -49,10 +49,21 @@ class ChainCheck:
         Result to which records, seals and findings are added.
     verifier : Verifier, optional
         Public key of the machine.
+    heads : frozenset of str
+        Values that the signed head of the machine states for this file, hexadecimal.
     """
 
-    def __init__(self, contents: Contents, result: RecordingAudit, verifier: Verifier | None) -> None:
+    def __init__(
+        self,
+        contents: Contents,
+        result: RecordingAudit,
+        verifier: Verifier | None,
+        heads: frozenset[str] = frozenset(),
+    ) -> None:
         self._contents, self._result, self._verifier = contents, result, verifier
+        self._heads = frozenset(map(bytes.fromhex, heads))
+        #: Time of the last valid signature or of the start of the file, and whether the next record must be a seal.
+        self._signed_ns, self._due, self._due_ns = 0, False, 0
         #: Value at the last record, and before a seal of a torn end that was finished afterwards.
         self.head = b""
         self._before_last = b""
@@ -76,7 +87,9 @@ class ChainCheck:
         """
         _, sequence, time_ns, body = message
         if not self.head:
+            self._signed_ns = time_ns
             self._open(message)
+            self._compare_head(self.head)
             if not records:
                 self._next = sequence + 1
                 return
@@ -93,8 +106,9 @@ class ChainCheck:
                 self._seal(before, RawRecord(topic, its_number, its_time, its_body))
             else:
                 result.seal, result.sealed_signed = "", False
-                result.unsigned_behind += 1
+                self._add_unsigned(topic, its_time)
         result.records += len(records)
+        self._compare_head(value)
         expected = (
             f'{{"schema":{SCHEMA},"machine":{self._machine},"time_utc_ns":{time_ns},"before":"{self.head.hex()}",'
             f'"parts":[],"records":[{",".join(entries)}]}}'
@@ -111,8 +125,9 @@ class ChainCheck:
         for record in records:
             self.head = chain.link(self.head, record.topic, record.body)
             result.seal, result.sealed_signed = "", False
+            self._add_unsigned(record.topic, record.log_time_ns)
+            self._compare_head(self.head)
         result.records += len(records)
-        result.unsigned_behind += len(records)
 
     def finish(self) -> None:
         """Add the results that are known only at the end."""
@@ -305,16 +320,43 @@ class ChainCheck:
         result.seal = "" if seal.reason == "hour" else seal.reason
         if (seal.sha256, seal.sequence) != (before.hex(), record.sequence - 1):
             result.find(Fault.SEAL_CHANGED, record)
-        result.sealed_signed = bool(seal.signature)
         if not seal.signature:
-            result.unsigned_behind += 1
+            result.sealed_signed = False
+            self._add_unsigned(record.topic, record.log_time_ns)
             return
         result.signed += 1
         result.keys.add(seal.public_key)
+        result.sealed_signed = True
         if self._verifier is not None and not self._verifier.holds(seal):
             result.find(Fault.FALSE_SIGNATURE, record)
-        else:
-            result.unsigned_behind = 0
+            self._add_unsigned(record.topic, record.log_time_ns)
+        elif (seal.sha256, seal.sequence) == (before.hex(), record.sequence - 1):
+            self._covered(record.log_time_ns)
+
+    def _add_unsigned(self, topic: str, time_ns: int) -> None:
+        """Count a record that no signature covers yet."""
+        result = self._result
+        result.unsigned_behind += 1
+        result.unsigned_samples += topic == "sample"
+        age_ns = abs(time_ns - self._signed_ns)
+        result.unsigned_min = age_ns / 60e9
+        # The recorder writes a seal in the same group of bytes as the first records for which one is due.
+        result.overdue = result.overdue or (self._due and time_ns != self._due_ns)
+        if age_ns >= chain.SEAL_EVERY_NS and not self._due:
+            self._due, self._due_ns = True, time_ns
+
+    def _covered(self, time_ns: int) -> None:
+        """Note that everything up to here is signed."""
+        result = self._result
+        result.unsigned_behind = result.unsigned_samples = 0
+        result.unsigned_min, result.overdue = 0.0, False
+        self._signed_ns, self._due = time_ns, False
+
+    def _compare_head(self, value: bytes) -> None:
+        """Note whether the machine's head states this value: then it covers everything up to here."""
+        if value in self._heads:
+            self._result.at_head = True
+            self._covered(self._signed_ns)
 
 
 def _numbers(first: int, last: int) -> str:

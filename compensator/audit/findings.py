@@ -64,9 +64,17 @@ class Fault(Enum):
     INDEX = AuditFinding.INDEX, "{what}"
     # Several files.
     RENAMED = AuditFinding.REORDERED, "it has the name of another file: it was created as {original}"
-    END_UNSIGNED = AuditFinding.UNSIGNED, "its end is not signed"
+    NOT_SIGNED = (
+        AuditFinding.UNSIGNED,
+        "no valid signature covers the last {records} record(s): {samples} sample(s), {minutes:.0f} min",
+    )
     NOTHING_SIGNED = AuditFinding.UNSIGNED, "has no hash chain, so nothing is signed"
     MORE_WAS_THERE = AuditFinding.TRUNCATED, "{next} continues from records that are missing here: the end was cut off"
+    BEFORE_HEAD = (
+        AuditFinding.TRUNCATED,
+        "it does not contain the value that the head of the machine states: cut off or rewritten",
+    )
+    NEWEST_MISSING = AuditFinding.MISSING_FILE, "the newest recording by the head of the machine, {newest}, is missing"
     FILE_MISSING = AuditFinding.MISSING_FILE, "the previous file, {previous}, is {lost}; it followed {before}"
     FILES_REORDERED = AuditFinding.REORDERED, "continues from {previous}, but {before} is between them"
     FILES_BROKEN = AuditFinding.BROKEN, "does not continue from the last value of {previous}: one of them was rewritten"

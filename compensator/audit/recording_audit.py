@@ -26,7 +26,11 @@ _MESSAGE_HEAD = 31
 
 
 def audit_recording(
-    path: Path, verifier: Verifier | None = None, *, progress: Callable[[int], None] | None = None
+    path: Path,
+    verifier: Verifier | None = None,
+    *,
+    heads: frozenset[str] = frozenset(),
+    progress: Callable[[int], None] | None = None,
 ) -> RecordingAudit:
     """Audit one file.
 
@@ -36,6 +40,8 @@ def audit_recording(
         A recording.
     verifier : Verifier, optional
         Public key of the machine.
+    heads : frozenset of str
+        Values that the signed head of the machine states for this file, hexadecimal.
     progress : callable, optional
         Called at intervals with the number of bytes processed since the last call.
 
@@ -45,16 +51,21 @@ def audit_recording(
         If the file is not a recording.
     """
     with Container(path) as container:
-        return _Audit(path, container, verifier, progress).run()
+        return _Audit(path, container, verifier, heads, progress).run()
 
 
 class _Audit:
     def __init__(
-        self, path: Path, container: Container, verifier: Verifier | None, progress: Callable[[int], None] | None
+        self,
+        path: Path,
+        container: Container,
+        verifier: Verifier | None,
+        heads: frozenset[str],
+        progress: Callable[[int], None] | None,
     ) -> None:
         self._result = RecordingAudit(file=path.name, size=path.stat().st_size)
         self._container, self._contents = container, container.contents
-        self._verifier, self._progress = verifier, progress
+        self._verifier, self._heads, self._progress = verifier, heads, progress
         self._chain: ChainCheck | None = None
         self._replay: ReplayCheck | None = None
         #: Records after the last complete group.
@@ -67,8 +78,12 @@ class _Audit:
             self._read()
         except Damaged as damage:
             error = damage
-        if not self._contents.channels and not isinstance(error, Torn):
-            raise error or DataError(f"{self._result.file}: no channels, expected a recording")
+        except DataError:
+            if not self._container.is_beheaded():
+                raise
+            error = Damaged(self._container.path, 0, "the first bytes are not those of an MCAP file")
+        if not self._contents.channels and error is None:
+            raise DataError(f"{self._result.file}: no channels, expected a recording")
         self._refuse_others()
         chain, replay = self._begin(), self._replay
         if chain.head:
@@ -77,6 +92,7 @@ class _Audit:
         for where, what in self._container.index.faults:
             self._result.find(Fault.INDEX, topic=where, what=what)
         self._result.findings_count += self._container.index.count - len(self._container.index.faults)
+        self._result.outside = self._container.outside()
         if chain.head:
             chain.finish()
         if replay is not None:
@@ -117,9 +133,10 @@ class _Audit:
             result.identity = identity.hexdigest()
             state = contents.attachments.get("state.json")
             result.state_before = hashlib.sha256(state.data).hexdigest() if state else ""
-            self._chain = ChainCheck(contents, result, self._verifier)
+            self._chain = ChainCheck(contents, result, self._verifier, self._heads)
             try:
                 self._replay = ReplayCheck(contents, result)
+                result.period_s = self._replay.compensation.model.period_s
             except CompensatorError as error:
                 result.not_replayed = str(error)
         return self._chain

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from compensator.audit.findings import KEPT, Difference, Fault, Finding
+from compensator.clock import NS
 from compensator.codes import AuditFinding, RecordingEnd
+from compensator.recording.chain import SEAL_EVERY_NS
 from compensator.recording.reading import RawRecord
 
 
@@ -30,12 +32,23 @@ class RecordingAudit:
         The first findings, and the number of all findings.
     records : int
         Records in the chain.
-    signed, unsigned_behind : int
-        Signed seals, and records after the last of them.
+    signed, unsigned_behind, unsigned_samples : int
+        Signed seals, and records and samples after the last of them that is valid.
+    unsigned_min : float
+        Time from that seal, or from the start of the file, to its last record, min.
+    overdue : bool
+        Whether a seal was due in that time: the recorder would not have gone on without it.
+    at_head : bool
+        Whether its chain contains a value that the machine's head states.
+    outside : list of str
+        Changes to bytes that the hash chain does not cover, as text.
     keys : set of str
         Public keys in the seals.
     seal, sealed_signed : str, bool
-        Reason of the seal that is the last record, empty if there is none, and whether it is signed.
+        Reason of the seal that is the last record, empty if there is none, and whether it has a signature, valid or
+        not.
+    period_s : float
+        Sample period, s; 0 if its samples could not be replayed.
     samples, skipped : int
         Samples that were replayed, and samples between them that were not recorded.
     first_seq, last_seq, first_ns, last_ns : int
@@ -70,9 +83,15 @@ class RecordingAudit:
     records: int = 0
     signed: int = 0
     unsigned_behind: int = 0
+    unsigned_samples: int = 0
+    unsigned_min: float = 0.0
+    overdue: bool = False
+    at_head: bool = False
+    outside: list[str] = field(default_factory=list)
     keys: set[str] = field(default_factory=set)
     seal: str = ""
     sealed_signed: bool = False
+    period_s: float = 0.0
     samples: int = 0
     skipped: int = 0
     first_seq: int = -1
@@ -89,6 +108,17 @@ class RecordingAudit:
     model: str = ""
     state_before: str = ""
     state_after: str = ""
+
+    @property
+    def may_be_live(self) -> bool:
+        """Whether it ends as a file may that is being written: without its end, and before the next seal is due.
+
+        The number of samples is bounded as well, because times can be rewritten; it is not bounded to one interval,
+        because the clock may have been set back.
+        """
+        unsigned_ns = self.unsigned_samples * self.period_s * NS
+        recent = not self.overdue and unsigned_ns <= 2 * SEAL_EVERY_NS
+        return recent and self.end in (RecordingEnd.OPEN, RecordingEnd.TORN)
 
     @property
     def early(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +13,9 @@ from compensator.audit.findings import Difference, Fault, Finding, utc
 from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
 from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
+from compensator.errors import UsageError
 from compensator.recording.chain import NOTHING
+from compensator.recording.head import read_head
 from compensator.recording.signature import Verifier
 
 _NAME = re.compile(r"^(?P<machine>.+)_\d{8}T\d{6}Z(-\d{3})?\.mcap$")
@@ -115,6 +117,7 @@ def audit(
     paths: Sequence[Path],
     *,
     public_key: Path | None = None,
+    head: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     executor: Executor | None = None,
 ) -> Audit:
@@ -126,6 +129,8 @@ def audit(
         Recordings, in any order.
     public_key : pathlib.Path, optional
         Key with which they must be signed.
+    head : pathlib.Path, optional
+        Head of the chain, which the machine keeps outside the folder of the recordings (`recording/head.py`).
     progress : callable, optional
         Called with the number of bytes processed and their total.
     executor : Executor, optional
@@ -136,9 +141,13 @@ def audit(
     DataError
         If a file is not a recording.
     UsageError
-        If the key cannot be used.
+        If the key or the head cannot be used.
     """
     verifier = Verifier(public_key) if public_key else None
+    if head is not None and verifier is None:
+        raise UsageError(f"{head}: a head of the chain is checked with the public key, which is not given")
+    ends = {end.file: end for end in read_head(head, verifier).ends if end.synced} if head is not None else {}
+    heads = {name: frozenset((end.synced,)) for name, end in ends.items()}
     paths = list(dict.fromkeys(paths))
     sizes = {path: path.stat().st_size if path.exists() else 0 for path in paths}
     total = sum(sizes.values())
@@ -151,28 +160,36 @@ def audit(
             progress(done, total)
 
     if executor is not None:
-        audits = _side_by_side(executor, paths, public_key, lambda path: add(sizes[path]))
+        audits = _side_by_side(executor, paths, public_key, heads, lambda path: add(sizes[path]))
     else:
-        audits = [audit_recording(path, verifier, progress=add) for path in paths]
-    return combine(audits, signed=verifier is not None)
+        audits = [
+            audit_recording(path, verifier, heads=heads.get(path.name, frozenset()), progress=add) for path in paths
+        ]
+    return combine(audits, signed=verifier is not None, newest=list(ends)[-1] if ends else "", heads=heads)
 
 
 def _side_by_side(
-    executor: Executor, paths: Sequence[Path], public_key: Path | None, done: Callable[[Path], None]
+    executor: Executor,
+    paths: Sequence[Path],
+    public_key: Path | None,
+    heads: Mapping[str, frozenset[str]],
+    done: Callable[[Path], None],
 ) -> list[RecordingAudit]:
     """Audit files in parallel: each contains the state at its start, so they are independent."""
-    jobs = {executor.submit(_audit_one, path, public_key): path for path in paths}
+    jobs = {executor.submit(_audit_one, path, public_key, heads.get(path.name, frozenset())): path for path in paths}
     for job in as_completed(jobs):
         job.result()
         done(jobs[job])
     return [job.result() for job in jobs]
 
 
-def _audit_one(path: Path, public_key: Path | None) -> RecordingAudit:
-    return audit_recording(path, Verifier(public_key) if public_key else None)
+def _audit_one(path: Path, public_key: Path | None, heads: frozenset[str]) -> RecordingAudit:
+    return audit_recording(path, Verifier(public_key) if public_key else None, heads=heads)
 
 
-def combine(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
+def combine(
+    audits: Sequence[RecordingAudit], *, signed: bool = False, newest: str = "", heads: Collection[str] = ()
+) -> Audit:
     """Combine the audits of single files.
 
     Parameters
@@ -181,13 +198,19 @@ def combine(audits: Sequence[RecordingAudit], *, signed: bool = False) -> Audit:
         In any order.
     signed : bool
         Whether seals were checked against a key.
+    newest : str
+        Name of the newest recording by the head of the machine; empty without a head.
+    heads : collection of str
+        Names of the recordings whose ends the head states.
     """
     # By the names at their creation, which show the order even if the clock was set back.
     files = sorted(map(_named, audits), key=lambda f: (f.machine, f.original.removesuffix(".mcap")))
-    series = _Series(files, signed)
+    series = _Series(files, signed, newest)
     for before, after in zip([None, *files[:-1]], files, strict=True):
         series.check_file(after)
         series.check_link(before if before is not None and before.machine == after.machine else None, after)
+    if files and newest:
+        series.check_head(files, newest, heads)
     findings = [finding for file in files for finding in (*series.own[file.file].findings, *file.findings)]
     return Audit(
         files=tuple(files),
@@ -205,13 +228,20 @@ def _named(file: RecordingAudit) -> RecordingAudit:
     return file if name is None or file.machine else replace(file, machine=name["machine"])
 
 
+def _started(original: str) -> str:
+    """Return the part of a file's name that shows when it was started."""
+    return original.removesuffix(".mcap").rpartition("_")[2]
+
+
 class _Series:
     """Checks files one after the other, and the links between them."""
 
-    def __init__(self, files: Sequence[RecordingAudit], signed: bool) -> None:
+    def __init__(self, files: Sequence[RecordingAudit], signed: bool, newest: str) -> None:
         self._names = {file.original: file for file in files}
         self._removed = {name for file in files for name in file.removed}
         self._newest = {file.machine: file.file for file in files}
+        #: Only the file that was started last may still be without its next seal; a head states which one that is.
+        self._live = newest or (max(files, key=lambda file: _started(file.original)).file if files else "")
         self._signed = signed
         #: Findings of whole files; they come before those within a file.
         self.own = {file.file: RecordingAudit(file=file.file) for file in files}
@@ -251,23 +281,39 @@ class _Series:
                 f"{file.early} offset(s) were published before they were on disk, because the disk was slow or failed"
             )
             remark(Remark(AuditRemark.PUBLISHED_EARLY, f"{name}: {figures}."))
+        if file.outside:
+            remark(Remark(AuditRemark.OUTSIDE_CHAIN, f"{name}: {'; '.join(file.outside)}."))
         self._check_signatures(file)
 
     def _check_signatures(self, file: RecordingAudit) -> None:
         name, remark = file.file, self.remarks.append
         if self._signed:
-            if file.end in (RecordingEnd.FINISHED, RecordingEnd.RECOVERED) and file.last and not file.sealed_signed:
-                self._find(Fault.END_UNSIGNED, file)
-            elif not file.last:
+            if not file.last:
                 self._find(Fault.NOTHING_SIGNED, file)
-            elif file.unsigned_behind:
-                figures = f"{name}: {file.unsigned_behind} record(s) after the last signature."
-                remark(Remark(AuditRemark.UNSIGNED_BEHIND, figures))
+                return
+            if not file.unsigned_behind:
+                return
+            records, samples, minutes = file.unsigned_behind, file.unsigned_samples, file.unsigned_min
+            # A false signature at the end is a finding of its own.
+            if not file.sealed_signed and (name != self._live or not file.may_be_live):
+                self._find(Fault.NOT_SIGNED, file, records=records, samples=samples, minutes=minutes)
+                return
+            figures = f"{records} record(s) after the last signature: {samples} sample(s), {minutes:.0f} min"
+            remark(Remark(AuditRemark.UNSIGNED_BEHIND, f"{name}: {figures}; no signature proves them."))
         elif file.signed:
             keys = ", ".join(key[:16] for key in sorted(file.keys))
             remark(
                 Remark(AuditRemark.SIGNATURE_NOT_CHECKED, f"{name}: signed by {keys}…, not checked (no --public-key).")
             )
+
+    def check_head(self, files: Sequence[RecordingAudit], newest: str, heads: Collection[str]) -> None:
+        """Check that the recordings reach what the head of the machine states."""
+        there = {file.file for file in files}
+        if newest not in there:
+            self._find(Fault.NEWEST_MISSING, files[-1], newest=newest)
+        for file in files:
+            if file.file in heads and not file.at_head:
+                self._find(Fault.BEFORE_HEAD, file)
 
     def check_link(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
         """Check the link of a file to the previous one."""

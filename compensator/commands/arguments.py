@@ -170,6 +170,7 @@ def replay(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("recording", type=Path, nargs="+", metavar="FILE.mcap", help="recordings, or a folder of them")
     add("--public-key", type=Path, metavar="FILE", help="Ed25519 public key (PEM) to check the signatures")
+    add("--head", type=Path, metavar="FILE", help="with --public-key: head of the chain, which the machine keeps")
     add("--model", metavar="OTHER", help="show what this model (a file, or quill) would have done, without an audit")
     add("--out", type=Path, metavar="CSV", help="with --model: table of both offsets for every sample")
     _page(parser)

@@ -35,18 +35,22 @@ def run(arguments: argparse.Namespace) -> Answer:
     if arguments.model is not None:
         if arguments.public_key is not None:
             raise UsageError("--public-key: is for the audit, which is not made with --model")
+        if arguments.head is not None:
+            raise UsageError("--head: is for the audit, which is not made with --model")
         if arguments.out is not None:
             checked_file(arguments.out, "--out", read=(*paths, Path(arguments.model)), ending=".csv")
         return _compare(paths, arguments.model, arguments.out, page)
     if arguments.out is not None:
         raise UsageError("--out: is for --model, which is not given")
-    public_key = arguments.public_key
+    public_key, head = arguments.public_key, arguments.head
+    if head is not None and public_key is None:
+        raise UsageError("--head: is checked with --public-key, which is not given")
     if arguments.scheduler is not None:
         # Workers may run in other folders, so paths must be absolute.
         paths, public_key = [resolved(path) for path in paths], public_key and resolved(public_key)
     worth = len(paths) if sum(path.stat().st_size for path in paths if path.exists()) > ALONE else 1
     with progress_bar("auditing") as progress, workers(worth, arguments.scheduler) as executor:
-        found = audit(paths, public_key=public_key, progress=progress, executor=executor)
+        found = audit(paths, public_key=public_key, head=head, progress=progress, executor=executor)
     answer = Answer(found.as_json(), summary(found), 0 if found.clean else FOUND)
     if page is None:
         return answer

@@ -20,6 +20,8 @@ MOST_SAMPLES = 6_000_000
 STRETCH_ROWS = 10
 #: Number of stretches that a remark lists.
 _SHOWN = 3
+#: Share of rows without a temperature, outside long gaps, from which it is remarked on.
+_SPARSE = 0.1
 
 
 def to_grid(table: Table, period_s: float) -> SampledData:
@@ -49,6 +51,14 @@ def to_grid(table: Table, period_s: float) -> SampledData:
             Remark(DataRemark.ROWS_SORTED, f"{table.name}: row {row}: {count} row(s) out of order; sorted by time.")
         )
     t_s = t_s[order] - t_s.min()
+    again = np.diff(t_s) == 0
+    if again.any():
+        row, count = table.rows[int(order[int(np.argmax(again)) + 1])], int(np.sum(again))
+        remarks.append(
+            Remark(
+                DataRemark.TIMES_EQUAL, f"{table.name}: row {row}: {count} row(s) with the time of another; averaged."
+            )
+        )
     slot = (
         np.round(t_s / period_s).astype(int)
         if _spacing(t_s) >= period_s
@@ -70,6 +80,7 @@ def to_grid(table: Table, period_s: float) -> SampledData:
             start = last
     records.append((start, n))
     remarks += _missing_inputs(table.name, columns, records, period_s)
+    remarks += _sparse_inputs(table, slot, order, columns)
     return SampledData(
         records=tuple(
             SampledRecord(
@@ -116,6 +127,18 @@ def _check_clock(table: Table, period_s: float) -> None:
                 f"{table.name}: row {table.rows[after[0]]}: {repeated_s / 60.0:.0f} min occur twice, expected once: a "
                 "clock that was set back, or two files in one? Give each part as a file of its own"
             )
+
+
+def _sparse_inputs(table: Table, slot: Indices, order: Indices, columns: Mapping[str, Vector]) -> Iterator[Remark]:
+    """Yield a remark on each temperature that is missing in many rows, long gaps apart."""
+    for column in [c for c in ("t_q_degc", "at_degc") if c in columns]:
+        in_long_gap = np.zeros(columns[column].size, dtype=bool)
+        for first, last in _gaps(~np.isnan(columns[column])):
+            in_long_gap[first:last] = last - first > SHORT_GAP_SAMPLES
+        empty = np.isnan(table.columns[column][order])[~in_long_gap[slot]]
+        if empty.size and np.mean(empty) > _SPARSE:
+            words = f"{table.name}: {column} is empty in {100.0 * np.mean(empty):.0f} % of the rows."
+            yield Remark(DataRemark.TEMPERATURE_SPARSE, words)
 
 
 def _check_size(table: Table, period_s: float) -> None:

@@ -61,6 +61,8 @@ MAGIC = b"\x89MCAP0\r\n"
 LONGEST = 64 * 2**20
 _WINDOW = 2**20
 _LONGEST_HEADER = 4096
+#: Number of notes on bytes without content that are kept.
+_MOST_NOTES = 20
 
 _T = TypeVar("_T")
 
@@ -145,6 +147,8 @@ class Contents:
         Whether the file has chunks, and whether it has its end.
     messages : int
         Number of messages.
+    outside : list of str
+        Bytes without content that differ from what the recorder writes, as text.
     """
 
     library: str = ""
@@ -155,6 +159,7 @@ class Contents:
     chunked: bool = False
     ended: bool = False
     messages: int = 0
+    outside: list[str] = field(default_factory=list)
 
     @property
     def run(self) -> dict[str, str]:
@@ -182,6 +187,8 @@ class Container:
         #: Compares the index with the records that were read.
         self.index = Index()
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        #: Schemas that a channel has.
+        self._used: set[int] = set()
         try:
             self._file: BinaryIO = open_file(path)
             self._size = self._file.seek(0, 2)
@@ -222,6 +229,31 @@ class Container:
                 if not whole:
                     break
         return self.contents
+
+    def is_beheaded(self) -> bool:
+        """Return whether the file is an MCAP file but for its first bytes: its end is one, or they nearly are."""
+        self._file.seek(0)
+        start = self._file.read(len(MAGIC))
+        self._file.seek(max(0, self._size - len(MAGIC)))
+        wrong = sum(one != other for one, other in zip(start, MAGIC, strict=False))
+        return start != MAGIC and len(start) == len(MAGIC) and (wrong <= 2 or self._file.read(len(MAGIC)) == MAGIC)
+
+    def outside(self) -> list[str]:
+        """Return, as text, which bytes without content differ from what a machine's recorder writes."""
+        contents, found = self.contents, list(self.contents.outside)
+        version = contents.run.get("compensator")
+        if version is not None and contents.library != f"compensator {version}":
+            found.append(
+                f"the header names {contents.library[:40]!r} as the program, the metadata compensator {version}"
+            )
+        unused = sorted(name for number, (name, _, _) in self._schemas.items() if number not in self._used)
+        if unused and contents.channels:
+            found.append(f"no channel has the schema(s) {', '.join(unused)[:80]}")
+        return found
+
+    def _note(self, what: str) -> None:
+        if what not in self.contents.outside and len(self.contents.outside) < _MOST_NOTES:
+            self.contents.outside.append(what)
 
     # ------------------------------------------------------------------ messages
 
@@ -331,6 +363,8 @@ class Container:
                 raise Damaged(self.path, offset, f"a chunk compressed by {compression!r}, expected zstd or none")
         except (zstandard.ZstdError, ValueError) as error:
             raise Damaged(self.path, offset, f"a chunk that cannot be uncompressed: {error}") from error
+        if not crc and size:
+            self._note("a chunk has no CRC")
         if len(data) != size or (crc and zlib.crc32(data) != crc):
             raise Damaged(self.path, offset, "a chunk whose CRC is wrong")
         return data
@@ -341,7 +375,8 @@ class Container:
         fields = Fields(self.path, offset, body)
         contents = self.contents
         if code == HEADER:
-            fields.text()
+            if fields.text():
+                self._note("the header names a profile")
             contents.library = fields.text()
             fields.done()
         elif code == SCHEMA:
@@ -353,6 +388,7 @@ class Container:
             number, schema = fields.number("<H"), fields.number("<H")
             topic, encoding, metadata = fields.text(), fields.text(), fields.table()
             fields.done()
+            self._used.add(schema)
             name, schema_encoding, data = self._schemas.get(schema, ("", "", b""))
             channel = McapChannel(topic, encoding, metadata, name, schema_encoding, data)
             if contents.channels.setdefault(number, channel) != channel:
@@ -370,7 +406,9 @@ class Container:
             crc = fields.number("<I")
             fields.done()
             self.index.add_attachment(offset, 9 + len(body), log_time, create_time, len(data), name, media_type)
-            if crc and zlib.crc32(body[:-4]) != crc:
+            if not crc:
+                self._note(f"attachment {name} has no CRC")
+            elif zlib.crc32(body[:-4]) != crc:
                 contents.flaws.append((f"attachment {name}", Flaw.WRONG_CRC))
             self._keep(
                 contents.attachments, name, Attachment(name, media_type, log_time, create_time, data), "attachment"
@@ -393,8 +431,12 @@ class Container:
         offset = self._base + self._at
         crc = zlib.crc32(self._buffer[: self._at], self._crc)
         stated = int.from_bytes(body[:4], "little")
-        if stated and stated != crc:
+        if not stated:
+            self._note("the data have no CRC")
+        elif stated != crc:
             raise Damaged(self.path, offset, "the CRC of the data is wrong")
+        if len(body) > 4:
+            self._note("the end of the data is longer than it is written")
         self._at += 9 + len(body)
         summary, summary_start = zlib.crc32(b""), self._base + self._at
         while True:
@@ -411,7 +453,11 @@ class Container:
             )
             summary = zlib.crc32(record, summary)
         stated = int.from_bytes(record[25:29], "little")
-        if stated and stated != zlib.crc32(record[:25], summary):
+        if len(record) > 29:
+            self._note("the footer is longer than it is written")
+        if not stated:
+            self._note("the summary has no CRC")
+        elif stated != zlib.crc32(record[:25], summary):
             raise Damaged(self.path, self._base + self._at, "the CRC of the summary is wrong")
         self.index.finish(summary_start, self._base + start, Fields(self.path, self._base + start, record, 9))
         self._need(len(MAGIC) + 1)

@@ -60,6 +60,9 @@ class Finisher:
         Retention limits.
     signer : Signer, optional
         Signs the seal of a recovered end.
+    accepted : callable, optional
+        For the name of a file the values of the chain, hexadecimal, with which it may end that nobody changed; the
+        seal of another recovered end is not signed. By default none is.
     compacted : callable, optional
         Compacts one file and returns a remark, or an empty text; by default `compact`.
     """
@@ -71,10 +74,12 @@ class Finisher:
         retention: Retention,
         signer: Signer | None,
         *,
+        accepted: Callable[[str], frozenset[str]] | None = None,
         compacted: Callable[[Path], str] | None = None,
     ) -> None:
         self._folder, self._machine, self._retention = folder, machine, retention
-        self._compact = compacted or (lambda path: compact(path, signer, yielding=True))
+        values = accepted or (lambda name: frozenset())
+        self._compact = compacted or (lambda path: compact(path, signer, accepted=values(path.name), yielding=True))
         self._lock = threading.Lock()
         self._jobs: deque[tuple[Path | None, int]] = deque()
         #: Files that could not be compacted because of the disk; retried with the next file.
@@ -143,7 +148,7 @@ class Finisher:
                 self._remove_oldest(now_ns)
             if error is not None and path is not None and path.exists():
                 text = f"{path.name}: could not be compacted and remains unchanged: {error}"
-                self._remark(text, RecordingData(code=RecordingCode.NOT_COMPACTED, file=path.name))
+                self.remark(text, RecordingData(code=RecordingCode.NOT_COMPACTED, file=path.name))
                 if isinstance(error, OSError):
                     with self._lock:
                         self._refused.append(path)
@@ -155,10 +160,11 @@ class Finisher:
         except (OSError, DataError) as error:
             return error
         if recovered:
-            self._remark(f"{path.name}: {recovered}", RecordingData(code=RecordingCode.RECOVERED, file=path.name))
+            self.remark(f"{path.name}: {recovered}", RecordingData(code=RecordingCode.RECOVERED, file=path.name))
         return None
 
-    def _remark(self, text: str, data: RecordingData) -> None:
+    def remark(self, text: str, data: RecordingData) -> None:
+        """Add a remark, and log it."""
         log.info("%s", text)
         with self._lock:
             self._remarks = [*self._remarks[-99:], (text, data.table())]
@@ -185,17 +191,23 @@ class Finisher:
         except OSError as error:
             if str(error) != self._unremoved:  # a failing disk is retried every minute
                 text = f"recordings beyond the retention limit could not be removed: {error}"
-                self._remark(text, RecordingData(code=RecordingCode.NOT_REMOVED))
+                self.remark(text, RecordingData(code=RecordingCode.NOT_REMOVED))
             self._unremoved = str(error)
         if removed:
             size = sum(size for _, size in removed)
             names = [name for name, _ in removed]
             text = f"{len(names)} recording(s) removed by the retention limit, up to {names[-1]}"
-            self._remark(text, RecordingData(code=RecordingCode.REMOVED, removed=names, bytes=size))
+            self.remark(text, RecordingData(code=RecordingCode.REMOVED, removed=names, bytes=size))
         return bool(removed)
 
 
-def compact(path: Path, signer: Signer | None = None, *, yielding: bool = False) -> str:
+def compact(
+    path: Path,
+    signer: Signer | None = None,
+    *,
+    accepted: frozenset[str] = frozenset(),
+    yielding: bool = False,
+) -> str:
     """Replace a machine's live recording by a compact copy.
 
     A torn end is finished: its complete records are listed in a `/chain` message, followed by a seal `recovered`.
@@ -206,6 +218,9 @@ def compact(path: Path, signer: Signer | None = None, *, yielding: bool = False)
         A recording; a file that is compact, has no hash chain or is being written is skipped.
     signer : Signer, optional
         Signs the seal of a recovered end.
+    accepted : frozenset of str
+        Values of the chain, hexadecimal, at which a recovered end is signed. Any other end may have been changed since
+        it was written: its seal remains without a signature for good.
     yielding : bool
         Whether to yield to other threads.
 
@@ -219,19 +234,23 @@ def compact(path: Path, signer: Signer | None = None, *, yielding: bool = False)
     OSError, DataError
         As by `rewrite`; the file is not changed.
     """
-    copy = rewrite(path, partial(_ChainedCopy, signer=signer), yielding=yielding, chained=True)
+    copy_of = partial(_ChainedCopy, signer=signer, accepted=accepted)
+    copy = rewrite(path, copy_of, yielding=yielding, chained=True)
     if not isinstance(copy, _ChainedCopy) or copy.recovered is None:
         return "its torn end was cut off" if copy is not None and copy.torn else ""
     end = "its torn end was cut off" if copy.torn else "it had no end"
-    return f"{end}; {copy.recovered} complete record(s) after the last complete group were kept"
+    unsigned = "; what follows its last signature remains unsigned" if copy.unsigned else ""
+    return f"{end}; {copy.recovered} complete record(s) after the last complete group were kept{unsigned}"
 
 
 class _ChainedCopy(Copy):
     """The copy of a machine's recording, with its chain; a torn end is finished."""
 
-    def __init__(self, contents: Contents, writer: Writer, *, signer: Signer | None) -> None:
+    def __init__(self, contents: Contents, writer: Writer, *, signer: Signer | None, accepted: frozenset[str]) -> None:
         super().__init__(contents, writer)
-        self._signer = signer
+        self._signer, self._accepted = signer, accepted
+        #: Whether there is a key, but the recovered end was not signed.
+        self.unsigned = False
         self._chain: chain.ChainWriter | None = None
         self._last: Message | None = None
         self._sealed = False
@@ -264,7 +283,9 @@ class _ChainedCopy(Copy):
                 self._append("chain", self._chain.message(self._last.log_time_ns))
             time_ns, sequence = self._last.log_time_ns, self._last.sequence
             seal = chain.seal(self._chain.machine, time_ns, RecordingEnd.RECOVERED, sequence, self._chain.head)
-            self._append("seal", encode(self._signer.sign(seal) if self._signer else seal))
+            signer = self._signer if seal.sha256 in self._accepted else None
+            self.unsigned = self._signer is not None and signer is None
+            self._append("seal", encode(signer.sign(seal) if signer else seal))
             self._append("chain", self._chain.message(time_ns))
         super().finish()
 

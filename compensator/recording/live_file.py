@@ -175,6 +175,8 @@ class RecordingFile(LiveFile):
         self._channels: dict[str, int] = {}
         self._sequence = 0
         self._chain = chain.ChainWriter(machine, before)
+        #: Value of the chain on disk, empty before the first sync, and the values that the next sync adds.
+        self.synced_value, self.pending = b"", list[bytes]()
 
     @property
     def head(self) -> bytes:
@@ -191,12 +193,20 @@ class RecordingFile(LiveFile):
         opening.write(contents)
         self._channels = {topic: number for number, topic in opening.topics.items()}
         self._write("chain", self._chain.begin(chain.parts_of(contents), self.time_ns))
+        self.pending.append(self._chain.head)
+
+    def sync(self) -> None:
+        """Write everything to disk."""
+        super().sync()
+        self.synced_value = self.pending[-1] if self.pending else self.synced_value
+        self.pending.clear()
 
     def append(self, records: Iterable[tuple[str, bytes]], time_ns: int) -> None:
         """Write a group of records and the values of the chain."""
         self.time_ns = time_ns
         for topic, data in records:
             self._chain.add(topic, chain.body_of(self._sequence, time_ns, data))
+            self.pending.append(self._chain.head)
             self._write(topic, data)
         self._write("chain", self._chain.message(time_ns))
 

@@ -281,18 +281,40 @@ def last_value(path: Path) -> bytes:
     DataError
         If it is not an MCAP file.
     """
-    value, before_seal, recovered = b"", b"", False
+    before_seal = value = b""
+    recovered = False
+    for record, following in _linked(path):
+        before_seal, value = value, following
+        recovered = record.topic == "seal" and b'"reason":"recovered"' in record.body
+    return before_seal if recovered else value
+
+
+def values_of(path: Path) -> set[bytes]:
+    """Return all values of the chain of a file, as computed from its records; empty if it has no chain.
+
+    A file that is not an MCAP file has none.
+    """
+    try:
+        return {value for _, value in _linked(path)}
+    except DataError:
+        return set()
+
+
+def _linked(path: Path) -> Iterator[tuple[RawRecord, bytes]]:
+    """Yield the first message of the chain and every record, each with the value of the chain that it makes."""
+    value = b""
     with Container(path) as container, suppress(Damaged, msgspec.MsgspecError, ValueError):
         for record in records_of(container):
             if record.topic == "chain" and not value:
                 first = msgspec.json.decode(record.data, type=Chain)
                 value = chain.opening(bytes.fromhex(first.before), chain.parts_of(container.contents))
-            elif record.topic != "chain" and not value:
+            elif record.topic == "chain":
+                continue
+            elif not value:
                 break
-            elif record.topic != "chain":
-                before_seal, value = value, chain.link(value, record.topic, record.body)
-                recovered = record.topic == "seal" and b'"reason":"recovered"' in record.body
-    return before_seal if recovered else value
+            else:
+                value = chain.link(value, record.topic, record.body)
+            yield record, value
 
 
 def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> int:
@@ -318,9 +340,15 @@ def first_sequence(folder: Path, machine: str, utc_ns: int, period_s: float) -> 
 
 
 def last_sequence(folder: Path, machine: str) -> int:
-    """Return the highest recorded sequence number; −1 if there is none."""
+    """Return the highest recorded sequence number; −1 if there is none.
+
+    A file that cannot be read does not keep a service from starting: `first_sequence` does not depend on it.
+    """
     for path in reversed(recordings(folder, machine)):
-        highest = max((message.seq for message in messages(path, ("sample", "offset"))), default=-1)
+        highest = -1
+        with suppress(DataError):
+            for message in messages(path, ("sample", "offset")):
+                highest = max(highest, message.seq)
         if highest >= 0:
             return highest
     return -1

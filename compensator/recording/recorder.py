@@ -18,17 +18,15 @@ import mcap
 
 from compensator import __version__
 from compensator.atomic_write import sync_folder
-from compensator.clock import NS
+from compensator.events import RecordingCode, RecordingData
 from compensator.recording import chain
 from compensator.recording.container import Attachment
 from compensator.recording.finishing import Finisher, Retention
+from compensator.recording.head import HeadKeeper, previous_end
 from compensator.recording.live_file import TOPICS, RecordingFile
 from compensator.recording.naming import day_of, names
-from compensator.recording.reading import last_value, recordings
+from compensator.recording.reading import recordings
 from compensator.recording.signature import Signer
-
-#: How often the chain is signed within a file.
-SEAL_EVERY_NS = 3600 * NS
 
 
 class McapRecorder:
@@ -46,6 +44,9 @@ class McapRecorder:
         Retention limits; by default everything is kept.
     signer : Signer, optional
         Signs the chain.
+    head : pathlib.Path, optional
+        File outside the folder in which the head of the chain is kept (`recording/head.py`); needs a signer. Without
+        it the end of a file that a kill has left is not signed afterwards.
     topics : sequence of str
         Topics of its files.
     """
@@ -58,6 +59,7 @@ class McapRecorder:
         *,
         retention: Retention | None = None,
         signer: Signer | None = None,
+        head: Path | None = None,
         topics: Sequence[str] = TOPICS,
     ) -> None:
         self._folder = folder
@@ -65,7 +67,11 @@ class McapRecorder:
         self.attachments = attachments
         self._signer = signer
         self._topics = topics
-        self._finisher = Finisher(folder, machine, retention or Retention(), signer)
+        self._keeper = HeadKeeper(head, machine, signer) if head is not None and signer is not None else None
+        accepted = self._keeper.accepted if self._keeper is not None else None
+        self._finisher = Finisher(folder, machine, retention or Retention(), signer, accepted=accepted)
+        #: Why the head was not written last time; empty if it was.
+        self._unkept = ""
         self._live: RecordingFile | None = None
         self._day = ""
         #: A file that was given up and could not be cut, and the size that was synced.
@@ -110,9 +116,11 @@ class McapRecorder:
                 self._open(time_utc_ns, day, {"state.json": state} | dict(opening or {}))
             assert self._live is not None
             self._live.append(records, time_utc_ns)
-            if self._signer is not None and time_utc_ns - self._live.sealed_ns >= SEAL_EVERY_NS:
+            # The clock may be set back, too.
+            if self._signer is not None and abs(time_utc_ns - self._live.sealed_ns) >= chain.SEAL_EVERY_NS:
                 self._live.seal("hour", time_utc_ns, self._signer)
             if sync:
+                self._keep_head(self._live)
                 self._live.sync()
         except BaseException as error:
             self._give_up()
@@ -153,7 +161,9 @@ class McapRecorder:
             return
         try:
             live.seal(reason, live.time_ns, self._signer)
+            self._keep_head(live)
             live.finish()
+            self._keep_head(live)
         except OSError:
             self._give_up()
             raise
@@ -180,10 +190,11 @@ class McapRecorder:
                 path.unlink(missing_ok=True)
             self._uncut = None
         previous = recordings(self._folder, self._machine)
-        before = self._last
-        if previous and not before:
-            before = last_value(previous[-1])
-        paths = names(self._folder, self._machine, time_utc_ns, previous[-1] if previous else None)
+        before, name = self._last, previous[-1].name if previous else ""
+        if not before:
+            name, before = self._read_end()
+        newest = max(filter(None, (previous[-1].stem if previous else "", name.removesuffix(".mcap"))), default="")
+        paths = names(self._folder, self._machine, time_utc_ns, self._folder / f"{newest}.mcap" if newest else None)
         live = self._live = RecordingFile(paths, self._machine, before or chain.NOTHING, time_utc_ns, self._topics)
         self.path = live.path
         metadata = {
@@ -194,13 +205,14 @@ class McapRecorder:
             "python": platform.python_version(),
             "started_utc_ns": str(time_utc_ns),
             "began": self._reason,
-            "previous_file": previous[-1].name if previous else "",
+            "previous_file": name,
             "previous_chain": before.hex(),
         }
         attachments = [
             _attached(name, data, time_utc_ns) for name, data in (*self.attachments.items(), *opening.items()) if data
         ]
         live.begin(metadata, attachments)
+        self._keep_head(live)
         live.sync()
         self._day = day
         sync_folder(self._folder)
@@ -208,6 +220,33 @@ class McapRecorder:
             # A kill leaves unfinished files: at a start it may be any of them, after a failure the last.
             for path in previous if self._reason == "start" else previous[-1:]:
                 self._finisher.enqueue(path, time_utc_ns)
+
+    def _read_end(self) -> tuple[str, bytes]:
+        """Return name and last value of the previous file; remark if it is not as it was written."""
+        keeper = self._keeper
+        if keeper is not None and keeper.unusable:
+            self._finisher.remark(keeper.unusable, RecordingData(code=RecordingCode.HEAD_NOT_KEPT))
+            keeper.unusable = ""
+        end = previous_end(self._folder, self._machine, keeper)
+        if end.differs:
+            data = RecordingData(code=RecordingCode.NOT_AS_WRITTEN, file=end.file)
+            text = f"{end.file}: {end.differs}; it was changed since it was written, or the head was not kept"
+            self._finisher.remark(text, data)
+        return end.file, end.value
+
+    def _keep_head(self, live: RecordingFile) -> None:
+        """Note what the next sync writes; the recording does not depend on it."""
+        if self._keeper is None:
+            return
+        try:
+            self._keeper.expect(live.path.name, live.synced_value, live.pending, live.time_ns)
+            self._unkept = ""
+        except OSError as error:
+            why = error.strerror or type(error).__name__
+            if why != self._unkept:  # a failing disk is tried again with every sample
+                text = f"{self._keeper.path}: {why}; the end that a kill leaves would not be signed"
+                self._finisher.remark(text, RecordingData(code=RecordingCode.HEAD_NOT_KEPT))
+            self._unkept = why
 
 
 def _attached(name: str, data: bytes, time_ns: int) -> Attachment:

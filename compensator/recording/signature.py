@@ -43,7 +43,15 @@ class Signer:
     def sign(self, seal: Seal) -> Seal:
         """Return the seal with its signature."""
         seal = msgspec.structs.replace(seal, public_key=self.public_key)
-        return msgspec.structs.replace(seal, signature=self._key.sign(signed_bytes(seal)).hex())
+        return msgspec.structs.replace(seal, signature=self.sign_bytes(signed_bytes(seal)))
+
+    def sign_bytes(self, data: bytes) -> str:
+        """Return the signature of bytes, hexadecimal."""
+        return str(self._key.sign(data).hex())
+
+    def made(self, data: bytes, signature: str) -> bool:
+        """Return whether a signature of bytes, hexadecimal, was made with this key."""
+        return _verified(self._key.public_key(), data, signature)
 
 
 class Verifier:
@@ -67,13 +75,21 @@ class Verifier:
 
     def holds(self, seal: Seal) -> bool:
         """Return whether the seal was signed with the private half of this key."""
-        from cryptography.exceptions import InvalidSignature
+        return self.made(signed_bytes(seal), seal.signature) and seal.public_key == self.public_key
 
-        try:
-            self._key.verify(bytes.fromhex(seal.signature), signed_bytes(seal))
-        except (InvalidSignature, ValueError):
-            return False
-        return seal.public_key == self.public_key
+    def made(self, data: bytes, signature: str) -> bool:
+        """Return whether a signature of bytes, hexadecimal, was made with the private half of this key."""
+        return _verified(self._key, data, signature)
+
+
+def _verified(key: Any, data: bytes, signature: str) -> bool:
+    from cryptography.exceptions import InvalidSignature
+
+    try:
+        key.verify(bytes.fromhex(signature), data)
+    except (InvalidSignature, ValueError):
+        return False
+    return True
 
 
 def _read_key(path: Path, half: Literal["private", "public"], error_kind: type[ConfigError] | type[UsageError]) -> Any:

@@ -96,6 +96,7 @@ async def run_service(
             {"config.toml": loaded.data, "model.toml": setup.model_bytes},
             retention=Retention(keep_days=config.recording.keep_days, keep_mb=config.recording.keep_mb),
             signer=setup.signer,
+            head=setup.head,
             topics=topics_of(probes=config.probe is not None, loop=config.loop is not None and config.loop.is_on),
         )
 

@@ -46,6 +46,8 @@ class Setup:
         Adopted models.
     signer : Signer, optional
         Signs the recordings.
+    head : pathlib.Path, optional
+        File for the head of their chain; None without a signer.
     fleet : drivers.Fleet
         The devices.
     certificate : Certificate, optional
@@ -57,6 +59,7 @@ class Setup:
     model_bytes: bytes
     store: ModelStore
     signer: Signer | None
+    head: Path | None
     fleet: drivers.Fleet
     certificate: Certificate | None
 
@@ -134,6 +137,7 @@ def load(path: str) -> Setup:
         model_bytes=model_bytes,
         store=store,
         signer=signer,
+        head=head_file(loaded),
         fleet=fleet,
         certificate=check_files(str(path), files) if files is not None else None,
     )
@@ -195,6 +199,33 @@ def load_signer(loaded: LoadedConfig) -> Signer | None:
             "is not readable by those who can change the recordings"
         )
     return Signer(path)
+
+
+def head_file(loaded: LoadedConfig) -> Path | None:
+    """Return the file for the head of the chain; None if no signing key is configured.
+
+    Raises
+    ------
+    ConfigError
+        If it is among the recordings, or configured without a key.
+    """
+    recording = loaded.config.recording
+    folder = loaded.resolve(recording.folder)
+    if recording.signing_key is None:
+        if recording.head is not None:
+            raise ConfigError(
+                f"{loaded.path}: recording.head = {recording.head!r}: needs recording.signing_key, which signs it"
+            )
+        return None
+    if recording.head is None:
+        return folder.parent / f"{loaded.config.machine.name}.head.json"
+    path = loaded.resolve(recording.head)
+    if path.is_relative_to(folder):
+        raise ConfigError(
+            f"{loaded.path}: recording.head = {recording.head!r}: is in the recording folder, expected a place that "
+            "is not writable by those who can change the recordings"
+        )
+    return path
 
 
 # ---------------------------------------------------------------------- warnings

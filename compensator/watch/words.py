@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from compensator.clock import NS
 from compensator.codes import State, WatchWarning, explain
-from compensator.events import EventKind, LoopAction, RecordingData, data_of
+from compensator.events import EventKind, LoopAction, RecordingCode, RecordingData, data_of
 from compensator.messages import Event
 from compensator.report.notation import plain
 
@@ -88,6 +88,8 @@ def to_do(event: Event) -> str:
     recording = data_of(event, RecordingData) if event.kind == EventKind.RECORDING else None
     if recording is not None and recording.is_resolved:
         return ""
+    if recording is not None and recording.code == RecordingCode.NOT_AS_WRITTEN:
+        return "Audit the recordings with the public key, and find out who had access to the folder."
     return _DO.get(event.kind, "")
 
 

@@ -109,7 +109,9 @@ def router(shop: dict[str, Any]) -> dict[str, Any]:
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "adminspace": {"enabled": False},
         "transport": {
-            # A second link under the name of a connected client is refused. After a power cut all connect at once.
+            # Refused, whatever stands here: a second session under an id that is connected. Not refused: sessions that
+            # share a certificate, each under an id of its own; max_links counts the links within one session. After a
+            # power cut all connect at once.
             "unicast": {"max_links": 1, "accept_pending": 1000},
             # Else long messages would bypass the links, through memory that others on this computer can open.
             "shared_memory": {"enabled": False},

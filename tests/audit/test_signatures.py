@@ -104,14 +104,6 @@ def test_what_is_behind_the_last_signature_of_a_live_file_is_said(tmp_path: Path
     service.kill()
 
 
-def test_a_recovered_end_is_signed(tmp_path: Path) -> None:
-    private, public = write_key(tmp_path, "machine", 7)
-    Service(tmp_path / "rec", signer=Signer(private)).run(5).kill()
-    Service(tmp_path / "rec", signer=Signer(private), seq=5).run(5).stop()
-    found = audit(recordings(tmp_path / "rec", MACHINE), public_key=public)
-    assert found.clean and [file.end for file in found.files] == ["recovered", "finished"], summary(found)
-
-
 # ------------------------------------------------------------------ keys
 
 

@@ -62,7 +62,12 @@ def test_signatures(key: str) -> None:
 @pytest.mark.parametrize("name", EXPECTED["tampered"])
 def test_what_was_changed_is_found_as_before(name: str, tmp_path: Path) -> None:
     with kept.tampered(name, tmp_path) as folder:
-        check(EXPECTED["tampered"][name], kept.replay(folder))
+        wanted, found = EXPECTED["tampered"][name], kept.replay(folder)
+        if name == "byte_of_the_file":  # version 0.1.0 refused the file, and audited no other
+            (finding,) = found["result"]["findings"]
+            assert (wanted["exit"], found["exit"], finding["kind"]) == (2, 3, "damaged")
+            return
+        check(wanted, found)
 
 
 @pytest.mark.parametrize("name", EXPECTED["compare"])

@@ -69,6 +69,8 @@ def test_the_name_of_a_command() -> None:
         ({"code": "recovered", "file": "a.mcap"}, True),
         ({"code": "disk_failed"}, False),
         ({"code": "not_removed"}, False),
+        ({"code": "not_as_written", "file": "a.mcap"}, False),
+        ({"code": "head_not_kept"}, False),
         ({"lost": 3}, True),  # version 0.1.0
         ({"removed": ["a.mcap"], "bytes": 3}, True),
         ({}, False),

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 from compensator.audit.series import summary
-from tests.soak import hostile, kills, month
+from tests.soak import forgeries, hostile, kills, month
 
 #: The month writes no faster than the disk syncs; what it shows has nothing to do with that.
 MEMORY = Path("/dev/shm")
@@ -80,6 +80,7 @@ def main() -> int:
     parser.add_argument("--machines", type=int, default=4, help="machines side by side (default 4)")
     parser.add_argument("--days", type=float, default=30.0, help="length of the month (default 30)")
     parser.add_argument("--hostile", type=int, default=300, help="hostile inputs of each kind (default 300)")
+    parser.add_argument("--forgeries", type=int, default=300, help="number of forged recordings (default 300)")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     # What the service says of defects that were put in on purpose would bury the table.
@@ -89,6 +90,8 @@ def main() -> int:
         report_kills(given.kills, given.machines, given.seed)
     if given.hostile:
         good &= report_hostile(given.hostile, given.seed)
+    if given.forgeries:
+        good = forgeries.report(given.forgeries, given.seed) and good
     return 0 if good else 1
 
 

@@ -1,4 +1,4 @@
-"""kill −9 at random moments: what a receiver got is on disk, nothing jumps, every recording audits clean."""
+"""kill −9 at random moments: what a receiver got is on disk and signed, nothing jumps, every recording audits clean."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tests.audit.test_signatures import write_key
 from tests.soak.site import Receiver, Site, check_received, end, free_port, is_early
 
 #: When to kill: at any time; when a finished file is being made compact; when a model is being taken over.
@@ -85,9 +86,10 @@ def run(folder: Path, kills: int, *, seed: int = 1, longest_s: float = 2.0, peri
     """Kill the service so often, then audit everything."""
     began = time.monotonic()
     endpoint = f"tcp/127.0.0.1:{free_port()}"
+    _, public_key = write_key(folder, "machine", 7)
     with (
         Receiver("shop/vmc-07", mode="peer", listen__endpoints=[endpoint]) as receiver,
-        Site(folder, connect=[endpoint], period_s=period_s) as site,
+        Site(folder, connect=[endpoint], period_s=period_s, extra='signing_key = "machine.pem"') as site,
     ):
         rounds = _Round(site, receiver, seed)
         moments = [MOMENTS[i % len(MOMENTS)] for i in range(kills)]
@@ -99,12 +101,12 @@ def run(folder: Path, kills: int, *, seed: int = 1, longest_s: float = 2.0, peri
             last.terminate()
             assert last.wait(60) == 0
         result = rounds.result
-        judge(site, receiver, result, period_s)
+        judge(site, receiver, result, period_s, public_key)
     result.seconds = time.monotonic() - began
     return result
 
 
-def judge(site: Site, receiver: Receiver, result: Killed, period_s: float) -> None:
+def judge(site: Site, receiver: Receiver, result: Killed, period_s: float, public_key: Path) -> None:
     """Nothing received is missing, nothing repeats or jumps, everything audits clean."""
     on_disk = site.on_disk()
     for data in receiver.offsets:
@@ -118,7 +120,7 @@ def judge(site: Site, receiver: Receiver, result: Killed, period_s: float) -> No
     result.models = len({message["model_sha256"] for message in receiver.messages})
     result.offsets, result.recorded = len(receiver.offsets), len(on_disk)
     result.largest_share_of_rate = figures["largest_share_of_rate"]
-    audit = site.replay()
+    audit = site.replay(public_key)
     assert audit["exit"] == 0, audit
     result.files = len(audit["files"])
 

@@ -235,9 +235,12 @@ stuck_after_min = 6000.0
                 found[seq] = record.data
         return found
 
-    def replay(self) -> dict[str, Any]:
-        """What `compensator replay` says, with its exit code."""
+    def replay(self, public_key: Path | None = None) -> dict[str, Any]:
+        """What `compensator replay` says, with its exit code; with a key it knows the head of the chain, too."""
         command = [sys.executable, "-m", "compensator", "replay", str(self.recordings), "--json"]
+        if public_key is not None:
+            head = self.recordings.parent / f"{self.name}.head.json"
+            command += ["--public-key", str(public_key), "--head", str(head)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
         assert done.stdout, done.stderr
         return {**json.loads(done.stdout), "exit": done.returncode}

@@ -1,0 +1,162 @@
+"""Damage anywhere in a file is a finding with its place, and the other files are audited; bytes outside records."""
+
+from __future__ import annotations
+
+import random
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from compensator.audit.series import Audit, audit, summary
+from compensator.cli import main
+from compensator.recording.container import MAGIC
+from compensator.recording.framing import ATTACHMENT, CHUNK, DATA_END, FOOTER, HEADER, SCHEMA
+from compensator.recording.reading import recordings
+from tests.audit.made import MACHINE, Service
+
+SEEDS = range(40)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, bytes]]:
+    folder = tmp_path_factory.mktemp("damage")
+    for seq in (0, 6, 12):
+        Service(folder, seq=seq).run(6).stop()
+    return [(path.name, path.read_bytes()) for path in recordings(folder, MACHINE)]
+
+
+def placed(folder: Path, made: list[tuple[str, bytes]], which: int, data: bytes) -> list[Path]:
+    for i, (name, original) in enumerate(made):
+        (folder / name).write_bytes(data if i == which else original)
+    return [folder / name for name, _ in made]
+
+
+def records(data: bytes) -> list[tuple[int, int, int]]:
+    """Kind, place and length with head of each record of a file."""
+    at, found = len(MAGIC), []
+    while at < len(data) - len(MAGIC):
+        code, length = struct.unpack_from("<BQ", data, at)
+        found.append((code, at, 9 + length))
+        at += 9 + length
+    return found
+
+
+def first_chunk(data: bytes) -> tuple[int, int]:
+    return next((at, length) for code, at, length in records(data) if code == CHUNK)
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_flipped_bit_in_the_first_chunk_names_its_place_and_stops_nothing(
+    tmp_path: Path, made: list[tuple[str, bytes]], which: int
+) -> None:
+    rng = random.Random(which)
+    name, data = made[which]
+    at, length = first_chunk(data)
+    for _ in range(15):
+        changed = bytearray(data)
+        changed[rng.randrange(at, at + length)] ^= 1 << rng.randrange(8)
+        found = audit(placed(tmp_path, made, which, bytes(changed)))
+        assert not found.clean and found.samples >= 12, summary(found)
+        assert {finding.file for finding in found.findings} == {name}
+        assert any(finding.kind in ("damaged", "index") and "byte" in finding.line() for finding in found.findings)
+
+
+def test_the_first_bytes_of_a_file(tmp_path: Path, made: list[tuple[str, bytes]]) -> None:
+    for at in range(len(MAGIC)):
+        changed = bytearray(made[1][1])
+        changed[at] ^= 4
+        found = audit(placed(tmp_path, made, 1, bytes(changed)))
+        assert [finding.kind for finding in found.findings] == ["damaged"] and "byte 0" in found.findings[0].line()
+        assert found.samples == 12
+
+
+def test_the_command_gives_3_and_audits_the_others(
+    tmp_path: Path, made: list[tuple[str, bytes]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, data = made[0]
+    at, _ = first_chunk(data)
+    changed = bytearray(data)
+    changed[at + 60] ^= 1
+    paths = placed(tmp_path, made, 0, bytes(changed))
+    assert main(["replay", *map(str, paths)]) == 3
+    shown = capsys.readouterr().out
+    assert f"{name}: damaged: byte {at}" in shown and "12 samples" in shown
+    paths[0].write_bytes(b"t_s,y_um\n0,1\n")
+    assert main(["replay", *map(str, paths)]) == 2
+
+
+# ------------------------------------------------------------------ bytes outside records
+
+
+def _resealed(data: bytearray) -> bytes:
+    """Both CRCs at the end made to fit."""
+    there = records(bytes(data))
+    end = next(at for code, at, _ in there if code == DATA_END)
+    struct.pack_into("<I", data, end + 9, zlib.crc32(data[:end]))
+    footer = next(at for code, at, _ in there if code == FOOTER)
+    summary_at = end + next(length for code, at, length in there if code == DATA_END)
+    struct.pack_into("<I", data, footer + 25, zlib.crc32(data[summary_at : footer + 25]))
+    return bytes(data)
+
+
+def header(data: bytes) -> bytes:
+    return _resealed(bytearray(data.replace(b"compensator 0", b"compensatos 0", 1)))
+
+
+def data_crc(data: bytes) -> bytes:
+    changed = bytearray(data)
+    struct.pack_into("<I", changed, next(at for code, at, _ in records(data) if code == DATA_END) + 9, 0)
+    return bytes(changed)
+
+
+def summary_crc(data: bytes) -> bytes:
+    changed = bytearray(data)
+    struct.pack_into("<I", changed, next(at for code, at, _ in records(data) if code == FOOTER) + 25, 0)
+    return bytes(changed)
+
+
+def chunk_crc(data: bytes) -> bytes:
+    changed = bytearray(data)
+    struct.pack_into("<I", changed, first_chunk(data)[0] + 9 + 24, 0)
+    return _resealed(changed)
+
+
+def attachment_crc(data: bytes) -> bytes:
+    changed = bytearray(data)
+    at, length = next((at, length) for code, at, length in records(data) if code == ATTACHMENT)
+    struct.pack_into("<I", changed, at + length - 4, 0)
+    return _resealed(changed)
+
+
+@pytest.mark.parametrize("change", [header, data_crc, summary_crc, chunk_crc, attachment_crc])
+def test_bytes_that_carry_no_record_are_remarked_on(
+    tmp_path: Path, made: list[tuple[str, bytes]], change: Callable[[bytes], bytes]
+) -> None:
+    assert "outside_chain" not in _codes(audit(placed(tmp_path, made, 1, made[1][1])))
+    changed = change(made[1][1])
+    assert changed != made[1][1]
+    found = audit(placed(tmp_path, made, 1, changed))
+    assert found.clean and _codes(found) == ["outside_chain"], summary(found)
+    assert made[1][0] in found.remarks[-1]
+
+
+def test_a_schema_that_no_channel_has(tmp_path: Path) -> None:
+    live = Service(tmp_path).run(6)
+    path = live.recorder.path
+    assert path is not None
+    live.kill()
+    data = path.read_bytes()
+    code, at, length = records(data)[0]
+    assert code == HEADER
+    body = struct.pack("<H", 99) + b"".join(struct.pack("<I", len(part)) + part for part in (b"ghost", b"", b"hidden"))
+    extra = struct.pack("<BQ", SCHEMA, len(body)) + body
+    path.write_bytes(data[: at + length] + extra + data[at + length :])
+    found = audit([path])
+    assert found.clean and "outside_chain" in _codes(found) and "ghost" in " ".join(found.remarks)
+
+
+def _codes(found: Audit) -> list[str]:
+    return [str(remark.code) for remark in found.remarks]

@@ -1,0 +1,277 @@
+"""Recordings changed by somebody who can write their folder, drawn from a seed, and what an audit may then believe.
+
+The forger knows the format and computes chains that fit, but has neither the key nor the head. Whether he is found is
+not stated for each attack: it follows from what he has changed. An audit that finds nothing must not have been
+deceived about a record that a signature or the head covers.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from compensator.audit.series import Audit, audit
+from compensator.errors import DataError
+from compensator.recording.reading import last_value, recordings
+from compensator.recording.signature import Signer
+from tests.audit.attacks import rechained, unsigned_seals, without_seals
+from tests.audit.made import MACHINE, Service
+from tests.audit.tampering import Line, lines_of, rewrite, with_new_values
+from tests.audit.test_signatures import write_key
+from tests.fuzz.mutation import mutated
+
+#: Minutes that the recorded service ran each time; it was stopped, killed, and killed again.
+RUNS = (65, 20, 70)
+_NONE_LEFT = "no file is left"
+
+
+def records(path: Path) -> list[Line]:
+    """The records of a file, without its chain and without the seal of a recovered end."""
+    lines = [line for line in lines_of(path)[0] if line.topic != "chain"]
+    if lines and lines[-1].topic == "seal" and b'"reason":"recovered"' in lines[-1].data:
+        lines.pop()
+    return lines
+
+
+@dataclass
+class Originals:
+    """Recordings of a machine with a key and a head; the newest one has no end.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Holds `rec`, the key pair and the head.
+    """
+
+    folder: Path
+
+    def __post_init__(self) -> None:
+        self.private, self.public = write_key(self.folder, "machine", 7)
+        seq = 0
+        for i, minutes in enumerate(RUNS):
+            service = self.start(self.folder, seq).run(minutes)
+            service.kill() if i else service.stop()
+            seq += minutes
+        self.next_seq = seq
+        self.records = {path.name: records(path) for path in recordings(self.folder / "rec", MACHINE)}
+        self.names = list(self.records)
+
+    def start(self, folder: Path, seq: int) -> Service:
+        """Start the service, with the key and the head of a folder."""
+        return Service(folder / "rec", seq=seq, signer=Signer(self.private), head=folder / "vmc-07.head.json")
+
+    def signed(self, name: str, there: list[Line]) -> int:
+        """Number of records of a file that signatures cover.
+
+        Without the head the newest file may have been cut off before a seal; then those that are left count.
+        """
+        if name != self.names[-1]:
+            return len(self.records[name])
+        seals = [i for i, line in enumerate(there) if line.topic == "seal" and b'"signature":""' not in line.data]
+        return 1 + max(seals, default=-1)
+
+    def written(self, name: str) -> int:
+        """Number of records of a file that are on disk by the head: all but the last group of the newest file."""
+        lines = self.records[name]
+        last = lines[-1].time_ns if name == self.names[-1] else -1
+        return sum(line.time_ns != last for line in lines)
+
+
+def deceived(originals: Originals, folder: Path, *, head: bool) -> str:
+    """Return which record an audit without findings would be wrong about; empty if about none.
+
+    Parameters
+    ----------
+    originals : Originals
+        What was recorded.
+    folder : pathlib.Path
+        Holds the changed recordings.
+    head : bool
+        Whether the head was known, to the audit or to the service at its next start.
+    """
+    there = {path.name: path for path in recordings(folder / "rec", MACHINE)}
+    kept = [name for name in originals.names if name in there]
+    if not kept:
+        return _NONE_LEFT if head else ""
+    first, last = originals.names.index(kept[0]), originals.names.index(kept[-1])
+    if kept != originals.names[first : last + 1]:
+        return f"between {kept[0]} and {kept[-1]} a file is missing"
+    if head and kept[-1] != originals.names[-1]:
+        return "the newest file is missing"
+    for name in kept:
+        found: list[Line] = []
+        with suppress(DataError):
+            found = records(there[name])
+        count = originals.written(name) if head else originals.signed(name, found)
+        if found[:count] != originals.records[name][:count]:
+            return f"{name}: one of the first {count} records"
+    return ""
+
+
+# ---------------------------------------------------------------------- what a forger does
+
+
+def _edit(rng: random.Random, lines: list[Line]) -> list[Line]:
+    """One to three records changed, removed, repeated or exchanged."""
+    lines = list(lines)
+    for _ in range(rng.randrange(1, 4)):
+        places = [i for i, line in enumerate(lines) if line.topic not in ("chain", "seal")]
+        if len(places) < 2:
+            return lines
+        # Often near the end, where the signatures are few.
+        i = rng.choice(places[-9:] if rng.random() < 0.3 else places)
+        way = rng.randrange(5)
+        if way < 2:
+            digits = [at for at, byte in enumerate(lines[i].data) if 49 <= byte <= 56]
+            at = rng.choice(digits)
+            data = lines[i].data[:at] + bytes((lines[i].data[at] + 1,)) + lines[i].data[at + 1 :]
+            lines[i] = replace(lines[i], data=data)
+        elif way == 2:
+            lines[i] = replace(lines[i], data=mutated(rng.randrange(2**32), lines[i].data))
+        elif way == 3:
+            del lines[i]
+        else:
+            lines.insert(i, lines[rng.choice(places)])
+    return lines
+
+
+def _kept_seals(lines: list[Line]) -> list[Line]:
+    return lines
+
+
+def _cut(rng: random.Random, lines: list[Line]) -> list[Line]:
+    ends = [i for i, line in enumerate(lines) if line.topic == "chain"]
+    return lines[: rng.choice(ends) + 1]
+
+
+def _rewritten(rng: random.Random, paths: list[Path]) -> None:
+    """Change one file and make its chain, and perhaps those after it, anew."""
+    which = rng.randrange(len(paths))
+    seals: Callable[[list[Line]], list[Line]] = rng.choice((_kept_seals, without_seals, unsigned_seals))
+    first = rng.choice((partial(_edit, rng), partial(_cut, rng), _kept_seals))
+    form = rng.randrange(4)
+    before: bytes | None = None
+    for path in paths[which : which + 1 if rng.random() < 0.3 else None]:
+
+        def change(lines: list[Line], first: Callable[[list[Line]], list[Line]] = first) -> list[Line]:
+            return seals(first(lines))
+
+        if form == 0:
+            contents = lines_of(path)[1]
+            if before is not None:
+                contents.run["previous_chain"] = before.hex()
+            rewrite(path, lambda lines, c=contents, edit=change: with_new_values(edit(lines), c))  # type: ignore[misc]
+        else:
+            cut = rng.randrange(1, 400) if form == 3 else 0
+            rechained(path, change, before=before, finished=form == 1, cut=cut)
+        before, first = last_value(path), _kept_seals
+
+
+def _bytes(rng: random.Random, paths: list[Path]) -> None:
+    """Change bytes of one file without knowing the format."""
+    path = rng.choice(paths)
+    data = bytearray(path.read_bytes())
+    early = rng.randrange(min(len(data), 6000))
+    way = rng.randrange(5)
+    if way == 0:
+        data[early] ^= 1 << rng.randrange(8)
+    elif way == 1:
+        del data[rng.randrange(len(data)) :]
+    elif way == 2:
+        at = rng.randrange(len(data))
+        data[at : at + rng.randrange(1, 200)] = b""
+    elif way == 3:
+        data[early : early + 40] = rng.randbytes(40)
+    else:
+        data = bytearray(mutated(rng.randrange(2**32), bytes(data)))
+    path.write_bytes(data)
+
+
+def _removed(rng: random.Random, paths: list[Path]) -> None:
+    for path in rng.sample(paths, rng.randrange(1, len(paths) + 1)):
+        path.unlink()
+
+
+def _exchanged(rng: random.Random, paths: list[Path]) -> None:
+    one, other = rng.sample(paths, 2)
+    data = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(data)
+
+
+def _inserted(rng: random.Random, paths: list[Path]) -> None:
+    """Copy a file to a later time, and perhaps let it continue from the newest one."""
+    copy = paths[-1].with_name(f"{MACHINE}_20260105T{rng.randrange(9, 24):02d}0000Z.mcap")
+    shutil.copy(rng.choice(paths), copy)
+    if rng.random() < 0.7:
+        rechained(copy, rng.choice((without_seals, unsigned_seals)), before=last_value(paths[-1]))
+
+
+ATTACKS: dict[str, Callable[[random.Random, list[Path]], None]] = {
+    "rewritten": _rewritten,
+    "rewritten again": _rewritten,
+    "bytes": _bytes,
+    "removed": _removed,
+    "exchanged": _exchanged,
+    "inserted": _inserted,
+}
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What came of one attack: its kind, whether it was found, and about which record somebody was deceived."""
+
+    kind: str
+    found: bool
+    deceived: str
+
+
+def attacked(originals: Originals, folder: Path, seed: int) -> Tried:
+    """Draw an attack; audit with the key, with the head, and again after the service has started.
+
+    Parameters
+    ----------
+    originals : Originals
+        What was recorded; copied.
+    folder : pathlib.Path
+        An empty folder.
+    seed : int
+        Of the attack.
+    """
+    rng = random.Random(seed)
+    shutil.copytree(originals.folder / "rec", folder / "rec")
+    shutil.copy(originals.folder / "vmc-07.head.json", folder)
+    kind = rng.choice(list(ATTACKS))
+    ATTACKS[kind](rng, recordings(folder / "rec", MACHINE))
+    found = []
+    for head in (False, True):
+        verdict = _verdict(originals, folder, head=head)
+        found.append(verdict is None or not verdict.clean)
+        if not found[-1] and (wrong := deceived(originals, folder, head=head)):
+            return Tried(kind, False, f"{'with' if head else 'without'} the head: {wrong}")
+    originals.start(folder, originals.next_seq).run(3).stop()
+    verdict = _verdict(originals, folder, head=False)
+    found.append(verdict is None or not verdict.clean)
+    if verdict is not None and verdict.clean:
+        wrong = deceived(originals, folder, head=True)
+        # Where all files are gone, the new one names the newest of them; they may be in an archive.
+        named = wrong == _NONE_LEFT and originals.names[-1] in " ".join(verdict.remarks)
+        if wrong and not named:
+            return Tried(kind, False, f"after a restart: {wrong}")
+    return Tried(kind, all(found), "")
+
+
+def _verdict(originals: Originals, folder: Path, *, head: bool) -> Audit | None:
+    """Audit the folder; None if it is refused in one line."""
+    paths = recordings(folder / "rec", MACHINE)
+    known = folder / "vmc-07.head.json" if head else None
+    try:
+        return audit(paths, public_key=originals.public, head=known) if paths else None
+    except DataError as error:
+        assert "\n" not in str(error)
+        return None
