@@ -43,8 +43,14 @@ from compensator.service.plausibility.guards import TEMPERATURES
 _NEAR = 4.0
 #: A returned value may differ by this part of the jump from the expected one, at most by the other part.
 _RETURNED, _RETURNED_MOST = 0.2, 0.5
-#: Consecutive samples for which a channel must be back.
-BACK_SAMPLES = 3
+#: Part of the permitted change that the temperature itself is expected to make; a suspect channel's is a new jump beyond.
+_NATURAL = 0.5
+#: Consecutive samples for which a channel must be back; doubled by each further jump, up to the last number.
+BACK_SAMPLES, MOST_BACK_SAMPLES = 3, 30
+#: Further jumps from which on the shifted engine no longer follows the channel: a loose contact has no level.
+_UNSTEADY = 2
+#: Samples without a jump after which earlier ones count no more.
+FORGOTTEN_SAMPLES = 240
 #: Deviations at which one sample's evidence is clipped: a switched heat is not evidence against a sensor.
 _CLIP = 5.0
 #: Weight of the past in the log likelihood ratio of a suspect channel, by sample: about half an hour.
@@ -52,7 +58,7 @@ _KEEP = 1.0 - 1.0 / 30.0
 #: Log likelihood ratio, and least number of samples, for the model to agree with a channel.
 _AGREES, _AGREES_SAMPLES = 12.0, 10
 #: A jump within the permitted rate is watched for this number of samples, and refuted at this log likelihood ratio.
-WATCHED_SAMPLES, _REFUTED = 15, 25.0
+WATCHED_SAMPLES, _REFUTED = 15, 12.0
 #: Standard deviations of the innovation that such a jump exceeds in any case.
 _JUMP = 6.0
 #: Y speaks for one engine: its residual within the first, the other's larger by the second, in deviations of Y.
@@ -81,6 +87,12 @@ class JumpState(msgspec.Struct, kw_only=True):
         Mean of measured Y − prediction over the last samples, µm: what a jump is compared with.
     shifts_k : dict of str to float
         By channel that has jumped: measured − expected, K. Empty if none has.
+    first_k : dict of str to float
+        The first jump of each of them, K.
+    again : int
+        Jumps after the first one, also of earlier times until `FORGOTTEN_SAMPLES` have passed.
+    quiet : int
+        Samples since the last jump or return.
     is_suspect : bool
         Whether these channels are not used; otherwise they are watched.
     samples : int
@@ -97,6 +109,9 @@ class JumpState(msgspec.Struct, kw_only=True):
 
     level_um: float = NAN
     shifts_k: dict[str, float] = {}
+    first_k: dict[str, float] = {}
+    again: int = 0
+    quiet: int = FORGOTTEN_SAMPLES
     is_suspect: bool = False
     samples: int = 0
     ratio: float = 0.0
@@ -144,8 +159,8 @@ class JumpWatch:
         self._least_k = config.guards.jump_min_k
         self._model = model
         period_min = model.period_s / 60.0
-        self._step_k = {
-            channel.name: (channel.rate_max_per_min or math.inf) * period_min
+        self._change_k = {
+            channel.name: _NATURAL * (channel.rate_max_per_min or math.inf) * period_min
             for channel in config.channel
             if channel.name in TEMPERATURES
         }
@@ -185,7 +200,12 @@ class JumpWatch:
             raise ValueError("state of a jump that is incomplete")
         self._believing, self._shifted = runs
         self._state = msgspec.structs.replace(
-            state, believing=None, shifted=None, shifts_k=dict(state.shifts_k), back=dict(state.back)
+            state,
+            believing=None,
+            shifted=None,
+            shifts_k=dict(state.shifts_k),
+            first_k=dict(state.first_k),
+            back=dict(state.back),
         )
 
     def _run_of(self, branch: Branch | None) -> _Run | None:
@@ -241,7 +261,10 @@ class JumpWatch:
     def _end(self) -> None:
         self._believing = self._shifted = None
         old = self._state
-        self._state = JumpState(level_um=NAN if old.is_suspect else old.level_um)
+        if old.is_suspect:
+            self._state = JumpState(again=old.again, quiet=0)
+        else:
+            self._state = JumpState(level_um=old.level_um, again=old.again, quiet=old.quiet)
 
     # ------------------------------------------------------------------ one sample
 
@@ -287,9 +310,12 @@ class JumpWatch:
         return Judgement(verdict.estimate, [*notes, *verdict.notes], {n: offered[n] for n in verdict.accepted})
 
     def observe(self, y_um: float, estimate: Estimate) -> None:
-        """Follow the level of measured Y − prediction, which a later jump is compared with."""
+        """Count quiet samples, and follow the level of measured Y − prediction, which a later jump is compared with."""
         state = self._state
-        if not self.is_on or state.shifts_k or math.isnan(y_um):
+        if not self.is_on or state.shifts_k:
+            return
+        state.quiet = min(state.quiet + 1, FORGOTTEN_SAMPLES)
+        if math.isnan(y_um):
             return
         residual = y_um - estimate.y_um
         state.level_um = (
@@ -303,7 +329,9 @@ class JumpWatch:
         self._believing, self._shifted = _Run(Engine(self._model)), _Run(Engine(self._model))
         for run in (self._believing, self._shifted):
             run.engine.restore(snapshot)
-        self._state = JumpState(level_um=self._state.level_um, is_suspect=is_suspect)
+        old = self._state
+        again = old.again + 1 if old.quiet < FORGOTTEN_SAMPLES else 0
+        self._state = JumpState(level_um=old.level_um, is_suspect=is_suspect, again=again)
 
     def _watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
         """Return the channels that differ from what the engine expects by more than its deviation explains."""
@@ -332,21 +360,26 @@ class JumpWatch:
                 values[name] = NAN
             elif name in state.shifts_k:
                 shift = state.shifts_k[name]
-                near = min(max(_NEAR * std, _RETURNED * abs(shift)), _RETURNED_MOST * abs(shift))
-                back = abs(difference) <= near
+                near = max(_NEAR * std, _RETURNED * abs(shift))
+                # Where the expectation itself is uncertain by the size of the jump, a return shows nothing.
+                back = abs(difference) <= near <= _RETURNED_MOST * abs(state.first_k[name])
                 state.back[name] = state.back.get(name, 0) + 1 if back else 0
                 if back:
                     values[name] = value
-                elif abs(difference - shift) <= max(self._step_k[name], _NEAR * std) or not state.is_suspect:
+                elif state.again >= _UNSTEADY:
+                    values[name] = NAN
+                elif abs(difference - shift) <= max(self._change_k[name], _NEAR * std) or not state.is_suspect:
                     values[name] = value - shift
                 else:
                     new.append(name)
+                    state.again += 1
             elif name in jumped:
                 new.append(name)
             else:
                 values[name] = value
             if name in new:
                 state.shifts_k[name], state.back[name], values[name] = difference, 0, NAN
+                state.first_k.setdefault(name, difference)
         return _Fed(values, new)
 
     def _weigh(self, believing: _Run, shifted: _Run, offered: Mapping[str, float], fed: _Fed) -> None:
@@ -379,7 +412,8 @@ class JumpWatch:
 
     def _suspected(self, engine: Engine) -> Judgement:
         state = self._state
-        if all(state.back.get(name, 0) >= BACK_SAMPLES for name in state.shifts_k):
+        needed = min(BACK_SAMPLES * 2 ** min(state.again, 8), MOST_BACK_SAMPLES)
+        if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
             return self._accept(engine, self._shifted, "has returned to what was expected before")
         if state.y_for >= Y_SAMPLES:
             return self._accept(engine, self._believing, "is used again: measured Y agrees with it")
@@ -450,5 +484,5 @@ def _quality(channel: ChannelSample | None) -> str:
 
 def _offered(channel: ChannelSample | None) -> float:
     """Return the value of a channel, whether it is used or only suspect; NaN if it cannot be one."""
-    usable = (SampleQuality.GOOD, SampleQuality.SUSPECT, SampleQuality.TOO_FAST)
+    usable = (SampleQuality.GOOD, SampleQuality.SUSPECT, SampleQuality.TOO_FAST, SampleQuality.T_Q_BELOW_AT)
     return number(channel.mean) if channel is not None and channel.quality in usable else NAN
