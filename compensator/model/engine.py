@@ -344,6 +344,10 @@ class Engine:
         found = self._observer.forecast(at_degc - reference.at_degc)
         return dataclasses.replace(found, t_q_k=found.t_q_k + reference.t_q_degc, at_k=found.at_k + reference.at_degc)
 
+    def drive_for(self, t_q_k: float) -> float:
+        """Return the heat, W (T_Q − AT, K, in a direct model), that would explain a difference of T_Q, K, at once."""
+        return self._observer.drive_for(t_q_k)
+
     def shift_reference(self, t_q_k: float, at_k: float) -> None:
         """Move the reference without a change of the state: a sensor has another zero from now on, K."""
         reference = self._reference

@@ -213,6 +213,10 @@ class Observer:
         _, t_q_variance = self._t_q_column(p, self._r_tq)
         return Forecast(self._t_q_of(x), math.sqrt(max(t_q_variance, 0.0)), at_expected, math.sqrt(at_variance))
 
+    def drive_for(self, t_q_k: float) -> float:
+        """Return the drive that would explain a difference of T_Q, K, from what is expected, within one sample."""
+        return self._x[self._q] + (t_q_k / self._d[0] if self._d[0] != 0.0 else math.copysign(math.inf, t_q_k))
+
     # ------------------------------------------------------------------ covariance
 
     def _recurse(self, r_at: float | None, r_tq: float | None, complete: bool) -> tuple[list[float], list[float]]:

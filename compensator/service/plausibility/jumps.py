@@ -15,9 +15,9 @@ The channel is accepted again if
 - measured Y agrees with the believing engine and contradicts the shifted one;
 - an operator says so: `resume` believes it, a zero keeps the state and gives the sensor its new zero.
 
-A jump within `rate_max_per_min` is used at first, as it may be heat; with `jump_min_k` both engines run for some
-samples, and where the shifted one expects them far better, the channel becomes suspect and the state that of the
-shifted engine: what the wrong values did is undone.
+A jump within `rate_max_per_min` is used at first; with `jump_min_k` both engines run for some samples, unless heat
+within its range of validity explains a jump of T_Q. Where the shifted one expects them far better, the channel becomes
+suspect and the state that of the shifted engine: what the wrong values did is undone.
 
 Everything here is computed from the samples alone, with scalar floats; the state is part of the compensation's.
 """
@@ -59,6 +59,8 @@ _KEEP = 1.0 - 1.0 / 30.0
 _AGREES, _AGREES_SAMPLES = 12.0, 10
 #: A jump within the permitted rate is watched for this number of samples, and refuted at this log likelihood ratio.
 WATCHED_SAMPLES, _REFUTED = 15, 12.0
+#: Heat beyond its range of validity by this part of the range cannot explain such a jump of T_Q.
+_BEYOND = 0.2
 #: Standard deviations of the innovation that such a jump exceeds in any case.
 _JUMP = 6.0
 #: Y speaks for one engine: its residual within the first, the other's larger by the second, in deviations of Y.
@@ -101,6 +103,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Log likelihood ratio of the believing over the shifted engine.
     back : dict of str to int
         Consecutive samples for which each channel has been back.
+    at_held : int
+        Consecutive samples for which AT has been where it was before the jump.
     y_for : int
         Consecutive samples for which measured Y has spoken for the believing engine.
     believing, shifted : Branch, optional
@@ -116,6 +120,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     samples: int = 0
     ratio: float = 0.0
     back: dict[str, int] = {}
+    at_held: int = 0
     y_for: int = 0
     believing: Branch | None = None
     shifted: Branch | None = None
@@ -297,6 +302,7 @@ class JumpWatch:
         if believing is None or shifted is None:
             return Judgement()
         found = self._fed(shifted, offered, jumped)
+        self._compare_held(engine, offered["at_degc"])
         if found.jumped and self._state.is_suspect:
             believing.engine.restore(shifted.engine.snapshot())
             self._state.samples, self._state.ratio, self._state.y_for = 0, 0.0, 0
@@ -343,9 +349,19 @@ class JumpWatch:
             ("at_degc", offered["at_degc"] - expected.at_k, expected.at_std_k),
             ("t_q_degc", offered["t_q_degc"] - expected.t_q_k, expected.t_q_std_k),
         ):
-            if abs(value) > max(self._least_k, _JUMP * std):
+            if abs(value) > max(self._least_k, _JUMP * std) and not (
+                name == "t_q_degc" and self._is_heat(engine.drive_for(value))
+            ):
                 found.append(name)
         return found
+
+    def _is_heat(self, heat_w: float) -> bool:
+        """Return whether there can be so much heat; a short burst of it looks like a jump for many minutes."""
+        if "heat_w" not in self._model.validity:
+            return True
+        low, high = self._model.validity["heat_w"]
+        beyond = _BEYOND * (high - low)
+        return low - beyond <= heat_w <= high + beyond
 
     def _fed(self, shifted: _Run, offered: Mapping[str, float], jumped: list[str]) -> _Fed:
         """Return what the shifted engine is given: at its own zero, less the jump, or missing at a jump."""
@@ -382,6 +398,14 @@ class JumpWatch:
                 state.first_k.setdefault(name, difference)
         return _Fed(values, new)
 
+    def _compare_held(self, engine: Engine, at_degc: float) -> None:
+        """Count the samples for which AT is where the engine without it holds it: air that a door let in goes again."""
+        state, first_k = self._state, abs(self._state.first_k.get("at_degc", NAN))
+        expected, std = _expected(engine, "at_degc", NAN)
+        near = max(_NEAR * std, _RETURNED * first_k)
+        is_back = list(state.shifts_k) == ["at_degc"] and abs(at_degc - expected) <= near <= _RETURNED_MOST * first_k
+        state.at_held = state.at_held + 1 if is_back else 0
+
     def _weigh(self, believing: _Run, shifted: _Run, offered: Mapping[str, float], fed: _Fed) -> None:
         """Add a sample to the log likelihood ratio; the jump itself speaks for neither."""
         cost = 0.0
@@ -415,6 +439,8 @@ class JumpWatch:
         needed = min(BACK_SAMPLES * 2 ** min(state.again, 8), MOST_BACK_SAMPLES)
         if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
             return self._accept(engine, self._shifted, "has returned to what was expected before")
+        if state.at_held >= needed:
+            return self._accept(engine, None, "has returned to where it was before")
         if state.y_for >= Y_SAMPLES:
             return self._accept(engine, self._believing, "is used again: measured Y agrees with it")
         if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
@@ -422,7 +448,6 @@ class JumpWatch:
         return Judgement()
 
     def _accept(self, engine: Engine, run: _Run | None, how: str) -> Judgement:
-        assert run is not None
         names = list(self._state.shifts_k)
         notes = [
             Note(
@@ -432,8 +457,10 @@ class JumpWatch:
             )
             for name in names
         ]
-        engine.restore(run.engine.snapshot())
-        estimate = run.estimate
+        estimate = None
+        if run is not None:
+            engine.restore(run.engine.snapshot())
+            estimate = run.estimate
         self._end()
         return Judgement(estimate, notes, dict.fromkeys(names, NAN))
 
