@@ -387,6 +387,10 @@ class Compensation:
             return ()
         decided, found = self.probing.decide(raw.machine, raw.seq, probes)
         notes += found
+        if self._config.probe is not None and self._memory.estimate is not None:
+            for probe in decided:
+                std_um = probe.std_um if probe.std_um is not None else self._config.probe.std_um
+                self._jumps.receive_probe(number(probe.innovation_um), std_um, self._memory.estimate.y_um)
         return tuple(decided)
 
     def _evidence(self, raw: Sample, values: Values, prediction: Prediction) -> SensorEvidence:

@@ -12,7 +12,7 @@ The channel is accepted again if
 - the model agrees with it: over the last samples the believing engine has expected T_Q and AT better than the shifted
   one, by a log likelihood ratio (T_Q follows AT, and heat that rises stays). The state becomes that of the believing
   one;
-- measured Y agrees with the believing engine and contradicts the shifted one;
+- measured Y, or two probes, agree with the believing engine and contradict the shifted one;
 - an operator says so: `resume` believes it, a zero keeps the state and gives the sensor its new zero.
 
 A jump within `rate_max_per_min` is used at first; with `jump_min_k` both engines run for some samples, unless heat
@@ -43,7 +43,7 @@ from compensator.service.plausibility.guards import TEMPERATURES
 _NEAR = 4.0
 #: A returned value may differ by this part of the jump from the expected one, at most by the other part.
 _RETURNED, _RETURNED_MOST = 0.2, 0.5
-#: Part of the permitted change that the temperature itself is expected to make; a suspect channel's is a new jump beyond.
+#: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
 _NATURAL = 0.5
 #: Consecutive samples for which a channel must be back; doubled by each further jump, up to the last number.
 BACK_SAMPLES, MOST_BACK_SAMPLES = 3, 30
@@ -67,6 +67,8 @@ _JUMP = 6.0
 _FITS, _CONTRADICTS = 3.0, 4.0
 #: Consecutive samples with Y for which it must.
 Y_SAMPLES = 10
+#: Probes that must speak for a channel: one may have met a chip.
+_PROBES = 2
 #: Weight of a new residual in the level before a jump.
 _LEVEL = 0.1
 
@@ -107,6 +109,8 @@ class JumpState(msgspec.Struct, kw_only=True):
         Consecutive samples for which AT has been where it was before the jump.
     y_for : int
         Consecutive samples for which measured Y has spoken for the believing engine.
+    probes_for : int
+        Probes that have spoken for it.
     believing, shifted : Branch, optional
         The two engines; None if no channel has jumped.
     """
@@ -122,6 +126,7 @@ class JumpState(msgspec.Struct, kw_only=True):
     back: dict[str, int] = {}
     at_held: int = 0
     y_for: int = 0
+    probes_for: int = 0
     believing: Branch | None = None
     shifted: Branch | None = None
 
@@ -305,7 +310,7 @@ class JumpWatch:
         self._compare_held(engine, offered["at_degc"])
         if found.jumped and self._state.is_suspect:
             believing.engine.restore(shifted.engine.snapshot())
-            self._state.samples, self._state.ratio, self._state.y_for = 0, 0.0, 0
+            self._start_evidence()
             notes += [self._jump_note(name) for name in jumped if name in found.jumped]
         self._weigh(believing, shifted, offered, found)
         believing.estimate = believing.engine.step(offered["t_q_degc"], offered["at_degc"], others)
@@ -314,6 +319,27 @@ class JumpWatch:
         self._weigh_y(y_um)
         verdict = self._suspected(engine) if self._state.is_suspect else self._watched(engine)
         return Judgement(verdict.estimate, [*notes, *verdict.notes], {n: offered[n] for n in verdict.accepted})
+
+    def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float) -> None:
+        """Compare both engines with a probe.
+
+        Parameters
+        ----------
+        innovation_um : float
+            Probe − prediction of the compensation, µm.
+        std_um : float
+            Standard deviation of the probe, µm.
+        predicted_um : float
+            Prediction of the compensation after the last sample, µm, without a correction.
+        """
+        believing, shifted = self._believing, self._shifted
+        if not self.suspects or believing is None or shifted is None or math.isnan(innovation_um):
+            return
+        if believing.estimate is None or shifted.estimate is None:
+            return
+        shown_um, std_um = innovation_um + predicted_um, math.hypot(std_um, self._y_std_um)
+        if _speaks_for(shown_um, believing.estimate, shifted.estimate, std_um):
+            self._state.probes_for += 1
 
     def observe(self, y_um: float, estimate: Estimate) -> None:
         """Count quiet samples, and follow the level of measured Y − prediction, which a later jump is compared with."""
@@ -362,6 +388,10 @@ class JumpWatch:
         low, high = self._model.validity["heat_w"]
         beyond = _BEYOND * (high - low)
         return low - beyond <= heat_w <= high + beyond
+
+    def _start_evidence(self) -> None:
+        state = self._state
+        state.samples, state.ratio, state.y_for, state.probes_for = 0, 0.0, 0, 0
 
     def _fed(self, shifted: _Run, offered: Mapping[str, float], jumped: list[str]) -> _Fed:
         """Return what the shifted engine is given: at its own zero, less the jump, or missing at a jump."""
@@ -430,9 +460,7 @@ class JumpWatch:
             return None
         if math.isnan(y_um) or math.isnan(state.level_um) or not self._y_std_um > 0.0:
             return None
-        moved = y_um - state.level_um
-        for_it, against = abs(moved - believing.estimate.y_um), abs(moved - shifted.estimate.y_um)
-        return for_it < _FITS * self._y_std_um and against > for_it + _CONTRADICTS * self._y_std_um
+        return _speaks_for(y_um - state.level_um, believing.estimate, shifted.estimate, self._y_std_um)
 
     def _suspected(self, engine: Engine) -> Judgement:
         state = self._state
@@ -443,6 +471,8 @@ class JumpWatch:
             return self._accept(engine, None, "has returned to where it was before")
         if state.y_for >= Y_SAMPLES:
             return self._accept(engine, self._believing, "is used again: measured Y agrees with it")
+        if state.probes_for >= _PROBES:
+            return self._accept(engine, self._believing, "is used again: probes agree with it")
         if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
             return self._accept(engine, self._believing, "is used again: the model agrees with it")
         return Judgement()
@@ -476,7 +506,8 @@ class JumpWatch:
                 self._end()
             else:
                 notes = [self._jump_note(name) for name in state.shifts_k]
-                state.is_suspect, state.ratio, state.samples, state.y_for = True, 0.0, 0, 0
+                state.is_suspect = True
+                self._start_evidence()
             return Judgement(estimate, notes)
         if state.samples >= WATCHED_SAMPLES:
             self._end()
@@ -489,6 +520,11 @@ class JumpWatch:
             f"{NAMES[name]} has jumped by {shift:+.2f} K against what was expected, {then}",
             {"code": Implausibility.JUMPED, "channel": name, "shift_k": shift},
         )
+
+
+def _speaks_for(y_um: float, believing: Estimate, shifted: Estimate, std_um: float) -> bool:
+    for_it, against = abs(y_um - believing.y_um), abs(y_um - shifted.y_um)
+    return for_it < _FITS * std_um and against > for_it + _CONTRADICTS * std_um
 
 
 @dataclass(frozen=True, slots=True)
