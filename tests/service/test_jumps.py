@@ -236,8 +236,8 @@ def test_the_state_goes_on_to_the_bit(day: dict[str, np.ndarray]) -> None:
 def test_a_threshold_needs_its_key() -> None:
     table = (
         "[guards]\nt_q_below_at_max_k = 2.0\njump_min_k = 1.0\n"
-        "[loss]\npredict_for_min = 1.0\n[zero]\nrest_rate_um_per_min = 1.0\n[machine]\nname = 'a'\n[model]\nfile = 'quill'\n"
-        "[recording]\nfolder = 'r'\n[zenoh]\nprefix = 's'\n"
+        "[loss]\npredict_for_min = 1.0\n[zero]\nrest_rate_um_per_min = 1.0\n"
+        "[machine]\nname = 'a'\n[model]\nfile = 'quill'\n[recording]\nfolder = 'r'\n[zenoh]\nprefix = 's'\n"
         "[limits]\noffset_max_um = 1.0\noffset_rate_max_um_per_min = 1.0\n"
         "validity = {t_q_degc = [0, 1], at_degc = [0, 1]}\n"
     )

@@ -49,6 +49,8 @@ _NATURAL = 0.5
 BACK_SAMPLES, MOST_BACK_SAMPLES = 3, 30
 #: Further jumps from which on the shifted engine no longer follows the channel: a loose contact has no level.
 _UNSTEADY = 2
+#: Longest gap that is interpolated once a loose contact is back, in samples: a lost heat is worse than a straight line.
+BRIDGED_SAMPLES = 480
 #: Samples without a jump after which earlier ones count no more.
 FORGOTTEN_SAMPLES = 240
 #: Deviations at which one sample's evidence is clipped: a switched heat is not evidence against a sensor.
@@ -218,13 +220,17 @@ class JumpWatch:
             back=dict(state.back),
         )
 
+    def _new_run(self) -> _Run:
+        return _Run(Engine(self._model, bridge_samples=BRIDGED_SAMPLES))
+
     def _run_of(self, branch: Branch | None) -> _Run | None:
         if branch is None:
             return None
-        engine = Engine(self._model)
-        engine.check(branch.engine)
-        engine.restore(branch.engine)
-        return _Run(engine, branch.estimate)
+        run = self._new_run()
+        run.engine.check(branch.engine)
+        run.engine.restore(branch.engine)
+        run.estimate = branch.estimate
+        return run
 
     def reset(self) -> None:
         """Forget the level of measured Y, and jumps that are only watched: there is another zero or another state."""
@@ -358,7 +364,7 @@ class JumpWatch:
 
     def _begin(self, engine: Engine, *, is_suspect: bool) -> None:
         snapshot = engine.snapshot()
-        self._believing, self._shifted = _Run(Engine(self._model)), _Run(Engine(self._model))
+        self._believing, self._shifted = self._new_run(), self._new_run()
         for run in (self._believing, self._shifted):
             run.engine.restore(snapshot)
         old = self._state
@@ -369,16 +375,16 @@ class JumpWatch:
         """Return the channels that differ from what the engine expects by more than its deviation explains."""
         if math.isnan(offered["t_q_degc"]) or math.isnan(offered["at_degc"]) or self._least_k is None:
             return []
-        expected = engine.forecast(offered["at_degc"])
+        at_degc, t_q_degc, least_k = offered["at_degc"], offered["t_q_degc"], self._least_k
+        # T_Q follows AT if AT is right, and not if it is wrong: only what neither explains is a jump of T_Q.
+        with_at, without = engine.forecast(at_degc), engine.forecast(NAN)
         found = []
-        for name, value, std in (
-            ("at_degc", offered["at_degc"] - expected.at_k, expected.at_std_k),
-            ("t_q_degc", offered["t_q_degc"] - expected.t_q_k, expected.t_q_std_k),
-        ):
-            if abs(value) > max(self._least_k, _JUMP * std) and not (
-                name == "t_q_degc" and self._is_heat(engine.drive_for(value))
-            ):
-                found.append(name)
+        if abs(at_degc - without.at_k) > max(least_k, _JUMP * without.at_std_k):
+            found.append("at_degc")
+        jumps = [t_q_degc - expected.t_q_k for expected in (with_at, without)]
+        limits = [max(least_k, _JUMP * expected.t_q_std_k) for expected in (with_at, without)]
+        if all(abs(k) > most and not self._is_heat(engine.drive_for(k)) for k, most in zip(jumps, limits, strict=True)):
+            found.append("t_q_degc")
         return found
 
     def _is_heat(self, heat_w: float) -> bool:
@@ -409,12 +415,15 @@ class JumpWatch:
                 near = max(_NEAR * std, _RETURNED * abs(shift))
                 # Where the expectation itself is uncertain by the size of the jump, a return shows nothing.
                 back = abs(difference) <= near <= _RETURNED_MOST * abs(state.first_k[name])
+                # A heat that is switched may bring it back for a moment.
+                unsure = min(state.back.get(name, 0), BACK_SAMPLES)
                 state.back[name] = state.back.get(name, 0) + 1 if back else 0
+                most = max((1 + unsure) * self._change_k[name], _NEAR * std)
                 if back:
                     values[name] = value
                 elif state.again >= _UNSTEADY:
                     values[name] = NAN
-                elif abs(difference - shift) <= max(self._change_k[name], _NEAR * std) or not state.is_suspect:
+                elif abs(difference - shift) <= most or not state.is_suspect:
                     values[name] = value - shift
                 else:
                     new.append(name)
