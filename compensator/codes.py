@@ -135,6 +135,12 @@ class Reason(Code):
         "A temperature has been missing for longer than loss.predict_for_min, so the offset is held.",
         "Repair the sensor; the offset then moves to its correct value at the permitted rate.",
     )
+    SUSPECT_CHANNEL = (
+        "suspect_channel",
+        "The channel after the colon has jumped and is not used until it returns, or until the model or measured Y "
+        "agrees with it.",
+        "Check that sensor and its plug; if it is right, send resume; if it was replaced, send zero.",
+    )
     OUTSIDE_VALIDITY = (
         "outside_validity",
         "T_Q, AT or the heat is outside the range of validity.",
@@ -207,6 +213,7 @@ class Reason(Code):
 SUFFIXES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         Reason.CHANNEL_MISSING: (),
+        Reason.SUSPECT_CHANNEL: ("t_q_degc", "at_degc"),
         Reason.OUTSIDE_VALIDITY: ("t_q_degc", "at_degc", "heat_w"),
         Reason.IMPLAUSIBLE: ("t_q_degc", "at_degc", "y_um", "model"),
     }
@@ -334,6 +341,11 @@ class SampleQuality(Code):
         "too_fast",
         "The value changed faster than rate_max_per_min of the channel.",
         "Check for a loose sensor or a noisy line.",
+    )
+    SUSPECT = (
+        "suspect",
+        "The channel has jumped, and nothing has spoken for its new value yet.",
+        "Check for a loose sensor, an exchanged plug or a couple that was replaced.",
     )
     STUCK = "stuck", "The value has not changed for too long.", "Check that the sensor and its module work."
     T_Q_BELOW_AT = (

@@ -84,9 +84,17 @@ class Channel(_Table, frozen=True, kw_only=True):
 
 
 class Guards(_Table, frozen=True, kw_only=True):
-    """`[guards]`: plausibility between channels."""
+    """`[guards]`: plausibility between channels, and what a jump of T_Q or AT leads to.
+
+    `suspect_jumps`: after a change beyond `rate_max_per_min` the channel is not used until evidence speaks for it; by
+    default it is used again as soon as the permitted change, which grows with the time, includes its value.
+    `jump_min_k`: a smaller jump, too, down to this one, makes the channel suspect if the next samples show that it is
+    no change of the heat; needs `suspect_jumps`.
+    """
 
     t_q_below_at_max_k: Kelvins
+    suspect_jumps: bool = False
+    jump_min_k: Kelvins | None = None
 
 
 class Validity(_Table, frozen=True, kw_only=True):
@@ -438,6 +446,8 @@ def _check(config: Config) -> None:
         raise ConfigError(
             f"plausibility.rest.channel = {rest.channel!r}: no such channel, expected one of: {', '.join(names)}"
         )
+    if config.guards.jump_min_k is not None and not config.guards.suspect_jumps:
+        raise ConfigError(f"guards.jump_min_k = {config.guards.jump_min_k:g}: expected guards.suspect_jumps = true")
     probe, offset_max = config.probe, config.limits.offset_max_um
     if probe is not None and probe.largest_um > offset_max:
         raise ConfigError(f"probe.largest_um = {probe.largest_um:g}, expected at most offset_max_um = {offset_max:g}")

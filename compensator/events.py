@@ -372,6 +372,8 @@ class Implausibility(StrEnum):
     TOGETHER = "together"
     RESIDUAL = "residual"
     RESIDUAL_OVER = "residual_over"
+    JUMPED = "jumped"
+    ACCEPTED = "accepted"
 
 
 _AnyData = TypeVar("_AnyData", bound=_Data)

@@ -19,7 +19,7 @@ from compensator.arrays import NAN, Vector
 from compensator.errors import ModelError
 from compensator.model.effects import EffectStream, Signals
 from compensator.model.late_observer import observer_of
-from compensator.model.observer import ObserverState
+from compensator.model.observer import Forecast, ObserverState
 from compensator.model.thermal_model import ThermalModel
 
 #: Longest run of incomplete samples that is repeated once both temperatures are back.
@@ -326,6 +326,32 @@ class Engine:
         else:
             self._remember(inputs)
         return self._advance(inputs, unknown=unknown)
+
+    def forecast(self, at_degc: float) -> Forecast:
+        """Return what the next sample is expected to measure, without advancing.
+
+        Parameters
+        ----------
+        at_degc : float
+            AT of that sample, °C, from which T_Q is then expected; NaN where missing.
+
+        Returns
+        -------
+        Forecast
+            With temperatures in °C.
+        """
+        reference = self._reference
+        found = self._observer.forecast(at_degc - reference.at_degc)
+        return dataclasses.replace(found, t_q_k=found.t_q_k + reference.t_q_degc, at_k=found.at_k + reference.at_degc)
+
+    def drive_for(self, t_q_k: float) -> float:
+        """Return the heat, W (T_Q − AT, K, in a direct model), that would explain a difference of T_Q, K, at once."""
+        return self._observer.drive_for(t_q_k)
+
+    def shift_reference(self, t_q_k: float, at_k: float) -> None:
+        """Move the reference without a change of the state: a sensor has another zero from now on, K."""
+        reference = self._reference
+        self._reference = Reference(reference.t_q_degc + t_q_k, reference.at_degc + at_k)
 
     def run(
         self,

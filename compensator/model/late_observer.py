@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compensator.arrays import NAN, Matrix, Vector
-from compensator.model.observer import Observer, ObserverState
+from compensator.model.observer import Forecast, Observer, ObserverState
 from compensator.model.thermal_model import ThermalModel
 
 #: Samples after which the variance of y is steady, whatever the slowest modes still do.
@@ -61,6 +61,17 @@ class LateObserver(Observer):
             t_q_k = t_q_k - at_k + at_then
         self._past.step(t_q_k, at_then, extra_t_q_k2=extra_t_q_k2, extra_at_k2=extra_then)
         self._run_on()
+
+    def forecast(self, at_k: float) -> Forecast:
+        """Return what the next sample is expected to measure, without advancing (as `Observer.forecast`)."""
+        then_k, extra = self._ambients[0]
+        at_then = NAN if extra == _MISSING else then_k
+        past, here = self._past.forecast(at_then), super().forecast(at_k)
+        t_q_k = past.t_q_k
+        if not self._of_ambient:
+            now = here.at_k if math.isnan(at_k) else at_k
+            t_q_k += now - (past.at_k if math.isnan(at_then) else at_then)
+        return Forecast(t_q_k, past.t_q_std_k, here.at_k, here.at_std_k)
 
     def _run_on(self) -> None:
         """Continue from the past to the present without T_Q."""

@@ -64,6 +64,24 @@ class ObserverState:
     started: bool = True
 
 
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What a sample is expected to measure.
+
+    Parameters
+    ----------
+    t_q_k, t_q_std_k : float
+        T_Q as a change from its reference, and the standard deviation of what is measured around it, K.
+    at_k, at_std_k : float
+        The same of AT.
+    """
+
+    t_q_k: float
+    t_q_std_k: float
+    at_k: float
+    at_std_k: float
+
+
 def _corrected(p: Matrix, gain: Matrix, column: Matrix, s: float) -> Matrix:
     """Return P − K L' − L K' + K S K' with L = P H', which is right for any gain K."""
     cross = np.multiply.outer(gain, column)
@@ -172,9 +190,32 @@ class Observer:
         self._x = x
 
     def _expected_t_q(self) -> float:
-        x = self._x
+        return self._t_q_of(self._x)
+
+    def _t_q_of(self, x: list[float]) -> float:
         expected = x[self._first[0]] + self._d[0] * x[self._q] + self._d[3] * x[self._a]
         return expected + x[self._first[3]]
+
+    def forecast(self, at_k: float) -> Forecast:
+        """Return what the next sample is expected to measure, without advancing.
+
+        Parameters
+        ----------
+        at_k : float
+            AT of that sample as a change from its reference, K, from which T_Q is then expected; NaN where missing.
+        """
+        x = self._moved(self._x) if self._started else self._x
+        p = self._moved_covariance(self._P) if self._started else self._P
+        at_expected, at_variance = x[self._a], float(p[self._a, self._a]) + self._r_at
+        if not math.isnan(at_k):
+            gain, p = self._update_at(p, self._r_at)
+            x = [*(value + k * (at_k - at_expected) for value, k in zip(x, gain, strict=False)), 0.0]
+        _, t_q_variance = self._t_q_column(p, self._r_tq)
+        return Forecast(self._t_q_of(x), math.sqrt(max(t_q_variance, 0.0)), at_expected, math.sqrt(at_variance))
+
+    def drive_for(self, t_q_k: float) -> float:
+        """Return the drive that would explain a difference of T_Q, K, from what is expected, within one sample."""
+        return self._x[self._q] + (t_q_k / self._d[0] if self._d[0] != 0.0 else math.copysign(math.inf, t_q_k))
 
     # ------------------------------------------------------------------ covariance
 

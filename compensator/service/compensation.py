@@ -24,6 +24,7 @@ from compensator.service.decision import Decision, OffsetDecision, mean
 from compensator.service.outcome import Outcome, Prediction, Values, estimate_message
 from compensator.service.plausibility import (
     HEATED_W,
+    JumpWatch,
     PlausibilityCheck,
     PlausibilityState,
     SensorEvidence,
@@ -67,6 +68,7 @@ class Compensation:
             raise ServiceError(f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured")
         self._guards = SensorGuards(config.channel, config.guards, self._period_min)
         self.plausibility = PlausibilityCheck(config, model)
+        self._jumps = JumpWatch(config, model)
         self._decision = OffsetDecision(config, model, self._engine.channels)
         self._limiter = self._decision.limiter
         self._probes: tuple[ReceivedProbe, ...] = ()
@@ -87,6 +89,7 @@ class Compensation:
             `warm`: it is not; only the deformation is zeroed, and the stored heat stays in the state.
             `auto`: `rest` if the predicted growth is below the configured rate, else `warm`.
         """
+        self._release(new_zero=True)
         self._zero.wanted, self._zero.mode = True, mode
 
     def hold(self) -> None:
@@ -96,14 +99,23 @@ class Compensation:
     def resume(self) -> None:
         """Follow the model again, at the permitted rate.
 
-        If sensors were exchanged, the state is wrong and is treated as unknown.
+        If sensors were exchanged, the state is wrong and is treated as unknown. A channel that has jumped is believed.
         """
+        self._release(new_zero=False)
         self._memory.operator_hold = False
         self._memory.internal_error = False
         if self.plausibility.exchanged:
             self.plausibility.acknowledge()
             if self._engine.has_reference:
                 self._pass_cold(self._cold_samples)
+
+    def _release(self, *, new_zero: bool) -> None:
+        """Use channels again that have jumped."""
+        names, estimate = self._jumps.release(self._engine, new_zero=new_zero)
+        for name in names:
+            self._guards.accept(name, NAN)
+        if estimate is not None:
+            self._memory.estimate = estimate
 
     def receive_probes(self, probes: Sequence[ReceivedProbe]) -> None:
         """Receive the probes that the next sample decides; without `[probe]` they are ignored."""
@@ -168,6 +180,7 @@ class Compensation:
                 memory=self._memory,
                 plausibility=self.plausibility.state if self.plausibility.is_on else None,
                 probing=self.probing.state if self.probing is not None else None,
+                jumps=self._jumps.state if self._jumps.is_on else None,
             )
         )
 
@@ -191,6 +204,7 @@ class Compensation:
         try:
             engine.check(restored.engine)
             engine.restore(restored.engine)
+            self._jumps.restore(restored.jumps)
         except ValueError as error:
             raise DataError(f"state: {error}") from error
         estimate = restored.memory.estimate
@@ -228,7 +242,9 @@ class Compensation:
         self._memory.missing_min += minutes
         if not self._engine.has_reference:
             return
-        if minutes > self.bridge_max_min:
+        is_cold = minutes > self.bridge_max_min
+        self._jumps.pass_time(min(samples, MOST_BRIDGED), held=is_cold)
+        if is_cold:
             self._pass_cold(min(samples, MOST_BRIDGED))
         else:
             self._memory.estimate = self._engine.skip(samples)
@@ -289,14 +305,18 @@ class Compensation:
             Everything to be recorded and published, in that order.
         """
         heat = self._memory.estimate.heat_w if self._memory.estimate else NAN
-        sample = msgspec.structs.replace(raw, channels=self._guards.check(raw.channels, heat))
+        channels = self._guards.check(raw.channels, heat, self._jumps.suspects)
+        sample = msgspec.structs.replace(raw, channels=channels)
         values = Values.of(sample.channels)
         notes: list[Note] = []
         self._set_zero(raw.time_utc_ns, values, notes)
         self._memory.seq, self._memory.time_utc_ns = raw.seq, raw.time_utc_ns
         estimate = None
         if self._engine.has_reference:
-            estimate = self._engine.step(values.t_q, values.at, values.others)
+            estimate = self._judge_jumps(sample, values, notes) or self._engine.step(
+                values.t_q, values.at, values.others
+            )
+            self._jumps.observe(values.y, estimate)
             self._memory.estimate = estimate
             self._memory.rates = [*self._memory.rates[-MEAN_SAMPLES + 1 :], estimate.y_rate_um_per_min]
             self._memory.heats = [*self._memory.heats[-MEAN_SAMPLES + 1 :], estimate.heat_w]
@@ -309,7 +329,9 @@ class Compensation:
             self._zero.y_ref = values.y - y_pred
         if self.plausibility.is_on:
             notes += self.plausibility.update(self._evidence(raw, values, prediction))
-        decision = self._decision.decide(values, prediction if estimate else None, self._memory, self.plausibility)
+        decision = self._decision.decide(
+            values, prediction if estimate else None, self._memory, self.plausibility, self._jumps.suspects
+        )
         if self.probing is not None and decision.limited is not None:
             held = decision.state in (State.HOLD, State.FAULT)
             self.probing.publish(decision.limited.offset_um, decision.limited.rate_um_per_min, is_held=held)
@@ -322,6 +344,16 @@ class Compensation:
             notes=tuple(notes),
             probes=decided,
         )
+
+    def _judge_jumps(self, sample: Sample, values: Values, notes: list[Note]) -> Estimate | None:
+        """Return the estimate of this sample if T_Q or AT is used again, or was refuted: the state is another one."""
+        if not self._jumps.is_on:
+            return None
+        found = self._jumps.update(self._engine, sample.channels, values.others, values.y)
+        notes += found.notes
+        for name, value in found.accepted.items():
+            self._guards.accept(name, value)
+        return found.estimate
 
     def _prediction(self) -> Prediction:
         """Return the deformation since the zero after the last sample, corrected by the probes; NaN before a zero."""
@@ -359,6 +391,10 @@ class Compensation:
             return ()
         decided, found = self.probing.decide(raw.machine, raw.seq, probes)
         notes += found
+        if self._config.probe is not None and self._memory.estimate is not None:
+            for probe in decided:
+                std_um = probe.std_um if probe.std_um is not None else self._config.probe.std_um
+                self._jumps.receive_probe(number(probe.innovation_um), std_um, self._memory.estimate.y_um)
         return tuple(decided)
 
     def _evidence(self, raw: Sample, values: Values, prediction: Prediction) -> SensorEvidence:
@@ -367,12 +403,14 @@ class Compensation:
             number(channel.mean) if channel is not None and channel.device_quality == SampleQuality.GOOD else NAN
             for channel in (raw.channels.get(name) for name in ("t_q_degc", "at_degc"))
         )
+        # One channel that has jumped is not an exchange of two.
+        below_k = at - t_q if len(self._jumps.suspects) != 1 else NAN
         reference = self._engine.reference
         rest = self._config.plausibility.rest if self._config.plausibility is not None else None
         # A prediction without both temperatures, or from an unknown state, is not evidence against a sensor.
         usable = not math.isnan(values.t_q + values.at) and self._memory.cold_min <= 0.0
         return SensorEvidence(
-            below_k=at - t_q,
+            below_k=below_k,
             apart_k=(values.t_q - reference.t_q_degc) - (values.at - reference.at_degc),
             rest=values.others.get(rest.channel, NAN) if rest is not None else NAN,
             residual_um=values.y - self._zero.y_ref - prediction.y_um if usable else NAN,
@@ -394,6 +432,7 @@ class Compensation:
             zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
         self.plausibility.reset(at_rest=not warm)
+        self._jumps.reset()
         if self.probing is not None:
             at_zero = self._memory.estimate
             self.probing.set_zero(time_ns, at_zero.contributions_um if at_zero is not None else None)

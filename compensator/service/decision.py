@@ -113,7 +113,12 @@ class OffsetDecision:
         self.limiter = OffsetLimiter(config.limits, self._period_min)
 
     def decide(
-        self, values: Values, prediction: Prediction | None, memory: Memory, plausibility: PlausibilityCheck
+        self,
+        values: Values,
+        prediction: Prediction | None,
+        memory: Memory,
+        plausibility: PlausibilityCheck,
+        suspects: Sequence[str] = (),
     ) -> Decision:
         """Decide one sample.
 
@@ -127,10 +132,13 @@ class OffsetDecision:
             Values kept from sample to sample; times in it advance.
         plausibility : PlausibilityCheck
             Checks between the sensors, including this sample.
+        suspects : sequence of str
+            Channels that have jumped and are not used.
         """
         pairs = ((Reason.T_Q_MISSING, values.t_q), (Reason.AT_MISSING, values.at))
         reasons: list[str] = [reason for reason, value in pairs if math.isnan(value)]
         lost = bool(reasons)
+        reasons += [f"{Reason.SUSPECT_CHANNEL}:{name}" for name in suspects]
         memory.missing_min = memory.missing_min + self._period_min if lost else 0.0
         expired = lost and memory.missing_min > self._predict_for_min
         if prediction is None:

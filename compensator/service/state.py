@@ -16,7 +16,7 @@ import msgspec
 from compensator.arrays import NAN
 from compensator.errors import DataError
 from compensator.model.engine import EngineState, Estimate
-from compensator.service.plausibility import PlausibilityState
+from compensator.service.plausibility import JumpState, PlausibilityState
 from compensator.service.probing import ProbingState
 
 #: Version of the state; a state of another version is refused.
@@ -109,6 +109,8 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
         State of the checks between the sensors; omitted if none is on, as in versions without these checks.
     probing : ProbingState, optional
         State of the probes; omitted without `[probe]`, as in versions without probes.
+    jumps : JumpState, optional
+        State of the watch for jumps; omitted without `guards.suspect_jumps`, as in versions without it.
     """
 
     schema: int
@@ -121,12 +123,13 @@ class CompensationState(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     memory: Memory
     plausibility: PlausibilityState | None = None
     probing: ProbingState | None = None
+    jumps: JumpState | None = None
 
 
 def encode_state(state: CompensationState) -> bytes:
     """Return a state as JSON."""
     table = msgspec.to_builtins(state)
-    for name in ("plausibility", "probing"):
+    for name in ("plausibility", "probing", "jumps"):
         if table[name] is None:
             del table[name]
     return json.dumps(_encodable(table), separators=(",", ":")).encode()
@@ -156,7 +159,10 @@ def decode_state(data: bytes) -> CompensationState:
         raise DataError(f"state: {error}") from error
     if state.schema != STATE_SCHEMA:
         raise DataError(f"state: schema = {state.schema}, expected {STATE_SCHEMA}")
-    nested = (state.engine, *([state.engine.gap.state] if state.engine.gap else []))
+    engines = [state.engine]
+    if state.jumps is not None:
+        engines += [branch.engine for branch in (state.jumps.believing, state.jumps.shifted) if branch is not None]
+    nested = [*engines, *(engine.gap.state for engine in engines if engine.gap is not None)]
     numbers = [state.offset_um, *(value for engine in nested for value in (*engine.observer.x, *engine.observer.p))]
     if not all(-LARGEST_COVARIANCE < value < LARGEST_COVARIANCE for value in numbers):
         raise DataError("state: a number of the offset or of the observer is not finite, or too large to be valid")

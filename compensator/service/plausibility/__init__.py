@@ -2,5 +2,15 @@
 
 from compensator.service.plausibility.checks import BLOCK_SAMPLES, PlausibilityCheck, PlausibilityState, SensorEvidence
 from compensator.service.plausibility.guards import HEATED_W, SensorGuards
+from compensator.service.plausibility.jumps import JumpState, JumpWatch
 
-__all__ = ["BLOCK_SAMPLES", "HEATED_W", "PlausibilityCheck", "PlausibilityState", "SensorEvidence", "SensorGuards"]
+__all__ = [
+    "BLOCK_SAMPLES",
+    "HEATED_W",
+    "JumpState",
+    "JumpWatch",
+    "PlausibilityCheck",
+    "PlausibilityState",
+    "SensorEvidence",
+    "SensorGuards",
+]

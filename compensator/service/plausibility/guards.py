@@ -6,7 +6,7 @@ The guards use only the recorded sample and their own state, so an audit repeats
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import msgspec
 
@@ -14,6 +14,8 @@ from compensator.codes import SampleQuality
 from compensator.config import Channel, Guards
 from compensator.messages import ChannelSample, number
 
+#: Channels whose jumps the model can judge, because it expects their values.
+TEMPERATURES = ("at_degc", "t_q_degc")
 #: Estimated heat, W, above which the machine counts as heated if heat is not measured.
 HEATED_W = 10.0
 
@@ -21,9 +23,13 @@ GuardState = tuple[float, float, float, float]
 
 
 class ChannelGuard:
-    """Guard of range, rate and constant values of one channel; `period_min` is the length of a sample, min."""
+    """Guard of range, rate and constant values of one channel; `period_min` is the length of a sample, min.
 
-    def __init__(self, channel: Channel, period_min: float) -> None:
+    With `suspects_jumps` the permitted change grows with the square root of the time without a value.
+    """
+
+    def __init__(self, channel: Channel, period_min: float, *, suspects_jumps: bool = False) -> None:
+        self._suspects_jumps = suspects_jumps
         self._channel = channel
         self._period_min = period_min
         self._last_good = math.nan
@@ -31,12 +37,14 @@ class ChannelGuard:
         self._still_at = math.nan
         self._still_min = 0.0
 
-    def check(self, sample: ChannelSample) -> str:
-        """Return the quality of a sample and update the state."""
+    def check(self, sample: ChannelSample, *, suspect: bool = False) -> str:
+        """Return the quality of a sample and update the state; a `suspect` channel is not good, whatever it is."""
         self._since_good_min += self._period_min
         if sample.device_quality != SampleQuality.GOOD:
             return sample.device_quality
         quality = self._quality(number(sample.mean), sample)
+        if suspect and quality in (SampleQuality.GOOD, SampleQuality.TOO_FAST):
+            return SampleQuality.SUSPECT
         if quality == SampleQuality.GOOD:
             self._last_good, self._since_good_min = number(sample.mean), 0.0
         return quality
@@ -52,10 +60,22 @@ class ChannelGuard:
         if channel.rate_max_per_min is not None and not math.isnan(self._last_good):
             # The permitted change grows with the time since the last good value: a sensor that returns after a long
             # loss is accepted again, a jump is not.
-            allowed = channel.rate_max_per_min * self._since_good_min
+            allowed = channel.rate_max_per_min * self._growth_min
             if abs(mean - self._last_good) > allowed:
                 return SampleQuality.TOO_FAST
         return SampleQuality.GOOD
+
+    @property
+    def _growth_min(self) -> float:
+        """Time for which the channel is permitted to change at its largest rate, min."""
+        if not self._suspects_jumps:
+            return self._since_good_min
+        # The straight growth would permit any fault after an open contact of a few samples.
+        return self._period_min * math.sqrt(self._since_good_min / self._period_min)
+
+    def accept(self, value: float) -> None:
+        """Continue from a value (NaN: from the next one, whatever it is)."""
+        self._last_good, self._since_good_min = value, 0.0
 
     def _is_stuck(self, sample: ChannelSample) -> bool:
         low, high = number(sample.min), number(sample.max)
@@ -84,10 +104,17 @@ class SensorGuards:
     """All guards of a machine; `period_min` is the length of a sample, min."""
 
     def __init__(self, channels: list[Channel], guards: Guards, period_min: float) -> None:
-        self._guards = {channel.name: ChannelGuard(channel, period_min) for channel in channels}
+        self._guards = {
+            channel.name: ChannelGuard(
+                channel, period_min, suspects_jumps=guards.suspect_jumps and channel.name in TEMPERATURES
+            )
+            for channel in channels
+        }
         self._limits = guards
 
-    def check(self, channels: Mapping[str, ChannelSample], heat_w: float) -> dict[str, ChannelSample]:
+    def check(
+        self, channels: Mapping[str, ChannelSample], heat_w: float, suspects: Collection[str] = ()
+    ) -> dict[str, ChannelSample]:
         """Return the channels with their final quality.
 
         Parameters
@@ -96,8 +123,12 @@ class SensorGuards:
             Samples with the devices' qualities.
         heat_w : float
             The model's estimate before this sample, W; NaN if there is none.
+        suspects : collection of str
+            Channels that have jumped and are not used (`JumpWatch`).
         """
-        qualities = {name: self._guards[name].check(sample) for name, sample in channels.items()}
+        qualities = {
+            name: self._guards[name].check(sample, suspect=name in suspects) for name, sample in channels.items()
+        }
         if self._t_q_below_at(channels, qualities, heat_w):
             # It is unknown which of the two is wrong, so neither is used.
             qualities["t_q_degc"] = qualities["at_degc"] = SampleQuality.T_Q_BELOW_AT
@@ -115,6 +146,10 @@ class SensorGuards:
         known = channels.get("heat_w")
         heat = number(known.mean) if known is not None and qualities["heat_w"] == SampleQuality.GOOD else heat_w
         return below_k > self._limits.t_q_below_at_max_k and heat > HEATED_W
+
+    def accept(self, name: str, value: float) -> None:
+        """Continue a channel from a value (NaN: from the next one, whatever it is)."""
+        self._guards[name].accept(value)
 
     def pass_time(self, minutes: float) -> None:
         """Account for time in which nothing was measured."""
