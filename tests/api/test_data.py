@@ -112,7 +112,7 @@ def test_a_date_and_time_of_another_name_gives_results_by_time(run: Path, as_ind
 
 
 def test_a_temperature_that_is_missing_for_long_is_remarked_and_not_interpolated() -> None:
-    n = 600
+    n = 1200
     table = {"t_s": 60.0 * np.arange(n), "t_q_degc": 20.0 + np.arange(n) / 50.0, "at_degc": np.full(n, 20.0)}
     for first, last in ((100, 160), (200, 290), (400, 461)):  # the first is bridged
         table["t_q_degc"][first:last] = np.nan
