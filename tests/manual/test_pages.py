@@ -216,9 +216,14 @@ def test_every_table_and_key_of_the_configuration_is_on_its_page() -> None:
 
 
 def is_table(kind: Any) -> bool:
-    return any(isinstance(c, type) and issubclass(c, msgspec.Struct) for c in (kind, *typing.get_args(kind)))
+    return bool(tables_in(kind))
 
 
 def table_of(kind: Any) -> type[msgspec.Struct]:
     """The struct that a field holds, alone, in a list, or where it may be left out."""
-    return next(c for c in (kind, *typing.get_args(kind)) if isinstance(c, type) and issubclass(c, msgspec.Struct))
+    return tables_in(kind)[0]
+
+
+def tables_in(kind: Any) -> list[type[msgspec.Struct]]:
+    own = [kind] if isinstance(kind, type) and issubclass(kind, msgspec.Struct) else []
+    return own + [table for part in typing.get_args(kind) for table in tables_in(part)]
