@@ -177,8 +177,9 @@ class Loop(_Table, frozen=True, kw_only=True):
 
     `policy`: `propose` asks a person before a better model is adopted, `adopt` adopts it. `at_utc`: time of the nightly
     diagnosis, UTC; `misfit_h`: one is made at once after measured and predicted Y have diverged for so long.
-    `record_h`: how much is diagnosed. `shadow_h`, `probes`, `deviations`: what a candidate must show beside the present model, on data
-    after the diagnosis: hours of measured Y or the number of probes, and by how many standard deviations it is better.
+    `record_h`: how much is diagnosed. `shadow_h`, `probes`, `deviations`: what a candidate must show beside the present
+    model, on data after the diagnosis: hours of measured Y or the number of probes, and by how many standard deviations
+    it is better.
     `watch_h`: how long the model before is compared after an adoption. `memory_mb`, `time_limit_min`: limits of a
     diagnosis.
     """

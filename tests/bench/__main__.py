@@ -19,6 +19,7 @@ from tests.bench import (
     probe_calibration,
     probe_naming,
     probes,
+    sensor_faults,
     shop,
     speed,
     spindle,
@@ -37,6 +38,7 @@ AREAS = {
     "hidden": hidden.report,
     "probes": probes.report,
     "faults": faults.report,
+    "sensor_faults": sensor_faults.report,
     "audit": audit.report,
     "shop": shop.report,
 }
