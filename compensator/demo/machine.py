@@ -128,6 +128,8 @@ rest_rate_um_per_min = 0.2
 
 [guards]
 t_q_below_at_max_k = 2.0
+suspect_jumps = true
+jump_min_k = 1.0
 
 [zenoh]
 prefix = "{prefix}"

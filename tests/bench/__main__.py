@@ -21,6 +21,7 @@ from tests.bench import (
     probe_calibration,
     probe_naming,
     probes,
+    sensor_faults,
     shop,
     speed,
     spindle,
@@ -40,6 +41,7 @@ AREAS = {
     "hidden": hidden.report,
     "probes": probes.report,
     "faults": faults.report,
+    "sensor_faults": sensor_faults.report,
     "audit": audit.report,
     "shop": shop.report,
 }

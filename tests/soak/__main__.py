@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 from compensator.audit.series import summary
+from tests.fuzz import test_sensor_faults as sensor_faults
 from tests.soak import forgeries, hostile, kills, month
 
 #: The month writes no faster than the disk syncs; what it shows has nothing to do with that.
@@ -74,6 +75,17 @@ def report_hostile(count: int, seed: int) -> bool:
     return not any(result.failed for result in results)
 
 
+def report_faults(count: int, seed: int) -> bool:
+    day = sensor_faults.working_day()
+    healthy = sensor_faults.run(day)[0]
+    found = [sensor_faults.missed(day, healthy, seed + i) for i in range(count)]
+    print(f"\nfaults of thermocouples, seeds {seed} to {seed + count - 1}")
+    row("days with a fault; of these with a jump of the offset or a jump believed", f"{count}; {sum(map(bool, found))}")
+    for text in filter(None, found):
+        print(text)
+    return not any(found)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description="Endurance of the service.")
     parser.add_argument("--kills", type=int, default=200, help="number of kills (default 200)")
@@ -81,11 +93,13 @@ def main() -> int:
     parser.add_argument("--days", type=float, default=30.0, help="length of the month (default 30)")
     parser.add_argument("--hostile", type=int, default=300, help="hostile inputs of each kind (default 300)")
     parser.add_argument("--forgeries", type=int, default=300, help="number of forged recordings (default 300)")
+    parser.add_argument("--faults", type=int, default=50, help="faults of thermocouples (default 50)")
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     # What the service says of defects that were put in on purpose would bury the table.
     logging.getLogger("compensator").addHandler(logging.NullHandler())
     good = report_month(given.days, given.seed) if given.days else True
+    good = report_faults(given.faults, given.seed) and good if given.faults else good
     if given.kills:
         report_kills(given.kills, given.machines, given.seed)
     if given.hostile:
