@@ -22,6 +22,8 @@ log = logging.getLogger("compensator")
 
 #: Number of connections that a router accepts at a time.
 PENDING = 1000
+#: How long a connection may be silent before it is authenticated, ms.
+ACCEPT_TIMEOUT_MS = 3000
 #: Time between two attempts to open a session, s.
 RETRY_S = 1.0
 #: Liveliness token of a service, below its prefix.
@@ -123,6 +125,7 @@ def enlarge_queues(config: zenoh.Config) -> None:
     each; by default Zenoh accepts 100 at a time.
     """
     set_key(config, "transport/unicast/accept_pending", PENDING)
+    set_key(config, "transport/unicast/accept_timeout", ACCEPT_TIMEOUT_MS)
     for priority in ("interactive_high", "data"):
         set_key(config, f"transport/link/tx/queue/size/{priority}", 16)
 

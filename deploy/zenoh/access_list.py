@@ -111,8 +111,9 @@ def router(shop: dict[str, Any]) -> dict[str, Any]:
         "transport": {
             # Refused, whatever stands here: a second session under an id that is connected. Not refused: sessions that
             # share a certificate, each under an id of its own; max_links counts the links within one session. After a
-            # power cut all connect at once.
-            "unicast": {"max_links": 1, "accept_pending": 1000},
+            # power cut all connect at once. A connection that does not authenticate holds a place for 3 s; the firewall
+            # has to bound more of them than there are places.
+            "unicast": {"max_links": 1, "accept_pending": 4000, "accept_timeout": 3000},
             # Else long messages would bypass the links, through memory that others on this computer can open.
             "shared_memory": {"enabled": False},
             "link": {
