@@ -27,7 +27,7 @@ LARGEST: Mapping[str, float] = {
     "offset_max_um": 5000.0,
     "offset_rate_max_um_per_min": 6000.0,
     "valid_max_s": 10_000.0,
-    "step_max_s": 60.0,
+    "step_max_s": 120.0,
     "clock_tolerance_s": 600.0,
 }
 

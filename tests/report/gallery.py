@@ -37,6 +37,7 @@ NAMES = (
 def make(folder: Path) -> dict[str, Path]:
     """Make the pages; their names stand for the commands."""
     pages = {name: folder / name / "report.html" for name in NAMES}
+    pages["identify"] = folder / "identify" / "model-calibration.html"
     for path in pages.values():
         path.parent.mkdir()
     rec = _recordings(folder)

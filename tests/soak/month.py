@@ -9,7 +9,7 @@ import random
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -145,9 +145,9 @@ class _Machine:
         )
         close = daemon._journal.close
 
-        async def closing(state: bytes) -> None:
+        async def closing(state: bytes, opening: Mapping[str, bytes] | None = None) -> None:
             if self._ending != "kill":
-                await close(state)
+                await close(state, opening)
                 return
             # A kill leaves the file as it is, and lets go of it.
             daemon._writer._executor.shutdown(wait=True)
