@@ -161,10 +161,7 @@ def diagnose(
     """
     base = model_of(model)
     measured = measurements(data, "data", columns, needed=True)
-    for one in measured:
-        for record in one.at_period(base.period_s).records:
-            require_channels(base, record, one.name)
-    runs, remarks = runs_in(measured, base.period_s, y_std_um=y_std_um)
+    runs, remarks = runs_in(measured, base.period_s, y_std_um=y_std_um, check=partial(require_channels, base))
     name = ", ".join(dict.fromkeys(run.name for run in runs))
     screen_temperatures(name, runs, quiet_air=True)
     require_y_noise(name, runs)

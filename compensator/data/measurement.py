@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -18,7 +18,7 @@ from compensator.codes import Remark
 from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
-from compensator.data.record import SampledData, require
+from compensator.data.record import SampledData, SampledRecord, require
 from compensator.data.runs import SHORTEST_RUN, Run, runs_of
 from compensator.data.screening import check_y_std
 from compensator.data.table import Table
@@ -258,7 +258,11 @@ def _origin(path: Path, sha256: str) -> Origin:
 
 
 def runs_in(
-    data: Sequence[Measurement], period_s: float = PERIOD_S, *, y_std_um: float | None = None
+    data: Sequence[Measurement],
+    period_s: float = PERIOD_S,
+    *,
+    y_std_um: float | None = None,
+    check: Callable[[SampledRecord, str], None] = lambda record, name: None,
 ) -> tuple[list[Run], list[Remark]]:
     """Return the runs of measurements, and what had to be corrected.
 
@@ -270,6 +274,8 @@ def runs_in(
         Sample period of the model, s.
     y_std_um : float, optional
         Standard deviation of one measured value of Y, µm; by default what neighbouring values show.
+    check : callable
+        Called with each record and the name of its data; refuses what cannot be used.
 
     Raises
     ------
@@ -285,6 +291,7 @@ def runs_in(
     for number, (measured, part) in enumerate(gridded):
         remarks += part.remarks
         for record in part.records:
+            check(record, measured.name)
             require(measured.name, record, _NEEDED)
             for run, corrected in runs_of(measured.label, record):
                 runs.append(dataclasses.replace(run, recording=number, y_std_um=y_std_um))

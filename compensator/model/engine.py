@@ -183,7 +183,7 @@ class Engine:
         self.bridge_samples = bridge_samples
         self._observer = observer_of(model)
         self._start_effects()
-        self.channels = tuple(dict.fromkeys(c for effect in self._effects for c in effect.channels))
+        self.channels = model.channels
         self._period_min = model.period_s / 60.0
         absolute = model.inputs == "absolute"
         self._reference = Reference(0.0, 0.0) if absolute else Reference(NAN, NAN)

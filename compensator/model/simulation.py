@@ -50,7 +50,7 @@ def require_channels(model: ThermalModel, record: SampledRecord, name: str) -> N
     DataError
         Naming data, channel and model.
     """
-    require(name, record, Engine(model).channels, why=f", which an effect of model {model.name} needs")
+    require(name, record, model.channels, why=f", which an effect of model {model.name} needs")
 
 
 def simulate(model: ThermalModel, record: SampledRecord, *, source: str = "") -> dict[str, Vector]:

@@ -193,6 +193,11 @@ class ThermalModel(Shown):
         return parts
 
     @property
+    def channels(self) -> tuple[str, ...]:
+        """Logged channels that its effects need, each once."""
+        return tuple(dict.fromkeys(channel for effect in self.effects for channel in effect.measured))
+
+    @property
     def late_t_q(self) -> Lateness | None:
         """By how much T_Q is late, where an effect says so."""
         return next((effect.lateness for effect in self.effects if effect.lateness is not None), None)
