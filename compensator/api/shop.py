@@ -294,8 +294,8 @@ class _Fed:
         """Begin at the first sample with a zero, with that zero if it was set before."""
         if step.sample is None or step.estimate is None:
             return False
-        zero = Zero.of_estimate(step.estimate)
-        if step.zero is None and math.isnan(zero.t_q_ref_degc):
+        zero = Zero.set_in(step.estimate)
+        if step.zero is None and zero is None:
             return False
         self._begun = True
         if step.zero is None:

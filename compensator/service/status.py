@@ -41,6 +41,12 @@ class Zero:
         )
 
     @classmethod
+    def set_in(cls, estimate: EstimateMessage | None) -> Zero | None:
+        """Return the zero of a recorded estimate; None before the first one."""
+        zero = cls.of_estimate(estimate) if estimate is not None else None
+        return zero if zero is not None and not math.isnan(zero.t_q_ref_degc) else None
+
+    @classmethod
     def of_references(cls, reference: Reference, zero: ZeroState) -> Zero:
         """Return the zero of a state, from the engine's reference and those of Y."""
         return cls(

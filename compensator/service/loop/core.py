@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -212,7 +211,7 @@ def warmed_on(
     if last is not None:
         shadow.process(last)
     else:
-        zero = next((found for outcome in record if (found := _zero_of(outcome)) is not None), None)
+        zero = next((found for outcome in record if (found := Zero.set_in(outcome.estimate)) is not None), None)
         if zero is not None:
             compensation.begin(zero)
     for outcome in record[begin + 1 :]:
@@ -227,8 +226,3 @@ def warmed_on(
 def is_rest(outcome: Outcome) -> bool:
     """Return whether a zero at rest was set with a sample."""
     return any(note.kind == EventKind.ZERO and note.data["mode"] == "rest" for note in outcome.notes)
-
-
-def _zero_of(outcome: Outcome) -> Zero | None:
-    zero = Zero.of_estimate(outcome.estimate)
-    return None if math.isnan(zero.t_q_ref_degc) else zero

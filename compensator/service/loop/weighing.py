@@ -99,7 +99,7 @@ def weigh(
     effects = effect_names(model)
     if same and model.sha256 == base.sha256:
         change = 0.0
-    weighed = _with(
+    weighed = replace(
         plain,
         effects=effects,
         candidate_sha256=model.sha256,
@@ -189,9 +189,3 @@ def _foundation(model: ThermalModel, effects: int) -> tuple[Any, ...]:
     first = [effect.to_table() for effect in model.effects[:effects]]
     paths = (model.ttf, model.dtf, model.tdtf, model.alternatives)
     return (model.kind, model.period_s, model.inputs, *paths, model.estimator, model.validity, first)
-
-
-def _with(data: DiagnosisData, **changes: Any) -> DiagnosisData:
-    from msgspec.structs import replace
-
-    return replace(data, **changes)

@@ -323,8 +323,8 @@ class JumpWatch:
         shifted.estimate = shifted.engine.step(found.values["t_q_degc"], found.values["at_degc"], others)
         self._state.samples += 1
         self._weigh_y(y_um)
-        verdict = self._suspected(engine) if self._state.is_suspect else self._watched(engine)
-        return Judgement(verdict.estimate, [*notes, *verdict.notes], {n: offered[n] for n in verdict.accepted})
+        verdict = self._suspected(engine, offered) if self._state.is_suspect else self._watched(engine)
+        return Judgement(verdict.estimate, [*notes, *verdict.notes], verdict.accepted)
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float) -> None:
         """Compare both engines with a probe.
@@ -471,22 +471,22 @@ class JumpWatch:
             return None
         return _speaks_for(y_um - state.level_um, believing.estimate, shifted.estimate, self._y_std_um)
 
-    def _suspected(self, engine: Engine) -> Judgement:
+    def _suspected(self, engine: Engine, offered: Mapping[str, float]) -> Judgement:
         state = self._state
         needed = min(BACK_SAMPLES * 2 ** min(state.again, 8), MOST_BACK_SAMPLES)
         if all(state.back.get(name, 0) >= needed for name in state.shifts_k):
-            return self._accept(engine, self._shifted, "has returned to what was expected before")
+            return self._accept(engine, offered, self._shifted, "has returned to what was expected before")
         if state.at_held >= needed:
-            return self._accept(engine, None, "has returned to where it was before")
+            return self._accept(engine, offered, None, "has returned to where it was before")
         if state.y_for >= Y_SAMPLES:
-            return self._accept(engine, self._believing, "is used again: measured Y agrees with it")
+            return self._accept(engine, offered, self._believing, "is used again: measured Y agrees with it")
         if state.probes_for >= _PROBES:
-            return self._accept(engine, self._believing, "is used again: probes agree with it")
+            return self._accept(engine, offered, self._believing, "is used again: probes agree with it")
         if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
-            return self._accept(engine, self._believing, "is used again: the model agrees with it")
+            return self._accept(engine, offered, self._believing, "is used again: the model agrees with it")
         return Judgement()
 
-    def _accept(self, engine: Engine, run: _Run | None, how: str) -> Judgement:
+    def _accept(self, engine: Engine, offered: Mapping[str, float], run: _Run | None, how: str) -> Judgement:
         names = list(self._state.shifts_k)
         notes = [
             Note(
@@ -501,7 +501,7 @@ class JumpWatch:
             engine.restore(run.engine.snapshot())
             estimate = run.estimate
         self._end()
-        return Judgement(estimate, notes, dict.fromkeys(names, NAN))
+        return Judgement(estimate, notes, {name: offered[name] for name in names})
 
     def _watched(self, engine: Engine) -> Judgement:
         """Decide whether a jump within the permitted rate was one of the sensor."""

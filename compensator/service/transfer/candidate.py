@@ -5,7 +5,6 @@ It is used at a restart with another configuration or model, and when a model is
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -232,7 +231,8 @@ def window_of(
     """
     files = recordings(folder, machine)
     last = _last_estimate(files)
-    if last is None or math.isnan((zero := Zero.of_estimate(last)).t_q_ref_degc):
+    zero = Zero.set_in(last)
+    if last is None or zero is None:
         raise DataError(f"{folder}: no recorded zero")
     span_ns, known_ns = round(WARM_UP * slowest * 60 * NS), last.time_utc_ns - compared_ns
     window = Window(zero=zero, files=files, from_ns=known_ns - span_ns, end_ns=last.time_utc_ns)

@@ -164,9 +164,7 @@ def _steps(window: Window, between_samples: Callable[[], None]) -> Iterator[Reco
 
 def _recorded_zero(step: RecordedStep) -> Zero | None:
     """Return the zero that was current at a sample; None if there was none."""
-    estimate = step.estimate if step.sample is not None else None
-    zero = Zero.of_estimate(estimate) if estimate is not None else None
-    return zero if zero is not None and not math.isnan(zero.t_q_ref_degc) else None
+    return Zero.set_in(step.estimate) if step.sample is not None else None
 
 
 def _compare(found: Comparison, step: RecordedStep, present: Outcome, candidate: Outcome) -> None:
