@@ -94,28 +94,22 @@ name = "probe"
 line = "probe-line"
 model = "capancdt-6200"
 inputs = [{ input = 0 }]
+""" + "".join(
+    f"""
 [[channel]]
-name = "t_q_degc"
-device = "spindle-thermocouples"
+name = "{name}"
+device = "{device}"
 input = 0
-range = [0.0, 80.0]
-rate_max_per_min = 30.0
-stuck_after_min = 90.0
-[[channel]]
-name = "at_degc"
-device = "cabinet-thermocouples"
-input = 0
-range = [0.0, 50.0]
-rate_max_per_min = 30.0
-stuck_after_min = 90.0
-[[channel]]
-name = "y_um"
-device = "probe"
-input = 0
-range = [-200.0, 200.0]
+range = {span}
 rate_max_per_min = 30.0
 stuck_after_min = 90.0
 """
+    for name, device, span in (
+        ("t_q_degc", "spindle-thermocouples", [0.0, 80.0]),
+        ("at_degc", "cabinet-thermocouples", [0.0, 50.0]),
+        ("y_um", "probe", [-200.0, 200.0]),
+    )
+)
 
 
 @pytest.fixture
