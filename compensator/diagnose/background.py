@@ -117,7 +117,7 @@ class _Problem:
     def __init__(self, background: Background, points: Points, explained: Vector) -> None:
         self.background, self.points = background, points
         table = points.averaged(background.columns)
-        self.scale = np.std(table[points.used], axis=0)
+        self.scale = np.std(table, axis=0)
         self.scale[self.scale < 1e-12] = np.inf
         self.table = table / self.scale
         self.target = points.residual - explained
@@ -200,7 +200,7 @@ class _Problem:
         sizes, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
         root = axes * np.sqrt(np.maximum(sizes, 0.0)) * weights[:, None]
         # The directions of the covariance that matter most for y, over what was seen.
-        seen = self.table[self.points.used] * np.where(np.isfinite(self.scale), self.scale, 0.0)
+        seen = self.table * np.where(np.isfinite(self.scale), self.scale, 0.0)
         _, _, directions = np.linalg.svd((seen - seen.mean(axis=0)) @ root, full_matrices=False)
         factor = (root @ directions[:MOST_ROWS].T).T
         template, lags = self.background.template, len(self.background.template.taus_min)

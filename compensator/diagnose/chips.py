@@ -153,7 +153,7 @@ def _deviations(points: Points, precision: Matrix, columns: Matrix, fixed: Vecto
 
 def _spikes(points: Points, values: Sequence[int]) -> Matrix:
     """Return a column for each of some values that lets it be anything."""
-    table = np.zeros((points.used.size, len(values)))
+    table = np.zeros((points.count, len(values)))
     table[list(values), range(len(values))] = ANYTHING * points.spread_um
     return table
 

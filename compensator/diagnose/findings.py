@@ -14,6 +14,7 @@ from compensator.diagnose.background import Background, Regressed
 from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, as_deployed, late_term
+from compensator.diagnose.scan import Grid
 from compensator.diagnose.search import Search, Selection
 from compensator.model.effects.blocks import Lag
 from compensator.model.effects.regression import AMBIENT, DRIVE, Regression
@@ -90,7 +91,7 @@ class Findings:
         return float(np.hypot(rest.slow_um, rest.own_um))
 
 
-def findings_of(evidence: Evidence, *, unobserved: bool = True) -> Findings:
+def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | None = None) -> Findings:
     """Search in some evidence.
 
     Parameters
@@ -99,12 +100,14 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True) -> Findings:
         Residual and signals; nothing but the samples used takes part.
     unobserved : bool
         Whether an unobserved source is looked for.
+    grid : Grid, optional
+        That of another search over the same signals.
     """
-    search = Search(evidence)
+    search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)
     fit, points = selection.fit, search.points
     terms, responses = as_deployed(fit)
-    nothing = np.zeros(points.used.size)
+    nothing = np.zeros(points.count)
     background = Background(evidence)
     ceiling = background.fitted(points, nothing, selection.before.rest)
     paths = Background(evidence, channels=False) if evidence.free_paths else None

@@ -234,7 +234,7 @@ def fit_terms(likelihood: Likelihood, starts: Sequence[Start], *, evaluations: i
 def _fitted(problem: _Problem, x: Vector, solved: tuple[Vector, Vector, Matrix], jacobian: Matrix) -> Fit:
     likelihood, (residual, amplitudes, precision) = problem.likelihood, solved
     parts, rest = problem.parts(x), iter(amplitudes.tolist())
-    terms, columns, fixed = [], [np.zeros((likelihood.points.used.size, 0))], np.zeros(likelihood.points.used.size)
+    terms, columns, fixed = [], [np.zeros((likelihood.points.count, 0))], np.zeros(likelihood.points.count)
     for hypothesis, part in zip(problem.hypotheses, parts, strict=True):
         own: tuple[float, ...] = ()
         if part.scale is None:

@@ -12,6 +12,7 @@ from compensator.arrays import Indices, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.findings import Findings, findings_of
 from compensator.diagnose.outcome import FOLDS, Step, rms_of
+from compensator.diagnose.scan import Grid
 from compensator.model.effects.hypothesis import Place
 from compensator.progress import ExecutorMap, Progress
 
@@ -52,7 +53,7 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     timed = [t.effect for t in found.terms if not t.effect.deployable]
     only_unobserved = bool(found.terms) and not any(term.hypothesis.effect.observed for term in found.terms)
     unobserved = any(not effect.observed for effect in timed) and not only_unobserved
-    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved), views)
+    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved, grid=found.search.grid), views)
     left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
     searches = np.zeros(len(places), dtype=int)
     for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
@@ -88,8 +89,8 @@ class _Predictions:
     has: Indices
 
 
-def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool) -> _Predictions:
-    found = findings_of(seen, unobserved=unobserved)
+def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool, grid: Grid) -> _Predictions:
+    found = findings_of(seen, unobserved=unobserved, grid=grid)
     steps, total = [], found.own_paths
     for place in places:
         total = sum(

@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 
 from compensator.arrays import Matrix, Vector
@@ -96,6 +96,17 @@ class Likelihood:
         weights = cho_solve(self._factor, self._random.T @ white)
         return np.concatenate([white - self._random @ weights, -weights])
 
+    def whitened(self, table: Matrix) -> tuple[Matrix, Matrix]:
+        """Return averaged columns without noise correlation, and what nuisances and own error have of them.
+
+        The products of projected columns are those of the first less those of the second: for very many columns that is
+        cheaper than to project them.
+        """
+        white = self._whitening.of(table)
+        factor, lower = self._factor
+        taken = solve_triangular(factor, self._random.T @ white, lower=lower, check_finite=False)
+        return white, np.asarray(taken)
+
 
 def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest, steps: int = 12) -> Rest:
     """Return the rest with which data are most probable, given what effects may add.
@@ -151,7 +162,7 @@ def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest, st
 
 def dense(likelihood: Likelihood) -> Matrix:
     """Return the projection as one matrix, for many columns at once."""
-    return likelihood.projected(np.eye(likelihood.points.used.size))
+    return likelihood.projected(np.eye(likelihood.points.count))
 
 
 def factored(gram: Matrix) -> tuple[Matrix, bool]:

@@ -162,7 +162,7 @@ def _bank(values: Sequence[Vector], period_min: float) -> Matrix:
 
 
 def _unit(points: Points, table: Matrix) -> Matrix:
-    """Return columns about their means, of standard deviation 1 on the points used; 0 where a column is constant."""
-    table = table - table[points.used].mean(axis=0)
-    spread = np.std(table[points.used], axis=0)
+    """Return columns about their means, of standard deviation 1; 0 where a column is constant."""
+    table = table - table.mean(axis=0)
+    spread = np.std(table, axis=0)
     return np.asarray(table / np.where(spread > 1e-9, spread, np.inf))

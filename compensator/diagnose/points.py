@@ -13,8 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
 
-from compensator.arrays import Indices, Matrix, Vector
+from compensator.arrays import Indices, Mask, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.model.effects.blocks import FilterBank
 from compensator.model.effects.hypothesis import Context
@@ -91,16 +92,16 @@ class Points:
 
     Attributes
     ----------
-    residual, used : numpy.ndarray, shape (points,)
-        Residual, µm, and which points take part.
+    residual : numpy.ndarray, shape (points,)
+        Residual, µm.
     count : int
-        How many do.
-    starts, begins : numpy.ndarray, frozenset of int
-        First point of each run.
+        Number of points.
+    starts : numpy.ndarray of int
+        First point of each run that has any.
     period_min : float
         Time between two points, min; where Y was measured now and then the median.
     relative_variance : numpy.ndarray, shape (points,)
-        Variance of the noise of each point, relative to a full one; infinite where it is not used.
+        Variance of the noise of each point, relative to a full one.
     stretches : list of (int, int, float)
         Stretches with equal noise and times between the points: begin, end, relative variance.
     is_exact : bool
@@ -119,21 +120,18 @@ class Points:
         self.is_exact = not context.approximate or evidence.free_paths
         stride = max(1, math.ceil(evidence.count / POINTS))
         edges = _edges(evidence, stride)
-        self._edges = np.concatenate(edges)
-        self._weights = evidence.used.astype(float)
-        counts = np.add.reduceat(self._weights, self._edges)
-        self._counts = np.maximum(counts, 1.0)
-        is_value = np.repeat(evidence.sparse, [e.size for e in edges])
-        self.used = counts >= np.where(is_value, 1.0, max(1.0, stride / 2.0))
-        self.starts = np.cumsum([0, *[e.size for e in edges[:-1]]])
-        self.begins = frozenset(self.starts.tolist())
+        first = np.concatenate(edges)
+        counts = np.add.reduceat(evidence.used.astype(float), first)
+        is_value, run = (np.repeat(each, [e.size for e in edges]) for each in (evidence.sparse, range(len(edges))))
+        kept = counts >= np.where(is_value, 1.0, max(1.0, stride / 2.0))
+        self.count = int(kept.sum())
+        self.starts = np.flatnonzero(np.diff(run[kept], prepend=-1))
+        self._minutes = context.period_min * np.diff(first[kept], append=first[-1] + stride)
         self.period_min = context.period_min * stride
-        self._minutes = self.period_min * np.ones(self._edges.size)
         if is_value.any():
-            self._minutes[:-1] = np.where(is_value[:-1], context.period_min * np.diff(self._edges), self.period_min)
             self.period_min = max(self.period_min, float(np.median(self._minutes[:-1])))
-        self.count = int(self.used.sum())
-        self.relative_variance = np.where(self.used, stride / self._counts, np.inf)
+        self.relative_variance = stride / counts[kept]
+        self._mean = _means(evidence.used, first, kept)
         self.stretches = _stretches(self.relative_variance, self._minutes, self.starts)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
         self.spread_um = max(evidence.spread_um, 1e-9)
@@ -167,8 +165,7 @@ class Points:
 
     def averaged(self, table: Matrix) -> Matrix:
         """Return the means of columns over the samples used of each point, shape (points, columns)."""
-        sums = np.add.reduceat(table * self._weights[:, None], self._edges, axis=0)
-        return np.asarray(sums / self._counts[:, None])
+        return np.asarray(self._mean @ table)
 
     def scaled(self, points: Matrix, sizes: Sequence[float], together: int) -> tuple[Matrix, Vector]:
         """Return averaged columns of which one unit is what is expected of each amplitude, and their scales.
@@ -184,7 +181,7 @@ class Points:
         together : int
             How many of the columns belong to one effect.
         """
-        spread = np.std(points[self.used], axis=0)
+        spread = np.std(points, axis=0)
         spread[spread < 1e-12] = 1.0
         scale = self.spread_um / spread
         if sizes:
@@ -247,11 +244,11 @@ class Points:
         return self._orthogonal(fast), self._orthogonal(slow), self._orthogonal(table)
 
     def _orthogonal(self, table: Matrix) -> Matrix:
-        """Return combinations of columns that are orthogonal on the points used and together of size 1."""
+        """Return combinations of columns that are orthogonal and together of size 1."""
         if not table.shape[1]:
             return table
-        table = table / np.maximum(np.std(table[self.used], axis=0), 1e-12)
-        _, sizes, directions = np.linalg.svd(table[self.used] - table[self.used].mean(axis=0), full_matrices=False)
+        table = table / np.maximum(np.std(table, axis=0), 1e-12)
+        _, sizes, directions = np.linalg.svd(table - table.mean(axis=0), full_matrices=False)
         kept = sizes > DISTINCT * sizes[0]
         return np.asarray(table @ directions[kept].T / sizes[kept] * math.sqrt(self.count / kept.sum()))
 
@@ -263,6 +260,15 @@ def _edges(evidence: Evidence, stride: int) -> list[Indices]:
         s + np.flatnonzero(evidence.used[s : s + record.size]) if sparse else np.arange(s, s + record.size, stride)
         for s, record, sparse in zip(starts.tolist(), evidence.signals, evidence.sparse, strict=True)
     ]
+
+
+def _means(used: Mask, first: Indices, kept: Mask) -> csr_array:
+    """Return what takes samples to the means of those that are used, for the points that are kept."""
+    point = np.searchsorted(first, np.flatnonzero(used), side="right") - 1
+    number = np.cumsum(kept) - 1
+    columns, rows = np.flatnonzero(used)[kept[point]], number[point[kept[point]]]
+    counts = np.bincount(rows)
+    return csr_array((1.0 / counts[rows], (rows, columns)), shape=(counts.size, used.size))
 
 
 def _stretches(variance: Vector, minutes: Vector, starts: Indices) -> list[tuple[int, int, float]]:

@@ -63,7 +63,7 @@ class RecordWithTest:
             noise=dataclasses.replace(evidence.noise, count=evidence.count + int(measured.sum())),
         )
         self.points = Points(self.evidence)
-        self.before = int(self.points.used[: self.points.starts[-1]].sum())
+        self.before = int(self.points.starts[-1])
         self.ends = np.ceil(np.array(HOURS) * 60.0 / (every_min or self.points.period_min)).astype(int)
         self._known: dict[int, tuple[Fit, Vector, Matrix, Matrix]] = {}
 

@@ -19,7 +19,7 @@ from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Start, Term, fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, learned_rest
 from compensator.diagnose.points import Points, Rest
-from compensator.diagnose.scan import Scan
+from compensator.diagnose.scan import Grid, Scan
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, Place, proposals
 
@@ -75,9 +75,17 @@ class Selection:
 
 
 class Search:
-    """One search over one body of evidence."""
+    """One search over one body of evidence.
 
-    def __init__(self, evidence: Evidence) -> None:
+    Parameters
+    ----------
+    evidence : Evidence
+        Residual and signals.
+    grid : Grid, optional
+        That of another search over the same signals, which spares its columns.
+    """
+
+    def __init__(self, evidence: Evidence, grid: Grid | None = None) -> None:
         context = evidence.context
         self.evidence, self.points = evidence, Points(evidence)
         self.hypotheses = proposals(context)
@@ -87,7 +95,8 @@ class Search:
         elif context.approximate:
             self.hypotheses += proposals(context, background=True)
         self.hypotheses = [_above(hypothesis, ALIAS_FREE * self.points.period_min) for hypothesis in self.hypotheses]
-        self._scan = Scan(self.points, self.hypotheses)
+        self.grid = grid or Grid(evidence.signals)
+        self._scan = Scan(self.points, self.hypotheses, self.grid)
         self.criterion = Criterion(evidence, self.hypotheses)
 
     def run(self, *, unobserved: bool = True) -> Selection:
@@ -99,7 +108,7 @@ class Search:
             Whether an unobserved source is looked for.
         """
         unobserved = unobserved and not self.evidence.free_paths
-        nothing = np.zeros(self.points.used.size)
+        nothing = np.zeros(self.points.count)
         rest = learned_rest(self.points, np.zeros((nothing.size, 0)), nothing, self.points.typical_rest())
         before = fit_terms(Likelihood(self.points, rest), [])
         self.criterion.something_acts = self.evidence.is_sparse and not self.criterion.leaves_noise(before)

@@ -12,6 +12,8 @@ from compensator.diagnose.points import Points, Rest
 
 #: Stretches of so few points are whitened in a loop.
 FEW = 12
+#: So many columns are whitened with all of them at once.
+MANY = 400
 
 
 class Whitening:
@@ -26,32 +28,48 @@ class Whitening:
     """
 
     def __init__(self, points: Points, rest: Rest) -> None:
-        self._used = points.used
         phis = points.decays(rest.tau_min)
-        stationary = (rest.slow_um / rest.noise_um) ** 2
-        predicted, p = np.empty(points.used.size), stationary
+        stationary, starts = (rest.slow_um / rest.noise_um) ** 2, set(points.starts.tolist())
+        predicted, p = np.empty(points.count), stationary
         for begin, end, noise in points.stretches:
-            if begin in points.begins:
+            if begin in starts:
                 p = stationary
             predicted[begin:end], p = _predicted_variances(p, end - begin, noise, float(phis[begin]), stationary)
         variances = predicted + points.relative_variance
+        # What a point says of the next one, and what is left of what was known before; nothing from run to run.
+        phis[points.starts[1:] - 1] = 0.0
         gains = predicted / variances
-        self._into = phis * gains
-        self._into[points.starts[1:] - 1] = 0.0
-        self._bands = np.ones((2, points.used.size))
+        self._into = (phis * gains)[:-1, None]
+        self._bands = np.ones((2, points.count))
         self._bands[1] = -phis * (1.0 - gains)
-        self._bands[1, points.starts[1:] - 1] = 0.0
-        self._scale = 1.0 / (np.sqrt(variances[points.used]) * rest.noise_um)
-        self.log_det = float(np.log(variances[points.used]).sum()) + 2.0 * points.count * math.log(rest.noise_um)
+        self._scale = 1.0 / (np.sqrt(variances) * rest.noise_um)[:, None]
+        self.log_det = float(np.log(variances).sum()) + 2.0 * points.count * math.log(rest.noise_um)
 
     def of(self, table: Matrix) -> Matrix:
-        """Return columns as the filter leaves them, on the points used."""
+        """Return columns as the filter leaves them."""
         if not table.shape[1]:
-            return np.zeros((self._scale.size, 0))  # LAPACK must not be called with nothing
-        driven = np.zeros(table.shape, order="F")
-        driven[1:] = self._into[:-1, None] * table[:-1]
+            return np.zeros(table.shape)  # LAPACK must not be called with nothing
+        if table.shape[1] > MANY:
+            return self._row_by_row(table)
+        # LAPACK goes along columns.
+        table = np.asfortranarray(table)
+        driven = np.empty(table.shape, order="F")
+        driven[0] = 0.0
+        np.multiply(table[:-1], self._into, out=driven[1:])
         predicted, _ = dtbtrs(self._bands, driven, uplo="L", diag="U", overwrite_b=1)
-        return np.asarray((table - predicted)[self._used] * self._scale[:, None])
+        np.subtract(table, predicted, out=predicted)
+        predicted *= self._scale
+        return np.asarray(predicted)
+
+    def _row_by_row(self, table: Matrix) -> Matrix:
+        """Return the same, with all columns at once from one point to the next."""
+        white, predicted, kept = np.empty(table.shape), np.zeros(table.shape[1]), -self._bands[1]
+        for i, (into, left) in enumerate(zip([*self._into[:, 0].tolist(), 0.0], kept.tolist(), strict=True)):
+            np.subtract(table[i], predicted, out=white[i])
+            predicted *= left
+            predicted += into * table[i]
+        white *= self._scale
+        return white
 
 
 def _predicted_variances(first: float, count: int, noise: float, phi: float, stationary: float) -> tuple[Vector, float]:
@@ -63,14 +81,10 @@ def _predicted_variances(first: float, count: int, noise: float, phi: float, sta
         values = []
         for _ in range(count):
             values.append(first)
-            left = first if noise == math.inf else first * noise / (first + noise)
-            first = stationary + phi * phi * (left - stationary)
+            first = stationary + phi * phi * (first * noise / (first + noise) - stationary)
         return np.array(values), first
     n = np.arange(count + 1, dtype=np.float64)
     course: Vector
-    if noise == math.inf:
-        course = stationary + np.power(phi, 2.0 * n) * (first - stationary)
-        return course[:-1], float(course[-1])
     driven = stationary * (1.0 - phi * phi)
     half = 0.5 * (noise * (1.0 - phi * phi) - driven)
     root = math.sqrt(half * half + driven * noise)

@@ -33,7 +33,7 @@ def diagnosed(monkeypatch, remainder_um):
         found = findings_of(evidence, **given)
         assert not found.terms
         points = found.search.points
-        fitted = Background(evidence).fitted(points, np.zeros(points.used.size), found.selection.before.rest)
+        fitted = Background(evidence).fitted(points, np.zeros(points.count), found.selection.before.rest)
         remainder = dataclasses.replace(fitted, added=remainder_um * wave(fitted.added.size))
         return dataclasses.replace(found, remainder=remainder, explains=True)
 

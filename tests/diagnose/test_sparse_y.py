@@ -268,7 +268,7 @@ def test_a_remainder_that_helps_nothing_is_not_deployed(monkeypatch):
         """All channels in place of the gain: as good, and no better."""
         found = findings_of(evidence, **given)
         points, rest = found.search.points, found.selection.before.rest
-        everything = Background(evidence).fitted(points, np.zeros(points.used.size), rest)
+        everything = Background(evidence).fitted(points, np.zeros(points.count), rest)
         return dataclasses.replace(found, remainder=everything, explains=False)
 
     for module in (diagnosis, held_out):
