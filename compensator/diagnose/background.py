@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import RandomColumns
+from compensator.diagnose.likelihood import STEP, RandomColumns
 from compensator.diagnose.points import Points, Rest, lags_of_paths
 from compensator.diagnose.whitening import Whitening
 from compensator.model.effects.regression import AMBIENT, DRIVE, MOST_CHANNELS, MOST_ROWS, Regression
@@ -120,7 +120,9 @@ class _Problem:
         self.scale = np.std(table, axis=0)
         self.scale[self.scale < 1e-12] = np.inf
         self.table = table / self.scale
-        self.target = points.residual - explained
+        random = np.concatenate([points.zeros, points.starts_of_modes], axis=1)
+        self._fixed = random.shape[1]
+        self._all = np.asfortranarray(np.column_stack([random, self.table, points.residual - explained]))
         self.groups, self.is_path = background.groups, background.is_path
         size, unknown = SIZE_SHARE * points.spread_um, points.evidence.free_paths
         self.typical_size, self.typical_path = np.log([size, size if unknown else points.own_um]).tolist()
@@ -144,26 +146,14 @@ class _Problem:
         typical = self.points.typical_rest()
         return dataclasses.replace(typical.without_own_error(), slow_um=slow_um, tau_min=tau_min, start_um=start_um)
 
-    def _white(self, x: Vector) -> tuple[Matrix, float, int]:
-        """Return target, random columns and channels, whitened; the log determinant; how many are random."""
-        rest = self._rest(x)
-        random = self.points.random(rest)
-        whitening = Whitening(self.points, rest)
-        white = whitening.of(np.column_stack([self.target, random, self.table]))
-        white[:, 1 + random.shape[1] :] *= np.exp(x[3:])[self.groups]
-        return white, whitening.log_det, random.shape[1]
-
-    def _solved(self, x: Vector) -> RandomColumns:
-        white, log_det, _ = self._white(x)
-        return RandomColumns(white[:, 1:], white[:, 0], log_det)
-
-    def _value(self, x: Vector) -> tuple[float, Vector]:
-        """Return the logarithm of the evidence, and its slopes but for the first two."""
-        solved = self._solved(x)
-        slopes, zeros = solved.surplus(solved.mean.size), self.points.zeros.shape[1]
-        starts = slopes[zeros : zeros + self.points.starts_of_modes.shape[1]].sum()
-        by_size = np.bincount(self.groups, weights=slopes[-self.groups.size :], minlength=self.is_path.size)
-        return -solved.surprise, np.array([starts, *by_size.tolist()])
+    def _white(self, x: Vector) -> tuple[Matrix, Vector, float]:
+        """Return zeros, initial states and channels of their sizes, and the target, whitened; the log determinant."""
+        whitening = Whitening(self.points, self._rest(x))
+        white = whitening.of(self._all)
+        first = self.points.zeros.shape[1]
+        white[:, first : self._fixed] *= np.exp(x[2])
+        white[:, self._fixed : -1] *= np.exp(x[3:])[self.groups]
+        return white[:, :-1], white[:, -1], whitening.log_det
 
     def _prior(self, x: Vector) -> tuple[float, Vector]:
         sizes, channels, slopes = x[3:], ~self.is_path, np.zeros(x.size)
@@ -183,20 +173,20 @@ class _Problem:
         return value, slopes
 
     def _with_gradient(self, x: Vector) -> tuple[float, Vector]:
-        (value, sizes), (prior, slopes) = self._value(x), self._prior(x)
-        slopes[2:] += sizes
-        for i in range(2):
-            moved = x.copy()
-            moved[i] += 1e-3
-            slopes[i] += (-self._solved(moved).surprise - value) / 1e-3
-        return -(value + prior), -slopes
+        model = RandomColumns(*self._white(x))
+        prior, slopes = self._prior(x)
+        surplus = model.surplus(model.mean.size)
+        slopes[2] += surplus[self.points.zeros.shape[1] : self._fixed].sum()
+        slopes[3:] += np.bincount(self.groups, weights=surplus[self._fixed :], minlength=self.is_path.size)
+        slopes[:2] -= model.slopes((self._white(x + STEP * (np.arange(x.size) == i)) for i in range(2)), STEP)
+        return model.surprise - prior, -slopes
 
     def _result(self, x: Vector, log_evidence: float) -> Regressed:
-        white, _, fixed = self._white(x)
-        gram = np.eye(white.shape[1] - 1) + white[:, 1:].T @ white[:, 1:]
+        white, target, _ = self._white(x)
+        gram = np.eye(white.shape[1]) + white.T @ white
         weights = np.exp(x[3:])[self.groups] / self.scale
-        covariance = np.linalg.inv(gram)[fixed:, fixed:]
-        gains = (np.linalg.solve(gram, white[:, 1:].T @ white[:, 0])[fixed:]) * weights
+        covariance = np.linalg.inv(gram)[self._fixed :, self._fixed :]
+        gains = (np.linalg.solve(gram, white.T @ target)[self._fixed :]) * weights
         sizes, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
         root = axes * np.sqrt(np.maximum(sizes, 0.0)) * weights[:, None]
         # The directions of the covariance that matter most for y, over what was seen.

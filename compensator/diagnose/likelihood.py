@@ -14,6 +14,7 @@ regularizations and Gaussian processes (Automatica 2012); Rasmussen and Williams
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -25,6 +26,8 @@ from compensator.diagnose.whitening import Whitening
 
 #: Furthest that the search of the rest goes, in e-folds.
 FURTHEST = 6.0
+#: Step of a logarithm for its slope.
+STEP = 1e-3
 
 
 class RandomColumns:
@@ -48,6 +51,7 @@ class RandomColumns:
     """
 
     def __init__(self, columns: Matrix, target: Vector, log_det: float = 0.0) -> None:
+        self._columns, self._target, self._log_det = columns, target, log_det
         moment = columns.T @ target
         self._factor = factored(columns.T @ columns)
         self.mean = cho_solve(self._factor, moment, check_finite=False)
@@ -57,6 +61,25 @@ class RandomColumns:
         """Return the slope of the log evidence by the logarithm of the size of each of the first columns."""
         known = np.diag(cho_solve(self._factor, np.eye(self.mean.size)[:, :count], check_finite=False))
         return np.asarray(self.mean[:count] ** 2 + known - 1.0)
+
+    def slopes(self, moved: Iterable[tuple[Matrix, Vector, float]], step: float) -> Vector:
+        """Return the slopes of the surprise by what the whitening depends on.
+
+        Parameters
+        ----------
+        moved : iterable of (numpy.ndarray, numpy.ndarray, float)
+            Columns, target and logarithm of the determinant after a small step of each.
+        step : float
+            The step.
+        """
+        left = self._target - self._columns @ self.mean
+        spread = cho_solve(self._factor, self._columns.T, check_finite=False).T
+        found = []
+        for columns, target, log_det in moved:
+            change = columns - self._columns
+            by_mean = left @ (target - self._target - change @ self.mean)
+            found.append((by_mean + np.vdot(spread, change) + 0.5 * (log_det - self._log_det)) / step)
+        return np.array(found)
 
 
 class Likelihood:
@@ -125,31 +148,29 @@ def learned_rest(points: Points, columns: Matrix, fixed: Vector, start: Rest, st
         Most evaluations of the gradient.
     """
     unit = dataclasses.replace(start, start_um=1.0, fast_um=1.0)
-    table = np.column_stack([points.residual - fixed, points.random(unit), columns])
+    table = np.asfortranarray(np.column_stack([points.residual - fixed, points.random(unit), columns]))
     ends = np.cumsum([points.zeros.shape[1], points.starts_of_modes.shape[1], points.fast.shape[1]]).tolist()
     sized = [slice(ends[0], ends[1]), slice(ends[1], ends[2])]
     # The noise of values measured now and then is stated.
     searched = np.arange(0 if points.is_exact and not points.evidence.is_sparse else 1, 5)
     at = np.clip(start.logs, points.typical_logs - FURTHEST, points.typical_logs + FURTHEST)
 
-    def solved(logs: Vector) -> RandomColumns:
+    def whitened(logs: Vector) -> tuple[Matrix, Vector, float]:
         rest = start.with_logs(logs)
         whitening = Whitening(points, rest)
         white = whitening.of(table)
         for where, size in zip(sized, (rest.start_um, rest.fast_um), strict=True):
             white[:, 1:][:, where] *= size
-        return RandomColumns(white[:, 1:], white[:, 0], whitening.log_det)
+        return white[:, 1:], white[:, 0], whitening.log_det
 
     def with_gradient(some: Vector) -> tuple[float, Vector]:
         logs = at.copy()
         logs[searched] = some
-        model, slopes = solved(logs), np.zeros(5)
+        model, slopes = RandomColumns(*whitened(logs)), np.zeros(5)
         here, surplus = model.surprise, model.surplus(ends[2])
         slopes[3:] = [-surplus[where].sum() for where in sized]
-        for i in searched[searched < 3].tolist():
-            moved = logs.copy()
-            moved[i] += 1e-3
-            slopes[i] = (solved(moved).surprise - here) / 1e-3
+        of_noise = searched[searched < 3]
+        slopes[of_noise] = model.slopes((whitened(logs + STEP * (np.arange(5) == i)) for i in of_noise), STEP)
         off = (logs - points.typical_logs) / REST_FOLDS
         return here + 0.5 * float(off @ off), (slopes + off / REST_FOLDS)[searched]
 

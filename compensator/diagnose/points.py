@@ -126,13 +126,14 @@ class Points:
         kept = counts >= np.where(is_value, 1.0, max(1.0, stride / 2.0))
         self.count = int(kept.sum())
         self.starts = np.flatnonzero(np.diff(run[kept], prepend=-1))
-        self._minutes = context.period_min * np.diff(first[kept], append=first[-1] + stride)
+        minutes = context.period_min * np.diff(first[kept], append=first[-1] + stride)
         self.period_min = context.period_min * stride
         if is_value.any():
-            self.period_min = max(self.period_min, float(np.median(self._minutes[:-1])))
+            self.period_min = max(self.period_min, float(np.median(minutes[:-1])))
+        self._lengths = np.unique(minutes, return_inverse=True)
         self.relative_variance = stride / counts[kept]
         self._mean = _means(evidence.used, first, kept)
-        self.stretches = _stretches(self.relative_variance, self._minutes, self.starts)
+        self.stretches = _stretches(self.relative_variance, minutes, self.starts)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
         self.spread_um = max(evidence.spread_um, 1e-9)
         self.own_um = self._own_um()
@@ -160,7 +161,7 @@ class Points:
 
     def decays(self, tau_min: float) -> Vector:
         """Return what is left of a slow process from each point to the next, shape (points,)."""
-        lengths, which = np.unique(self._minutes, return_inverse=True)
+        lengths, which = self._lengths
         return np.array([math.exp(-length / tau_min) for length in lengths.tolist()])[which]
 
     def averaged(self, table: Matrix) -> Matrix:

@@ -107,6 +107,7 @@ class Scan:
         # What is projected has the products of what is whitened with the upper part of what is projected.
         products = white.T @ target[:size]
         squares = _squares(white, white) - _squares(taken, taken) - _squares(cross, back)
+        squares = np.maximum(squares, 0.0)  # rounding, where a column hardly changes
         widths = np.diff(self._first)
         gains = np.empty(widths.size)
         for width in set(widths.tolist()):
