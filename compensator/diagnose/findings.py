@@ -101,7 +101,7 @@ def findings_of(evidence: Evidence, *, unobserved: bool = True, grid: Grid | Non
     unobserved : bool
         Whether an unobserved source is looked for.
     grid : Grid, optional
-        That of another search over the same signals.
+        That of a search over all data, where something is held out.
     """
     search = Search(evidence, grid)
     selection = search.run(unobserved=unobserved)

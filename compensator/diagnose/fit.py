@@ -194,9 +194,8 @@ class _Problem:
 
 
 def _part(likelihood: Likelihood, hypothesis: Hypothesis, values: tuple[float, ...]) -> _Part:
-    points = likelihood.points
-    table, scale = raw_columns(points.evidence, hypothesis, values), None
-    averaged = points.averaged(table)
+    points, scale = likelihood.points, None
+    averaged = points.columns_of(hypothesis, values)
     if hypothesis.amplitudes:
         averaged, scale = points.scaled(averaged, hypothesis.sizes, averaged.shape[1])
     return _Part(values, averaged, scale, likelihood.projected(averaged))

@@ -18,10 +18,12 @@ from scipy.sparse import csr_array
 from compensator.arrays import Indices, Mask, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.model.effects.blocks import FilterBank
-from compensator.model.effects.hypothesis import Context
+from compensator.model.effects.hypothesis import Context, Hypothesis
 
 #: Points that the samples are averaged to.
 POINTS = 700
+#: Averaged columns that are kept.
+MOST_KNOWN = 3000
 #: Lags of the paths' own error, and which of them are fast, min.
 OWN_LAGS, FAST_MIN = 8, 25.0
 #: Combinations of lagged inputs that differ less than this from others are left out.
@@ -96,6 +98,8 @@ class Points:
         Residual, µm.
     count : int
         Number of points.
+    first : numpy.ndarray of int, shape (points,)
+        First sample of each point.
     starts : numpy.ndarray of int
         First point of each run that has any.
     period_min : float
@@ -118,15 +122,16 @@ class Points:
         self.evidence = evidence
         context = evidence.context
         self.is_exact = not context.approximate or evidence.free_paths
-        stride = max(1, math.ceil(evidence.count / POINTS))
+        # The same for all data and for what is left where something is held out.
+        stride = max(1, math.ceil(int(np.isfinite(evidence.y_um).sum()) / POINTS))
         edges = _edges(evidence, stride)
         first = np.concatenate(edges)
         counts = np.add.reduceat(evidence.used.astype(float), first)
         is_value, run = (np.repeat(each, [e.size for e in edges]) for each in (evidence.sparse, range(len(edges))))
         kept = counts >= np.where(is_value, 1.0, max(1.0, stride / 2.0))
-        self.count = int(kept.sum())
+        self.count, self.first = int(kept.sum()), first[kept]
         self.starts = np.flatnonzero(np.diff(run[kept], prepend=-1))
-        minutes = context.period_min * np.diff(first[kept], append=first[-1] + stride)
+        minutes = context.period_min * np.diff(self.first, append=first[-1] + stride)
         self.period_min = context.period_min * stride
         if is_value.any():
             self.period_min = max(self.period_min, float(np.median(minutes[:-1])))
@@ -140,6 +145,7 @@ class Points:
         self.typical_logs = self._typical_logs(stride)
         self.fast, self.slow = self._own_columns()
         self._forms: dict[str, Matrix] = {}
+        self._known: dict[tuple[Hypothesis, tuple[float, ...]], Matrix] = {}
         nuisances = self.averaged(evidence.nuisances)
         is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
         self.zeros, self.starts_of_modes = ZERO_TIMES * self.spread_um * nuisances[:, is_zero], nuisances[:, ~is_zero]
@@ -167,6 +173,17 @@ class Points:
     def averaged(self, table: Matrix) -> Matrix:
         """Return the means of columns over the samples used of each point, shape (points, columns)."""
         return np.asarray(self._mean @ table)
+
+    def columns_of(self, hypothesis: Hypothesis, values: tuple[float, ...]) -> Matrix:
+        """Return the averaged columns of a hypothesis; one fit after another asks for the same."""
+        known = self._known.get((hypothesis, values))
+        if known is None:
+            raw = np.concatenate([hypothesis.columns(record, values) for record in self.evidence.signals])
+            known = self.averaged(raw)
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
+            self._known[hypothesis, values] = known
+        return known
 
     def scaled(self, points: Matrix, sizes: Sequence[float], together: int) -> tuple[Matrix, Vector]:
         """Return averaged columns of which one unit is what is expected of each amplitude, and their scales.

@@ -12,7 +12,6 @@ on average. Either may be true, so the smaller one of both directions counts.
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -21,7 +20,7 @@ from compensator.arrays import Indices, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.fit import Fit, Term, raw_columns
 from compensator.diagnose.nuisances import nuisances_of
-from compensator.diagnose.points import POINTS, Points, Rest
+from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.trials import Trial
 from compensator.diagnose.whitening import Whitening
 
@@ -47,7 +46,6 @@ class RecordWithTest:
     """
 
     def __init__(self, evidence: Evidence, trial: Trial, every_min: float) -> None:
-        self.record_period_min = evidence.context.period_min * max(1, math.ceil(evidence.count / POINTS))
         n, samples = trial.signals.size, 1
         self.every_min = every_min
         if every_min:
@@ -78,14 +76,9 @@ class RecordWithTest:
         """Return the same for what a source adds to the test, beside a fit without it."""
         begin = self.evidence.used.size - course.size
         added = self.points.averaged(np.concatenate([np.zeros(begin), course])[:, None])
-        d = self._whitening(fit.rest).of(added)[self.before :, 0]
+        d = Whitening(self.points, fit.rest).of(added)[self.before :, 0]
         _, table, precision = self._prediction(fit, fit.rest)
         return expected_change(d, table, precision, self.ends)
-
-    def _whitening(self, rest: Rest) -> Whitening:
-        # The noise of a point is that of its samples' mean; with the test there may be more of them in a point.
-        share = self.record_period_min / self.points.period_min if self.points.is_exact and not self.every_min else 1.0
-        return Whitening(self.points, dataclasses.replace(rest, noise_um=rest.noise_um * float(np.sqrt(share))))
 
     def _prediction(self, fit: Fit, rest: Rest) -> tuple[Vector, Matrix, Matrix]:
         """Return the mean of the test, columns of what stays unknown in it, and their precision after the record."""
@@ -93,7 +86,7 @@ class RecordWithTest:
         if known is None or known[0] is not fit:
             added, slopes = self._response(fit)
             table = np.column_stack([self.points.residual - added, added, self.points.random(rest), slopes])
-            white = self._whitening(rest).of(table)
+            white = Whitening(self.points, rest).of(table)
             seen, test = white[: self.before], white[self.before :]
             precision = np.eye(white.shape[1] - 2) + seen[:, 2:].T @ seen[:, 2:]
             mean = test[:, 1] + test[:, 2:] @ np.linalg.solve(precision, seen[:, 2:].T @ seen[:, 0])

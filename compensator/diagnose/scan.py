@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,40 +12,26 @@ from compensator.diagnose.fit import Fit, Start
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points, Rest
 from compensator.model.effects.hypothesis import Hypothesis
-from compensator.model.effects.signals import RecordSignals
-
-#: Columns that are kept for other searches take no more memory than this, bytes.
-KEPT_BYTES = 3e8
 
 
+@dataclass(frozen=True, slots=True)
 class Grid:
-    """Columns of hypotheses at every point of their grids on every sample: they do not depend on what is held out.
+    """Columns of hypotheses at every point of their grids: nothing in them depends on what is held out.
 
     Parameters
     ----------
-    signals : sequence of RecordSignals
-        What effects act by.
+    first : numpy.ndarray of int, shape (points,)
+        First sample of each point of all data.
+    columns : mapping of Hypothesis to numpy.ndarray, shape (points, ·)
+        Columns of all points of a grid side by side.
     """
 
-    def __init__(self, signals: Sequence[RecordSignals]) -> None:
-        self._signals = signals
-        self._known: dict[Hypothesis, Matrix] = {}
-        self._bytes = 0
+    first: Indices
+    columns: Mapping[Hypothesis, Matrix]
 
-    def columns(self, hypothesis: Hypothesis) -> Matrix:
-        """Return the columns of all points of a grid side by side, shape (n, points · amplitudes)."""
-        known = self._known.get(hypothesis)
-        if known is not None:
-            return known
-        rows = [
-            np.concatenate([hypothesis.columns(record, values).T for values in hypothesis.grid()])
-            for record in self._signals
-        ]
-        table = np.ascontiguousarray(np.concatenate(rows, axis=1).T)
-        if self._bytes + table.nbytes < KEPT_BYTES:
-            self._bytes += table.nbytes
-            self._known[hypothesis] = table
-        return table
+    def of(self, hypothesis: Hypothesis, points: Points) -> Matrix:
+        """Return the columns of a hypothesis for what is left of the points where something is held out."""
+        return self.columns[hypothesis][np.searchsorted(self.first, points.first)]
 
 
 class Scan:
@@ -55,26 +41,39 @@ class Scan:
     ----------
     points : Points
         The data.
-    hypotheses : list of Hypothesis
+    hypotheses : sequence of Hypothesis
         What could act.
+    grid : Grid, optional
+        Their columns for all data, where something is held out.
+
+    Attributes
+    ----------
     grid : Grid
-        Their columns on every sample.
+        Their columns for all data.
     """
 
-    def __init__(self, points: Points, hypotheses: Sequence[Hypothesis], grid: Grid) -> None:
+    def __init__(self, points: Points, hypotheses: Sequence[Hypothesis], grid: Grid | None = None) -> None:
+        self.grid = grid or Grid(points.first, {one: _on_grid(points, one) for one in hypotheses if one.grid()})
         self._points = points
-        self._where = [(hypothesis, values) for hypothesis in hypotheses for values in hypothesis.grid()]
-        tables, widths = [], []
+        several: dict[int, list[tuple[Hypothesis, Matrix]]] = {}
         for hypothesis in hypotheses:
-            count = len(hypothesis.grid())
-            if not count:
-                continue
-            table = points.averaged(grid.columns(hypothesis))
-            width = table.shape[1] // count
-            widths += [width] * count
-            tables.append(points.scaled(table, hypothesis.sizes, width)[0] if hypothesis.amplitudes else table)
+            if count := len(hypothesis.grid()):
+                table = self.grid.of(hypothesis, points)
+                width = table.shape[1] // count
+                if hypothesis.amplitudes:
+                    table = points.scaled(table, hypothesis.sizes, width)[0]
+                several.setdefault(width, []).append((hypothesis, table))
+        #: Columns of hypotheses with equally many of them, for each number: where they are.
+        self._where: dict[int, slice] = {}
+        self._starts, tables = list[Start](), [np.zeros((points.count, 0))]
+        begin = 0
+        for width, some in several.items():
+            tables += [table for _, table in some]
+            self._starts += [(hypothesis, values) for hypothesis, _ in some for values in hypothesis.grid()]
+            end = begin + sum(table.shape[1] for _, table in some)
+            self._where[width], begin = slice(begin, end), end
         self._columns = np.concatenate(tables, axis=1)
-        self._first = np.array([0, *itertools.accumulate(widths)])
+        self._fixed = np.array([not hypothesis.amplitudes for hypothesis, _ in self._starts], dtype=bool)
 
     def ranked(self, rest: Rest, fit: Fit, cost: Callable[[Hypothesis], float]) -> list[Start]:
         """Rank the hypotheses whose places are free by what their best grid point adds to the evidence.
@@ -91,14 +90,14 @@ class Scan:
         likelihood = Likelihood(self._points, rest)
         gains = self._gains(likelihood, fit)
         best: dict[int, tuple[float, Start]] = {}
-        for (hypothesis, values), gain in zip(self._where, gains.tolist(), strict=True):
+        for (hypothesis, values), gain in zip(self._starts, gains.tolist(), strict=True):
             known = best.get(id(hypothesis))
             if hypothesis.place not in fit.places and (known is None or gain > known[0]):
                 best[id(hypothesis)] = (gain, (hypothesis, values))
         ranking = sorted(best.values(), key=lambda item: cost(item[1][0]) - item[0])
         return [start for _, start in ranking]
 
-    def _gains(self, likelihood: Likelihood, fit: Fit) -> Matrix:
+    def _gains(self, likelihood: Likelihood, fit: Fit) -> Vector:
         """Return what each grid point adds to the logarithm of the evidence, amplitudes integrated out."""
         white, taken = likelihood.whitened(self._columns)
         kept, inner, target = fit.solved(likelihood)
@@ -106,34 +105,38 @@ class Scan:
         cross, back = kept[:size].T @ white, inner[:, :size] @ white
         # What is projected has the products of what is whitened with the upper part of what is projected.
         products = white.T @ target[:size]
-        squares = _squares(white, white) - _squares(taken, taken) - _squares(cross, back)
-        squares = np.maximum(squares, 0.0)  # rounding, where a column hardly changes
-        widths = np.diff(self._first)
-        gains = np.empty(widths.size)
-        for width in set(widths.tolist()):
-            which = np.flatnonzero(widths == width)
-            at = self._first[which][:, None] + np.arange(width)
-            if width == 1:
-                one = at[:, 0]
-                gains[which] = 0.5 * (products[one] ** 2 / (1.0 + squares[one]) - np.log1p(squares[one]))
-                continue
-            gram = np.eye(width) + _grams(white, white, at) - _grams(taken, taken, at) - _grams(cross, back, at)
+        gains = list[float]()
+        for width, at in self._where.items():
+            gram = (
+                _blocks(white[:, at], white[:, at], width)
+                - _blocks(taken[:, at], taken[:, at], width)
+                - _blocks(cross[:, at], back[:, at], width)
+            )
             # Rounding of large columns must not take away what the prior adds.
-            gram += 1e-10 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(width)
-            moment = products[at]
+            own = np.maximum(np.diagonal(gram, axis1=1, axis2=2), 0.0)
+            unit = np.eye(width)
+            gram = np.where(unit, own[:, :, None], gram) + unit * (1.0 + 1e-10 * own.sum(axis=1))[:, None, None]
+            moment = products[at].reshape(-1, width)
             solved = np.linalg.solve(gram, moment[..., None])[..., 0]
-            gains[which] = 0.5 * np.einsum("ij,ij->i", moment, solved) - 0.5 * np.linalg.slogdet(gram)[1]
-        for i, (hypothesis, _) in enumerate(self._where):
-            if not hypothesis.amplitudes:
-                gains[i] = products[self._first[i]] - 0.5 * squares[self._first[i]]
-        return gains
+            added = 0.5 * np.einsum("ij,ij->i", moment, solved) - 0.5 * np.linalg.slogdet(gram)[1]
+            fixed = self._fixed[len(gains) : len(gains) + added.size]
+            gains += np.where(fixed, moment[:, 0] - 0.5 * own[:, 0], added).tolist()
+        return np.array(gains)
 
 
-def _squares(first: Matrix, second: Matrix) -> Vector:
-    """Return the product of each column with its like."""
-    return np.asarray(np.einsum("ij,ij->j", first, second))
+def _on_grid(points: Points, hypothesis: Hypothesis) -> Matrix:
+    """Return the averaged columns of a hypothesis at all points of its grid, side by side."""
+    rows = [
+        np.concatenate([hypothesis.columns(record, values).T for values in hypothesis.grid()])
+        for record in points.evidence.signals
+    ]
+    return points.averaged(np.concatenate(rows, axis=1).T)
 
 
-def _grams(first: Matrix, second: Matrix, at: Indices) -> Matrix:
-    """Return the products of some columns with each other, for each row of their numbers."""
-    return np.asarray(first.T[at] @ second.T[at].transpose(0, 2, 1))
+def _blocks(first: Matrix, second: Matrix, width: int) -> Matrix:
+    """Return the products of columns with each other, in groups of so many side by side, shape (·, width, width)."""
+    found = np.empty((first.shape[1] // width, width, width))
+    for i in range(width):
+        for j in range(i, width):
+            found[:, i, j] = found[:, j, i] = np.einsum("ij,ij->j", first[:, i::width], second[:, j::width])
+    return found

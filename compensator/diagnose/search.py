@@ -82,7 +82,7 @@ class Search:
     evidence : Evidence
         Residual and signals.
     grid : Grid, optional
-        That of another search over the same signals, which spares its columns.
+        That of a search over all data, where something is held out.
     """
 
     def __init__(self, evidence: Evidence, grid: Grid | None = None) -> None:
@@ -95,9 +95,13 @@ class Search:
         elif context.approximate:
             self.hypotheses += proposals(context, background=True)
         self.hypotheses = [_above(hypothesis, ALIAS_FREE * self.points.period_min) for hypothesis in self.hypotheses]
-        self.grid = grid or Grid(evidence.signals)
-        self._scan = Scan(self.points, self.hypotheses, self.grid)
+        self._scan = Scan(self.points, self.hypotheses, grid)
         self.criterion = Criterion(evidence, self.hypotheses)
+
+    @property
+    def grid(self) -> Grid:
+        """What a search without some of the data need not compute again."""
+        return self._scan.grid
 
     def run(self, *, unobserved: bool = True) -> Selection:
         """Search what the inputs explain, and a source that no channel shows.
