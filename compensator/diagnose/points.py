@@ -7,7 +7,6 @@ its own.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -106,8 +105,6 @@ class Points:
         Time between two points, min; where Y was measured now and then the median.
     relative_variance : numpy.ndarray, shape (points,)
         Variance of the noise of each point, relative to a full one.
-    stretches : list of (int, int, float)
-        Stretches with equal noise and times between the points: begin, end, relative variance.
     is_exact : bool
         Whether effects have their form exactly: no error of the calibration is stated, or the paths are free.
     spread_um, own_um : float
@@ -138,7 +135,6 @@ class Points:
         self._lengths = np.unique(minutes, return_inverse=True)
         self.relative_variance = stride / counts[kept]
         self._mean = _means(evidence.used, first, kept)
-        self.stretches = _stretches(self.relative_variance, minutes, self.starts)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
         self.spread_um = max(evidence.spread_um, 1e-9)
         self.own_um = self._own_um()
@@ -287,13 +283,6 @@ def _means(used: Mask, first: Indices, kept: Mask) -> csr_array:
     columns, rows = np.flatnonzero(used)[kept[point]], number[point[kept[point]]]
     counts = np.bincount(rows)
     return csr_array((1.0 / counts[rows], (rows, columns)), shape=(counts.size, used.size))
-
-
-def _stretches(variance: Vector, minutes: Vector, starts: Indices) -> list[tuple[int, int, float]]:
-    """Return where equal variances and times to the next point begin and end, cut where runs begin."""
-    changes = np.flatnonzero((variance[1:] != variance[:-1]) | (minutes[1:] != minutes[:-1])) + 1
-    edges = np.unique(np.concatenate([starts, changes, [variance.size]])).tolist()
-    return [(a, b, float(variance[a])) for a, b in itertools.pairwise(edges)]
 
 
 def lags_of_paths(context: Context) -> tuple[float, ...]:

@@ -7,11 +7,9 @@ import math
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
-from compensator.arrays import Matrix, Vector
+from compensator.arrays import Matrix
 from compensator.diagnose.points import Points, Rest
 
-#: Stretches of so few points are whitened in a loop.
-FEW = 12
 #: So many columns are whitened with all of them at once.
 MANY = 400
 
@@ -28,17 +26,16 @@ class Whitening:
     """
 
     def __init__(self, points: Points, rest: Rest) -> None:
+        stationary = (rest.slow_um / rest.noise_um) ** 2
+        # What is left of a slow process from each point to the next; nothing from run to run.
         phis = points.decays(rest.tau_min)
-        stationary, starts = (rest.slow_um / rest.noise_um) ** 2, set(points.starts.tolist())
-        predicted, p = np.empty(points.count), stationary
-        for begin, end, noise in points.stretches:
-            if begin in starts:
-                p = stationary
-            predicted[begin:end], p = _predicted_variances(p, end - begin, noise, float(phis[begin]), stationary)
-        variances = predicted + points.relative_variance
-        # What a point says of the next one, and what is left of what was known before; nothing from run to run.
         phis[points.starts[1:] - 1] = 0.0
-        gains = predicted / variances
+        predicted, p = [], stationary
+        for noise, kept in zip(points.relative_variance.tolist(), (phis**2).tolist(), strict=True):
+            predicted.append(p)
+            p = stationary + kept * (p * noise / (p + noise) - stationary)
+        variances = np.array(predicted) + points.relative_variance
+        gains = np.array(predicted) / variances
         self._into = (phis * gains)[:-1, None]
         self._bands = np.ones((2, points.count))
         self._bands[1] = -phis * (1.0 - gains)
@@ -70,27 +67,3 @@ class Whitening:
             predicted += into * table[i]
         white *= self._scale
         return white
-
-
-def _predicted_variances(first: float, count: int, noise: float, phi: float, stationary: float) -> tuple[Vector, float]:
-    """Return the variances of a slow rest before each of some points with equal noise, and after them.
-
-    What the Kalman filter makes of a variance is a linear fraction of it, so that many points need no loop.
-    """
-    if count <= FEW:
-        values = []
-        for _ in range(count):
-            values.append(first)
-            first = stationary + phi * phi * (first * noise / (first + noise) - stationary)
-        return np.array(values), first
-    n = np.arange(count + 1, dtype=np.float64)
-    course: Vector
-    driven = stationary * (1.0 - phi * phi)
-    half = 0.5 * (noise * (1.0 - phi * phi) - driven)
-    root = math.sqrt(half * half + driven * noise)
-    # The larger of both fixed points, without cancellation, and the other, which is negative.
-    settled = driven * noise / (half + root) if half > 0.0 else root - half
-    other = settled - 2.0 * root
-    odds = np.power(phi * noise / (settled + noise), 2.0 * n) * (first - settled) / (first - other)
-    course = (settled - other * odds) / (1.0 - odds)
-    return course[:-1], float(course[-1])
