@@ -31,6 +31,8 @@ class Grid:
 
     def of(self, hypothesis: Hypothesis, points: Points) -> Matrix:
         """Return the columns of a hypothesis for what is left of the points where something is held out."""
+        if hypothesis not in self.columns:  # of fewer values measured now and then, fewer periods show
+            return _on_grid(points, hypothesis)
         return self.columns[hypothesis][np.searchsorted(self.first, points.first)]
 
 
