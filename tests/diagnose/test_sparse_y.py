@@ -176,7 +176,7 @@ def test_a_value_is_a_point_and_the_rest_decays_by_the_time_between():
 
 def test_points_do_not_grow_with_the_samples_between_two_probes():
     week = Points(evidence_of(QUILL, runs(probed("none", 1, hours=96.0))))
-    assert week.used.size == week.count == 95
+    assert week.first.size == week.count == 95
     assert Likelihood(week, week.typical_rest()).target.size < 200
 
 
