@@ -297,7 +297,8 @@ def test_what_only_the_remainder_corrects_is_not_called_unseen(found: Diagnosis)
 
 
 def test_without_effect_ceiling_and_remainder_the_page_says_so_and_claims_nothing(found: Diagnosis) -> None:
-    bare = dataclasses.replace(found, effects=(), steps=(), tried=(), ceiling=None, remainder=None, verdict="adequate")
+    nothing = {"effects": (), "steps": (), "tried": (), "ceiling": None, "remainder": None, "advice": None}
+    bare = dataclasses.replace(found, **nothing, verdict="adequate")
     words = text(bare)
     assert "No linear use of the logged channels leaves less" in words
     assert "before and after" not in words and "a correction that explains nothing" not in words
