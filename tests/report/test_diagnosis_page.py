@@ -134,7 +134,7 @@ def test_steps_are_predictions_of_searches_without_the_block(monkeypatch: pytest
         )
 
     monkeypatch.setattr(held_out_module, "findings_of", findings_of)
-    all_of = SimpleNamespace(search=SimpleNamespace(evidence=evidence), terms=())
+    all_of = SimpleNamespace(search=SimpleNamespace(evidence=evidence, grid=None), terms=())
     held_out = held_out_module.held_out_of(all_of, places, lambda done, of: None, map)
     first, second = held_out.steps
     assert (first.searches, second.searches) == (3, 2)
@@ -167,14 +167,14 @@ def test_an_effect_lies_over_its_residual_and_its_channel_below_it(found: Diagno
 
 def test_what_no_channel_shows_has_no_channel_below(found: Diagnosis) -> None:
     step = dataclasses.replace(found.effects[0], term=drawn_term("step"))
-    [section] = sections(dataclasses.replace(found, effects=(step,), steps=found.steps[:1]))
+    section, *_ = sections(dataclasses.replace(found, effects=(step,), steps=found.steps[:1]))
     picture = next(block for block in section.blocks if isinstance(block, Figure))
     assert picture.below == () and "No channel shows its cause." in picture.note
 
 
 def test_a_path_is_shown_with_what_drives_it(found: Diagnosis) -> None:
     gain = dataclasses.replace(found.effects[0], term=drawn_term("gain"))
-    [section] = sections(dataclasses.replace(found, effects=(gain,), steps=found.steps[:1]))
+    section, *_ = sections(dataclasses.replace(found, effects=(gain,), steps=found.steps[:1]))
     picture = next(block for block in section.blocks if isinstance(block, Figure))
     assert picture.below[0].y_label == "W"
     assert picture.below[0].lines[0].y == pytest.approx(found.evidence.signals[0].drive)
