@@ -185,8 +185,10 @@ def test_two_probes_speak_for_it_and_one_does_not(day: dict[str, np.ndarray]) ->
         values["t_q_degc"] += 8.0 if i >= BEGIN else 0.0
         compensation.process(sample(i, values))
     watch = compensation._jumps
-    assert watch.suspects == ("t_q_degc",) and watch._believing is not None and watch._believing.estimate is not None
-    believed = watch._believing.estimate.y_um
+    assert watch.suspects == ("t_q_degc",)
+    believing = watch.state.believing
+    assert believing is not None and believing.estimate is not None
+    believed = believing.estimate.y_um
     watch.receive_probe(0.0, 1.0, believed - 60.0)  # fits neither
     watch.receive_probe(believed, 1.0, 0.0)
     assert compensation.process(sample(i, values)).sample.channels["t_q_degc"].quality == "suspect"
