@@ -220,8 +220,7 @@ class Publisher:
             if sender is None:
                 query.drop()  # type: ignore[no-untyped-call]
                 return
-            payload = query.payload.to_bytes() if query.payload is not None else b""
-            reply = self._on_command(name, payload, sender)
+            reply = self._on_command(name, _payload(query, longest(name)), sender)
             if isinstance(reply, Future):
                 reply.add_done_callback(lambda done: send(query, key, done.result()))
             else:

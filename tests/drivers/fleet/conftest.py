@@ -71,7 +71,7 @@ class Slave:
 Fault = Callable[[bytes], bytes | None]
 
 #: A device's time-out: long enough that one which answers is not late on a busy computer.
-TIMEOUT_S = 0.25
+TIMEOUT_S = 0.5
 #: Time within which a read ends that has lost a reply, also on a busy computer; below the longest time-out.
 BOUND_S = 1.5
 

@@ -150,7 +150,7 @@ async def test_verification_takes_what_there_is(rig: Any) -> None:
 @pytest.mark.parametrize(
     ("fault", "error", "text"),
     [
-        (lambda reply: None, DeviceTimeout, r"no reply to '#01' from address 01 on .* within 0.25 s"),
+        (lambda reply: None, DeviceTimeout, r"no reply to '#01' from address 01 on .* within 0.5 s"),
         (lambda reply: reply[:-1], DeviceGarbled, "no valid reply to '#01' in b'>"),
         (lambda reply: reply[:-3] + b"\r", DeviceGarbled, "5 characters|expected"),
         (lambda reply: reply[:-8] + b"\r", DeviceGarbled, "7 values in .* expected 8"),

@@ -207,7 +207,7 @@ def exception(code: int) -> Callable[[bytes], bytes]:
         (exception(2), DeviceRefused, r"holding register 0 .count 8. of unit 1 .*illegal data address"),
         (exception(6), DeviceRefused, "device busy"),
         (exception(11), DeviceRefused, "gateway target did not answer"),
-        (lambda frame: None, DeviceTimeout, r"no answer from unit 1 on 127.0.0.1:\d+ within 0.25 s"),
+        (lambda frame: None, DeviceTimeout, r"no answer from unit 1 on 127.0.0.1:\d+ within 0.5 s"),
         (lambda frame: frame[:12], DeviceTimeout, "no answer"),
         (lambda frame: b"HTTP/1.1 400 Bad Request\r\n\r\n", DeviceGarbled, "no Modbus TCP header"),
         (lambda frame: frame[:6] + b"\x02" + frame[7:], DeviceGarbled, "unit 2 answers"),
