@@ -104,6 +104,14 @@ class JumpWatch:
         self._state = JumpState()
         self._engines: JumpEngines | None = None
 
+    def describe(self) -> str:
+        """Describe whether jumps are watched for."""
+        if not self.is_on:
+            return "jumps of T_Q and AT off (no guards.suspect_jumps)"
+        if self._least_k is None:
+            return "jumps of T_Q and AT beyond rate_max_per_min (no guards.jump_min_k)"
+        return f"jumps of T_Q and AT beyond rate_max_per_min, and from {self._least_k:g} K on"
+
     # ------------------------------------------------------------------ state
 
     @property
