@@ -17,6 +17,7 @@ from typing import NamedTuple, NoReturn
 from compensator import __version__
 from compensator.blas import one_thread_from_start
 from compensator.commands import Answer, arguments
+from compensator.commands.stopping import stoppable
 from compensator.errors import CompensatorError
 from drivers.errors import DriverError
 
@@ -124,6 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments without the program's name; by default those of `sys.argv`.
     """
+    stoppable()
     one_thread_from_start()
     given, unknown = _parser().parse_known_args(argv)
     if unknown:

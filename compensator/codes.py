@@ -600,6 +600,11 @@ class ServiceWarning(Code):
         "Probes that show the largest permitted correction are refused: probe.measured_max_um is below it.",
         "Set probe.measured_max_um to about three times probe.largest_um.",
     )
+    HEAD_NOT_WRITABLE = (
+        "head_not_writable",
+        "The head of the chain cannot be written by this user: after a kill, the end of a recording stays unsigned.",
+        "Give the service's user a folder of its own for [recording] head, or run check as that user.",
+    )
     SERVICE_RUNS = (
         "service_runs",
         "The service is running and uses the devices; a second program may be refused or disturb its readings.",

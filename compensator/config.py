@@ -229,7 +229,7 @@ class Zenoh(_Table, frozen=True, kw_only=True):
     by default only on loopback without TLS.
     """
 
-    prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$")]
+    prefix: Annotated[str, Meta(pattern=r"^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$", max_length=200)]
     mode: Literal["peer", "client", "router"] = "peer"
     listen: Annotated[list[Text], Meta(max_length=50)] = []
     connect: Annotated[list[Text], Meta(max_length=50)] = []

@@ -27,6 +27,8 @@ import importlib.util
 import json
 import os
 import shutil
+import signal
+import stat
 import subprocess
 import sys
 import tomllib
@@ -47,6 +49,8 @@ SYSTEM_FILES = {
 }
 JOURNAL_LIMITS = {"systemd/journald.conf": "/etc/systemd/journald.conf.d/compensator.conf"}
 COMMAND = "/usr/local/bin/compensator"
+#: Largest file that is read, bytes: a wheel, and anything else.
+WHEEL_BYTES, FILE_BYTES = 100_000_000, 1_000_000
 UNITS = ("compensator-router.service", "compensator@*.service")
 
 
@@ -95,11 +99,11 @@ class Installation:
     def extras(self) -> list[str]:
         """Return the extras of the version in use: an upgrade keeps them."""
         current = self.link("current")
-        return (current / ".complete").read_text(encoding="utf-8").split() if current else []
+        return read(current / ".complete").decode().split() if current else []
 
     def build(self, wheel: Path, wheels: Path | None, extras: Sequence[str], *, dependencies: bool) -> Path:
         """Make the virtual environment of a wheel; a complete one stays, an incomplete one is made again."""
-        digest = hashlib.sha256(wheel.read_bytes() + " ".join(extras).encode()).hexdigest()
+        digest = hashlib.sha256(read(wheel, WHEEL_BYTES) + " ".join(extras).encode()).hexdigest()
         version = self.root / "versions" / f"{wheel.name.split('-')[1]}-{digest[:8]}"
         if (version / ".complete").exists():
             report(f"{version.name}: installed already")
@@ -143,7 +147,7 @@ class Installation:
         here = any(self.path(place).exists() for place in JOURNAL_LIMITS.values())
         files = SYSTEM_FILES | (JOURNAL_LIMITS if journal_limits or here else {})
         for name, place in files.items():
-            data = (share / name).read_bytes().replace(PREFIX.encode(), self._prefix.encode())
+            data = read(share / name).replace(PREFIX.encode(), self._prefix.encode())
             self._write(self.path(place), place, data, known)
         command = self.path(COMMAND)
         if not command.exists() or command.is_symlink():
@@ -153,7 +157,7 @@ class Installation:
 
     def _write(self, path: Path, place: str, data: bytes, known: dict[str, list[str]]) -> None:
         digest, newer = hashlib.sha256(data).hexdigest(), path.with_name(path.name + ".new")
-        found = hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else None
+        found = hashlib.sha256(read(path)).hexdigest() if path.exists() else None
         if found == digest:
             return
         if found is not None and found not in known.get(place, []):
@@ -171,7 +175,10 @@ class Installation:
         report(f"{path}: written")
 
     def _known(self) -> dict[str, list[str]]:
-        return json.loads(self._manifest.read_text(encoding="utf-8")) if self._manifest.exists() else {}
+        try:
+            return json.loads(read(self._manifest)) if self._manifest.exists() else {}
+        except ValueError as error:
+            raise InstallError(f"{self._manifest}: {error}, expected what this program wrote; remove it") from error
 
     def remove_system_files(self) -> None:
         """Remove the files written; those that were changed here stay."""
@@ -181,7 +188,7 @@ class Installation:
             path.with_name(path.name + ".new").unlink(missing_ok=True)
             if not path.exists():
                 continue
-            if hashlib.sha256(path.read_bytes()).hexdigest() in known.get(place, []):
+            if hashlib.sha256(read(path)).hexdigest() in known.get(place, []):
                 path.unlink()
                 report(f"{path}: removed")
             else:
@@ -208,7 +215,7 @@ class Installation:
             lines = done.stderr.strip().splitlines() or ["no answer"]
             raise InstallError(f"{version.name} cannot use {config}: {lines[-1]}")
         name = config.parent.name
-        table = tomllib.loads(config.read_text(encoding="utf-8"))
+        table = tomllib.loads(read(config).decode())
         folder = (Path(CONFIGURATIONS) / name / table["recording"]["folder"]).as_posix()
         if not os.path.normpath(folder).startswith(f"{RECORDINGS}/{name}/"):
             raise InstallError(
@@ -379,8 +386,8 @@ def machine(given: argparse.Namespace, installation: Installation, system: Syste
 
 
 def _copy(source: Path, target: Path, system: System) -> None:
-    data = source.read_bytes()
-    if target.exists() and target.read_bytes() != data:
+    data = read(source)
+    if target.exists() and read(target) != data:
         newer = target.with_name(target.name + ".new")
         newer.write_bytes(data)
         system.own(newer, 0o640)
@@ -419,6 +426,24 @@ def uninstall(given: argparse.Namespace, installation: Installation, system: Sys
         system.remove_user()
         report("configuration, recordings, logs and user: removed")
     system.forget()
+
+
+def read(path: Path, most: int = FILE_BYTES) -> bytes:
+    """Return the bytes of a regular file; a device or a pipe may have no end.
+
+    Raises
+    ------
+    InstallError
+        If it is no regular file, or larger.
+    """
+    # A pipe would wait for its writer.
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise InstallError(f"{path}: not a regular file")
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise InstallError(f"{path}: larger than {most} bytes")
+    return data
 
 
 def report(text: str) -> None:
@@ -472,6 +497,8 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 1 failed."""
     given = _parser().parse_args(argv)
+    # A script starts its background jobs with SIGINT ignored, and so would pip be started.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     os.umask(0o022)  # root's own may be narrower, and then the service could not read its program
     installation, system = Installation(given.prefix, given.destdir), System(touch=not given.destdir)
     try:
@@ -482,6 +509,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (InstallError, OSError) as error:
         print(f"install.py: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("install.py: interrupted; the same command completes it", file=sys.stderr)
+        return 130
     return 0
 
 

@@ -64,6 +64,8 @@ class ChainCheck:
         self._heads = frozenset(map(bytes.fromhex, heads))
         #: Time of the last valid signature or of the start of the file, and whether the next record must be a seal.
         self._signed_ns, self._due, self._due_ns = 0, False, 0
+        #: Times of the last record that a signature or the head covers, and of the last record.
+        self._covered_ns = self._last_ns = 0
         #: Value at the last record, and before a seal of a torn end that was finished afterwards.
         self.head = b""
         self._before_last = b""
@@ -87,7 +89,7 @@ class ChainCheck:
         """
         _, sequence, time_ns, body = message
         if not self.head:
-            self._signed_ns = time_ns
+            self._signed_ns = self._covered_ns = self._last_ns = time_ns
             self._open(message)
             self._compare_head(self.head)
             if not records:
@@ -338,8 +340,8 @@ class ChainCheck:
         result = self._result
         result.unsigned_behind += 1
         result.unsigned_samples += topic == "sample"
-        age_ns = abs(time_ns - self._signed_ns)
-        result.unsigned_min = age_ns / 60e9
+        age_ns, self._last_ns = abs(time_ns - self._signed_ns), time_ns
+        result.unsigned_min = abs(time_ns - self._covered_ns) / 60e9
         # The recorder writes a seal in the same group of bytes as the first records for which one is due.
         result.overdue = result.overdue or (self._due and time_ns != self._due_ns)
         if age_ns >= chain.SEAL_EVERY_NS and not self._due:
@@ -350,13 +352,16 @@ class ChainCheck:
         result = self._result
         result.unsigned_behind = result.unsigned_samples = 0
         result.unsigned_min, result.overdue = 0.0, False
-        self._signed_ns, self._due = time_ns, False
+        self._signed_ns = self._covered_ns = time_ns
+        self._due = False
 
     def _compare_head(self, value: bytes) -> None:
         """Note whether the machine's head states this value: then it covers everything up to here."""
         if value in self._heads:
             self._result.at_head = True
+            covered_ns = self._last_ns
             self._covered(self._signed_ns)
+            self._covered_ns = covered_ns
 
 
 def _numbers(first: int, last: int) -> str:

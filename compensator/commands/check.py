@@ -13,7 +13,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     setup = load(arguments.config)
     config, model = setup.config, setup.model
-    checks = Compensation(config, model).plausibility.describe()
+    checks = Compensation(config, model).describe_checks()
     warnings = setup.warnings()
     log_warnings(arguments.config, warnings)
     machine, devices = config.machine.name, setup.fleet.devices

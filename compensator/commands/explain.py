@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> Answer:
     if words is None:
         near = difflib.get_close_matches(code, known, n=3)
         meant = f"did you mean {', '.join(near)}?" if near else "no similar code;"
-        raise UsageError(f"{arguments.code}: unknown code, {meant} `compensator explain` lists all codes")
+        raise UsageError(f"{arguments.code[:60]!r}: unknown code, {meant} `compensator explain` lists all codes")
     suffixes = SUFFIXES.get(name)
     if colon and (suffixes is None or not suffix or (suffixes and suffix not in suffixes)):
         known_suffixes = () if suffixes is None else suffixes or ("CHANNEL",)

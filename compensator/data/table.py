@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from compensator.arrays import Vector
+from compensator.arrays import LARGEST, Vector
 from compensator.codes import DataRemark, Remark
 from compensator.config import ROLES
 from compensator.errors import DataError, UsageError
@@ -154,6 +154,9 @@ def table_of(
     assert time is not None
     if np.isnan(time).any():
         raise DataError(f"{name}: row {rows[int(np.argmax(np.isnan(time)))]}: time is missing")
+    if (far := np.abs(time) > LARGEST).any():
+        i = int(np.argmax(far))
+        raise DataError(f"{name}: row {rows[i]}: {time_column} = {time[i]:g} s, expected at most {LARGEST:g}")
     start = float(time[0]) if time_column == "time_utc" else None
     return Table(name=name, t_s=time - time[0], columns=numbers, rows=rows, start_utc_s=start)
 

@@ -22,7 +22,9 @@ def main() -> int:
     parser.add_argument("--config", required=True, metavar="FILE", help="TOML with a table [receiver]")
     arguments = parser.parse_args()
     ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    signals = (signal.SIGINT, signal.SIGTERM)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # who starts a program may have blocked them
+    for number in signals:
         signal.signal(number, lambda *_: ended.set())
     try:
         settings, _ = load_settings(arguments.config)

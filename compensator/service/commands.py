@@ -19,12 +19,10 @@ from compensator.service.event_log import EventLog
 from compensator.service.loop.live import LiveLoop
 from compensator.service.probing import ReceivedProbe, read_probe
 from compensator.service.probing.received import ProbeRefused, unused_probe
-from compensator.service.publisher import COMMANDS, Reply, Sender, refusal
+from compensator.service.publisher import COMMANDS, Reply, Sender, longest, refusal
 from compensator.service.replay import execute
-from compensator.service.transfer.adoption import LONGEST_MODEL, Adoption, ModelRequest
+from compensator.service.transfer.adoption import Adoption, ModelRequest
 
-#: Longest payload of a command without a model, bytes.
-LONGEST_COMMAND = 10_000
 #: Largest number of commands that wait for the next sample.
 WAITING_COMMANDS = 100
 #: Largest number of probes that wait for the next sample to be compared with the prediction.
@@ -215,8 +213,8 @@ class Commands:
 
     def _check_sender(self, name: str, payload: bytes, sender: Sender) -> None:
         """Refuse a command that is too long, or whose sender may be anyone."""
-        if len(payload) > (LONGEST_MODEL if name in (CommandName.ADOPT, CommandName.BACK) else LONGEST_COMMAND):
-            raise ServiceError(f"{name}: the payload of {len(payload)} bytes is longer than permitted")
+        if len(payload) > longest(name):
+            raise ServiceError(f"{name}: the payload is longer than {longest(name)} bytes")
         if sender.proof == "none" and not self._unproven:
             raise ServiceError(
                 f"{name}: the sender {sender.name} is not authenticated; expected a router with TLS and the key "

@@ -166,6 +166,10 @@ class Compensation:
         wanted = self._config.restart.bridge_max_min
         return min(self._slowest_min if wanted is None else wanted, MOST_BRIDGED * self._period_min)
 
+    def describe_checks(self) -> str:
+        """Describe which checks of the sensors are on and off."""
+        return f"{self.plausibility.describe()}; {self._jumps.describe()}"
+
     def state(self) -> bytes:
         """Return everything that determines the next outcome, as JSON without loss of precision."""
         return encode_state(

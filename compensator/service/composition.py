@@ -121,7 +121,11 @@ async def run_service(
         resumed = resume(loaded, setup.model, checkpointed)
         loop = loop_parts(setup, resumed, diagnose)
         first = first_sequence(folder, machine, clock.utc_ns(), setup.model.period_s)
-        checks = Note(EventKind.PLAUSIBILITY, resumed.compensation.plausibility.describe(), {})
+        compensation = resumed.compensation
+        # As before on a machine that does not watch for jumps: its recordings stay the same.
+        watches = config.guards.suspect_jumps
+        described = compensation.describe_checks() if watches else compensation.plausibility.describe()
+        checks = Note(EventKind.PLAUSIBILITY, described, {})
         daemon = Daemon(
             config=config,
             compensation=resumed.compensation,

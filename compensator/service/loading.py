@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import logging
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -102,6 +103,7 @@ class Setup:
                 "a probe that shows such an error is refused."
             )
             found.append(Remark(ServiceWarning.PROBE_BOUNDS, figures))
+        found += _unwritable_head(self.head, self.recordings)
         if zenoh.secured():
             now = now or datetime.datetime.now(datetime.UTC)
             wrong = self.certificate.wrong_at(now) if self.certificate is not None else None
@@ -229,6 +231,18 @@ def head_file(loaded: LoadedConfig) -> Path | None:
 
 
 # ---------------------------------------------------------------------- warnings
+
+
+def _unwritable_head(head: Path | None, recordings: Path) -> list[Remark]:
+    """Warn where the head of the chain cannot be replaced."""
+    if head is None:
+        return []
+    folder = head.parent
+    while not folder.exists() and folder in recordings.parents:  # it is made with that of the recordings
+        folder = folder.parent
+    if folder.is_dir() and os.access(folder, os.W_OK | os.X_OK) and not head.is_dir():
+        return []
+    return [Remark(ServiceWarning.HEAD_NOT_WRITABLE, f"The head of the chain {head} cannot be written by this user.")]
 
 
 def _numbered_port(line: Mapping[str, Any]) -> Remark | None:

@@ -30,6 +30,8 @@ log = logging.getLogger("compensator")
 COMMANDS = tuple(CommandName)
 #: Characters of a sender's name, which is a chunk of a key.
 SENDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
+#: Longest payload of a command that contains a model, and of any other, bytes.
+_LONGEST_MODEL, _LONGEST = 1_000_000, 10_000
 
 _KEYS = {
     "offset": "thermal/y/offset",
@@ -41,6 +43,11 @@ _KEYS = {
 
 #: Answer to a command, or a future of it if it takes longer than Zenoh's thread may wait.
 Reply = dict[str, Any] | Future[dict[str, Any]]
+
+
+def longest(command: str) -> int:
+    """Return the longest payload of a command, bytes."""
+    return _LONGEST_MODEL if command in (CommandName.ADOPT, CommandName.BACK) else _LONGEST
 
 
 def refusal(text: str) -> dict[str, Any]:
@@ -220,8 +227,7 @@ class Publisher:
             if sender is None:
                 query.drop()  # type: ignore[no-untyped-call]
                 return
-            payload = query.payload.to_bytes() if query.payload is not None else b""
-            reply = self._on_command(name, payload, sender)
+            reply = self._on_command(name, _payload(query, longest(name)), sender)
             if isinstance(reply, Future):
                 reply.add_done_callback(lambda done: send(query, key, done.result()))
             else:
@@ -240,3 +246,10 @@ class Publisher:
         if not SENDER.fullmatch(sender):
             return None
         return Sender(sender, "certificate" if self._settings.secured() else "none")
+
+
+def _payload(query: zenoh.Query, most: int) -> bytes:
+    """Return the payload; of one that is longer only as much as shows that it is: it is not copied."""
+    if query.payload is None:
+        return b""
+    return query.payload.to_bytes() if len(query.payload) <= most else bytes(most + 1)

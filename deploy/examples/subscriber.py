@@ -1,10 +1,12 @@
 """Follow the Y offset, a line each minute: python subscriber.py [tcp/127.0.0.1:7447 [shop/vmc-07 [COUNT]]]."""
 
 import json
+import signal
 import sys
 
 import zenoh
 
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, also in the background of a script
 given = dict(enumerate(sys.argv))
 endpoint, prefix = given.get(1, "tcp/127.0.0.1:7447"), given.get(2, "shop/vmc-07")
 config = zenoh.Config()

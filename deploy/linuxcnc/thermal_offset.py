@@ -49,7 +49,9 @@ def main() -> int:
     parser.add_argument("--name", default="thermal-offset", help="name of the component")
     arguments = parser.parse_args()
     ended: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
+    signals = (signal.SIGTERM, signal.SIGINT)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)  # whoever starts it may have blocked them
+    for number in signals:
         signal.signal(number, lambda *_: ended.append(1))
     try:
         settings, tables = load_settings(arguments.config)

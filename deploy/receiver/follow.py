@@ -1,5 +1,6 @@
 """The smallest program that brings the offset to a control: `follow.py receiver.toml`."""
 
+import signal
 import sys
 import time
 
@@ -11,6 +12,10 @@ def apply(offset_um: float, why: str) -> None:
     print(f"{offset_um:+.2f} µm  {why}", flush=True)
 
 
+ending = (signal.SIGINT, signal.SIGTERM)
+signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)  # whoever starts it may have blocked or ignored them
+for number in ending:
+    signal.signal(number, signal.default_int_handler)
 try:
     settings, _ = load_settings(sys.argv[1] if len(sys.argv) > 1 else "receiver.toml")
     with Receiver(settings, applied_um=0.0) as receiver:  # applied_um: the offset at your control now

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
+import stat
 import sys
 import tomllib
 from pathlib import Path
@@ -28,6 +30,13 @@ KEYS = {
 }
 #: What a receiver may query; anything else below a prefix is published or is a command.
 ANSWERED = ("thermal/y/offset", "thermal/status", "thermal/sample", "thermal/estimate")
+
+#: Largest list, bytes.
+LONGEST = 1_000_000
+#: Most points in a line of it.
+MOST_POINTS = 300
+#: Keys whose value is a list of texts; the others are a text.
+LISTS = {"listen", "machines"}
 
 HEADER = """\
 // Configuration of the Zenoh router: compensator router --config router.json5, or zenohd --config router.json5.
@@ -148,7 +157,14 @@ def checked(shop: dict[str, Any], source: Path) -> dict[str, Any]:
         refuse("expected a table [router] and at least one [[machine]]")
     names: list[str] = []
     for kind, keys in KEYS.items():
-        for table in [shop["router"]] if kind == "router" else shop.get(kind, []):
+        tables = [shop["router"]] if kind == "router" else shop.get(kind, [])
+        if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+            refuse(f"{kind}: expected tables [[{kind}]]")
+        for table in tables:
+            for key, value in table.items():
+                texts = value if key in LISTS else [value]
+                if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+                    refuse(f"{kind}: {key} = {value!r:.60}, expected {'texts' if key in LISTS else 'a text'}")
             for key in {*table} ^ keys:
                 if key in table or key != "machines":
                     refuse(f"{kind}: {key}: {'unknown' if key in table else 'missing'}, keys are {', '.join(keys)}")
@@ -174,6 +190,20 @@ def checked(shop: dict[str, Any], source: Path) -> dict[str, Any]:
     return shop
 
 
+def read(path: Path) -> bytes:
+    """Return the bytes of a regular file; a device or a pipe may have no end."""
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise ValueError("not a regular file")
+        data = file.read(LONGEST + 1)
+    if len(data) > LONGEST:
+        raise ValueError(f"larger than {LONGEST} bytes")
+    # The time to read a key grows with the square of its parts.
+    if any(line.count(b".") > MOST_POINTS for line in data.splitlines()):
+        raise ValueError(f"a line with more than {MOST_POINTS} points")
+    return data
+
+
 def main() -> int:
     """Write the configuration to stdout."""
     text, _, example = (__doc__ or "").rpartition("\n\n")
@@ -181,9 +211,9 @@ def main() -> int:
     parser.add_argument("shop", type=Path, metavar="FILE", help="the participants, TOML")
     path = parser.parse_args().shop
     try:
-        shop = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        sys.exit(f"{path}: {error}")
+        shop = tomllib.loads(read(path).decode())
+    except (OSError, ValueError, RecursionError) as error:
+        sys.exit(f"{path}: {getattr(error, 'strerror', None) or error}")
     sys.stdout.write(HEADER + json.dumps(router(checked(shop, path)), indent=2) + "\n")
     return 0
 

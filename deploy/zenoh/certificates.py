@@ -15,12 +15,13 @@ import datetime
 import ipaddress
 import os
 import re
+import stat
 import sys
 from pathlib import Path
 
 try:
     from cryptography import x509
-    from cryptography.exceptions import InvalidSignature
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -28,12 +29,38 @@ except ImportError:
     sys.exit("certificates.py: needs the package cryptography: pip install quill-compensator[tls]")
 
 ROLES = ("machine", "receiver", "operator", "probe")
+#: Largest file of a key or certificate, bytes.
+LONGEST = 100_000
 CLOCK_SKEW = datetime.timedelta(hours=1)
 
 
 def now() -> datetime.datetime:
     """Return the time, UTC, in whole seconds as certificates have it."""
     return datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+
+
+def read(path: Path) -> bytes:
+    """Return the bytes of a regular file of at most 100,000; a device or a pipe may have no end."""
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                sys.exit(f"{path}: not a regular file")
+            data = file.read(LONGEST + 1)
+    except OSError as error:
+        sys.exit(f"{path}: {error.strerror}")
+    if len(data) > LONGEST:
+        sys.exit(f"{path}: larger than {LONGEST} bytes, expected a key or a certificate")
+    return data
+
+
+def read_certificate(path: Path) -> x509.Certificate:
+    """Read a certificate with a common name."""
+    try:
+        certificate = x509.load_pem_x509_certificate(read(path))
+        common_name(certificate)
+    except (ValueError, IndexError):
+        sys.exit(f"{path}: expected a certificate in PEM with a common name")
+    return certificate
 
 
 def write(path: Path, data: bytes, mode: int) -> None:
@@ -59,7 +86,10 @@ def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
     """Read a key; refuse one that others can read."""
     if path.stat().st_mode & 0o077:
         sys.exit(f"{path}: mode {path.stat().st_mode & 0o777:04o}, expected 0600: chmod 600 {path}")
-    key = serialization.load_pem_private_key(path.read_bytes(), None)
+    try:
+        key = serialization.load_pem_private_key(read(path), None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        sys.exit(f"{path}: expected a key in PEM without a password")
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         sys.exit(f"{path}: expected an elliptic-curve key")
     return key
@@ -82,7 +112,7 @@ def authority(folder: Path, days: int) -> tuple[x509.Certificate, ec.EllipticCur
         missing = key_path if path.exists() else path
         sys.exit(f"{missing}: missing, but the other half of the authority exists; nothing is overwritten")
     if path.exists():
-        return x509.load_pem_x509_certificate(path.read_bytes()), read_key(key_path)
+        return read_certificate(path), read_key(key_path)
     key = new_key(key_path)
     # A log could not tell two authorities of one name apart.
     name = name_of(f"compensator CA {os.urandom(4).hex()}")
@@ -163,7 +193,7 @@ def is_valid(folder: Path, stem: str, name: str, ca: x509.Certificate, renew_bel
     path, key_path = folder / f"{stem}.pem", folder / f"{stem}.key"
     if not path.exists() or not key_path.exists():
         return False
-    certificate = x509.load_pem_x509_certificate(path.read_bytes())
+    certificate = read_certificate(path)
     try:
         certificate.verify_directly_issued_by(ca)
     except (ValueError, TypeError, InvalidSignature):
@@ -196,7 +226,7 @@ def main() -> int:
             issue(folder, stem, name, hosts, ca, begins=begins, ends=ends)
             made.append(stem)
     for path in sorted(folder.glob("*.pem")):
-        certificate = x509.load_pem_x509_certificate(path.read_bytes())
+        certificate = read_certificate(path)
         until = f"{certificate.not_valid_after_utc:%Y-%m-%d}"
         print(f"{path.name:<28} {common_name(certificate):<28} until {until}{'  new' if path.stem in made else ''}")
     return 0

@@ -313,3 +313,11 @@ def test_where_the_head_is_kept(tmp_path: Path) -> None:
     config('recording.head = "head.json"')
     with pytest.raises(ConfigError, match="needs recording"):
         head_file(load_config(path))
+
+
+def test_what_lies_behind_the_head_is_counted_from_it(shop: Shop) -> None:
+    """Nineteen samples lie behind the last seal; the head covers all but the last sync."""
+    shop.start().run(80).kill()
+    without, (behind,) = shop.audit().files[0], shop.audit(head=True).files
+    assert (without.unsigned_samples, without.unsigned_min) == (19, 19.0)
+    assert (behind.unsigned_samples, behind.unsigned_min) == (1, 1.0)

@@ -9,6 +9,7 @@ python -m tests.bench loop --help        the loop over machine-weeks, too
 import sys
 
 from compensator.blas import in_one_thread
+from compensator.commands.stopping import stoppable
 from tests.bench import (
     audit,
     diagnosis,
@@ -65,4 +66,5 @@ def main(chosen):
 
 
 if __name__ == "__main__":
+    stoppable()
     in_one_thread(main, sys.argv[1:])

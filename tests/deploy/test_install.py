@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import os
 import zipfile
 from pathlib import Path
 from types import ModuleType
@@ -290,6 +291,21 @@ def test_the_newest_wheel_of_a_folder_is_taken_and_none_is_said(
     assert install.main(arguments) == 1
     error = capsys.readouterr().err
     assert "no quill_compensator-*.whl" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("wrong", ["device", "pipe", "large"])
+def test_a_configuration_that_has_no_end_is_refused(pc: Pc, wrong: str, tmp_path: Path) -> None:
+    pc.activate(pc.version("1.0-aaaa"))
+    given = tmp_path / "given"
+    if wrong == "device":
+        given.symlink_to("/dev/zero")
+    elif wrong == "pipe":
+        os.mkfifo(given)
+    else:
+        given.write_bytes(bytes(1_000_001))
+    with pytest.raises(install.InstallError, match=r"not a regular file|larger than 1000000 bytes"):
+        install.machine(argparse.Namespace(name="vmc-07", config=given, model=[]), pc.installation, pc.system)
+    assert pc.system.units == []
 
 
 def test_a_second_installer_is_kept_out(pc: Pc) -> None:

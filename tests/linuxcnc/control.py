@@ -32,6 +32,12 @@ net y-clear axis.y.eoffset-clear
 """
 
 
+#: What is waited for first; on a busy computer LinuxCNC itself hangs now and then while it starts.
+STARTS = "LinuxCNC is up"
+#: Longest time that the panel takes for an answer, s; a block of a program may take a minute.
+ANSWER_S = 120.0
+
+
 class Period(NamedTuple):
     """One servo period, µm."""
 
@@ -58,8 +64,9 @@ class Control:
             assert alive(), "LinuxCNC ended while starting"
             return Path(self._path).exists()
 
-        until(there, "LinuxCNC is up", 60.0)
+        until(there, STARTS, 60.0)
         until(self._try, "the panel answers")
+        self._socket.settimeout(ANSWER_S)
         self._lines = self._socket.makefile("rw")
 
     def _try(self) -> bool:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.linuxcnc.control import NAMESPACES, ROOT, why_not
+from tests.linuxcnc.control import NAMESPACES, ROOT, STARTS, why_not
 
 REASON = why_not()
-pytestmark = [pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(580)]
 
 
 @pytest.fixture
@@ -28,12 +28,18 @@ def place() -> Iterator[Path]:
 
 @pytest.mark.parametrize("name", ["scripted", "service", "probing", "refused"])
 def test_at_the_control(name: str, place: Path) -> None:
-    done = subprocess.run(
-        [*NAMESPACES, sys.executable, "-m", "tests.linuxcnc.scenario", name, str(place)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
+    for attempt in ("first", "second"):
+        folder = place / attempt
+        folder.mkdir()
+        folder.chmod(0o755)
+        done = subprocess.run(
+            [*NAMESPACES, sys.executable, "-m", "tests.linuxcnc.scenario", name, str(folder)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=280,
+            check=False,
+        )
+        if f": {STARTS}" not in done.stderr:
+            break
     assert done.returncode == 0 and done.stdout.endswith("done\n"), done.stdout + done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -119,6 +120,10 @@ def test_the_shipped_router_is_made_of_the_shipped_list() -> None:
         ('machines = ["vmc-07"]', 'machines = ["vmc-70"]', "vmc-70"),
         ('listen = ["tls/', 'listen = ["tcp/', "tls/HOST:PORT"),
         ("[[operator]]", "[[operater]]", "operater"),
+        ('name = "anna"', "name = 5", "name = 5, expected a text"),
+        ('machines = ["vmc-07"]', "machines = [7]", "expected texts"),
+        ("[[operator]]", "[operator]", "expected tables [[operator]]"),
+        ("[[operator]]", ".".join("a" * 400) + " = 1\n[[operator]]", "more than 300 points"),
     ],
 )
 def test_a_list_that_gives_other_rights_than_meant_is_refused(
@@ -129,6 +134,21 @@ def test_a_list_that_gives_other_rights_than_meant_is_refused(
     path = tmp_path / "shop.toml"
     path.write_text(text.replace(old, new), encoding="utf-8")
     assert expected in script("access_list.py", str(path), code=1)
+
+
+def test_what_has_no_end_is_neither_a_list_nor_a_certificate(tmp_path: Path, shop: Shop) -> None:
+    assert script("access_list.py", "/dev/zero", code=1) == "/dev/zero: not a regular file\n"
+    own = Shop(tmp_path, shop.keys)
+    keys = shutil.copytree(own.keys, tmp_path / "copied")
+    certificate = keys / "machine-vmc-07.pem"
+    for make, expected in (
+        (lambda: os.mkfifo(certificate), "not a regular file"),
+        (lambda: certificate.write_bytes(bytes(200_000)), "larger than 100000 bytes"),
+        (lambda: certificate.write_text("no certificate"), "expected a certificate in PEM"),
+    ):
+        certificate.unlink()
+        make()
+        assert expected in script("certificates.py", str(keys), "--machine", "vmc-07", code=1)
 
 
 def test_the_trial_on_one_computer_works_as_written(tmp_path: Path) -> None:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from compensator.cli import main
 from compensator.config import parse_config
 from compensator.errors import ConfigError
 from compensator.messages import encode, number
 from compensator.service.compensation import Compensation, Outcome
 from compensator.service.state import decode_state
 from sim_hardware.physics import Duty, PublishedQuill, World, usual_sensors
+from tests.audit.test_signatures import write_key
 from tests.service.records import QUILL, direct, sample
 from tests.service.simulated import TABLE, config
 
@@ -178,6 +181,32 @@ def test_an_operator_decides(day: dict[str, np.ndarray], how: str) -> None:
         assert abs(offsets(outcomes)[-1] - offsets(healthy)[-1]) > 10.0  # 6 K too warm, as the operator said
 
 
+def test_check_names_the_guards_and_a_head_that_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    private, _ = write_key(tmp_path, "machine", 7)
+    private.chmod(0o600)
+    text = (
+        (Path(__file__).parents[2] / "deploy/machine.example.toml")
+        .read_text(encoding="utf-8")
+        .replace("/var/lib/compensator/", "")
+    )
+    path = tmp_path / "machine.toml"
+    signed = f'keep_days = 730\nsigning_key = "{private.name}"\nhead = "{tmp_path}/none/head.json"'
+    path.write_text(text.replace("keep_days = 730", signed), encoding="utf-8")
+    assert main(["check", "--config", str(path)]) == 0
+    shown = capsys.readouterr()
+    assert "beyond rate_max_per_min, and from 1 K on" in shown.out and "[head_not_writable]" in shown.err
+    (tmp_path / "none").mkdir()
+    path.write_text(path.read_text().replace("jump_min_k = 1.0", ""), encoding="utf-8")
+    assert main(["check", "--config", str(path)]) == 0
+    shown = capsys.readouterr()
+    assert "(no guards.jump_min_k)" in shown.out and "head_not_writable" not in shown.err
+    path.write_text(path.read_text().replace("suspect_jumps = true", ""), encoding="utf-8")
+    assert main(["check", "--config", str(path)]) == 0
+    assert "jumps of T_Q and AT off (no guards.suspect_jumps)" in capsys.readouterr().out
+
+
 def test_two_probes_speak_for_it_and_one_does_not(day: dict[str, np.ndarray]) -> None:
     compensation = Compensation(settings(), QUILL)
     for i in range(BEGIN + 9):
@@ -185,8 +214,10 @@ def test_two_probes_speak_for_it_and_one_does_not(day: dict[str, np.ndarray]) ->
         values["t_q_degc"] += 8.0 if i >= BEGIN else 0.0
         compensation.process(sample(i, values))
     watch = compensation._jumps
-    assert watch.suspects == ("t_q_degc",) and watch._believing is not None and watch._believing.estimate is not None
-    believed = watch._believing.estimate.y_um
+    assert watch.suspects == ("t_q_degc",)
+    believing = watch.state.believing
+    assert believing is not None and believing.estimate is not None
+    believed = believing.estimate.y_um
     watch.receive_probe(0.0, 1.0, believed - 60.0)  # fits neither
     watch.receive_probe(believed, 1.0, 0.0)
     assert compensation.process(sample(i, values)).sample.channels["t_q_degc"].quality == "suspect"

@@ -62,9 +62,9 @@ class Wired:
         )
 
     def _tables(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        host = {"host": "127.0.0.1", "timeout_s": 0.15}
+        host = {"host": "127.0.0.1", "timeout_s": 0.3}
         lines = [
-            {"name": "a", "protocol": "modbus-rtu", "port": str(self.rtu.port), "timeout_s": 0.15},
+            {"name": "a", "protocol": "modbus-rtu", "port": str(self.rtu.port), "timeout_s": 0.3},
             {"name": "b", "protocol": "modbus-tcp", "tcp_port": self.tcp.port, **host},
             {
                 "name": "c",
@@ -115,7 +115,7 @@ FAULTS = [
     ("couples", "bad_crc", {}, "t_q_degc"),
     ("couples", "wrong_length", {}, "t_q_degc"),
     ("couples", "disconnect", {}, "t_q_degc"),
-    ("couples", "late", {"delay_s": 0.5}, "t_q_degc"),
+    ("couples", "late", {"delay_s": 0.8}, "t_q_degc"),
     ("couples", "open", {"input": 0}, "t_q_degc"),
     ("couples", "over", {"input": 0}, "t_q_degc"),
     ("couples", "under", {"input": 0}, "t_q_degc"),

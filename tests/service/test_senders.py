@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import pytest
 import zenoh
 
 from compensator.config import Zenoh
 from compensator.recording.reading import read_messages, recordings
-from compensator.service.publisher import Publisher, Sender
+from compensator.service.publisher import Publisher, Sender, _payload, longest
 from compensator.service.session import session_config
 from tests.audit.made import MACHINE
 from tests.audit.tampering import Line, rewrite
@@ -24,6 +27,34 @@ ANNA = Sender("anna", "certificate")
 def events(folder: Path, kind: str) -> list[dict[str, Any]]:
     found = [json.loads(r.data) for path in recordings(folder, MACHINE) for r in read_messages(path, ("event",))]
     return [event for event in found if event["kind"] == kind]
+
+
+class Long:
+    """A payload that must not be copied."""
+
+    def __init__(self, length: int) -> None:
+        self._length = length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def to_bytes(self) -> bytes:
+        raise MemoryError
+
+
+@pytest.mark.parametrize(("name", "length"), [("adopt", 1_000_001), ("hold", 10_001), ("probe", 10**12)])
+async def test_a_payload_that_is_too_long_is_refused_before_it_is_copied(
+    tmp_path: Path, name: str, length: int
+) -> None:
+    query = SimpleNamespace(payload=Long(length))
+    payload = _payload(cast("zenoh.Query", query), longest(name))
+    bench = replayable(tmp_path)
+    replies: list[Any] = []
+    bench.at_sample[2] = lambda: replies.append(bench.daemon.command(name, payload, ANNA))
+    await bench.run(4)
+    (reply,) = replies
+    text = reply.result(timeout=0)["text"] if isinstance(reply, Future) else reply["text"]
+    assert text == f"{name}: the payload is longer than {longest(name)} bytes"
 
 
 async def test_the_recording_says_who_commanded_whatever_the_payload_says(tmp_path: Path) -> None:

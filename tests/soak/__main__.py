@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 from compensator.audit.series import summary
+from compensator.commands.stopping import stoppable
 from tests.fuzz import test_sensor_faults as sensor_faults
 from tests.soak import forgeries, hostile, kills, month
 
@@ -110,4 +111,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    stoppable()
     raise SystemExit(main())

@@ -40,8 +40,6 @@ log = logging.getLogger("compensator")
 
 #: How long the end of the service waits for a model that is being prepared, and for its thread to notice the end, s.
 GRACE_S, NOTICE_S = 5.0, 5.0
-#: Longest payload of a command that contains a model, bytes.
-LONGEST_MODEL = 1_000_000
 T = TypeVar("T")
 _ENDING = "the service is ending"
 _ADVICE = "wait, zero the machine at rest, or use --force"

@@ -70,6 +70,11 @@ class Slave:
 
 Fault = Callable[[bytes], bytes | None]
 
+#: A device's time-out: long enough that one which answers is not late on a busy computer.
+TIMEOUT_S = 0.5
+#: Time within which a read ends that has lost a reply, also on a busy computer; below the longest time-out.
+BOUND_S = 1.5
+
 
 class ModbusBus:
     """Units behind one end. `faults` are used up one for each request; each turns the frame due into what
@@ -230,7 +235,7 @@ class Rig:
         units: Mapping[int, Slave],
         *devices: Mapping[str, Any],
         rtu: bool = False,
-        timeout_s: float = 0.1,
+        timeout_s: float = TIMEOUT_S,
     ) -> tuple[ModbusBus, TcpEnd, list[drivers.Device]]:
         """Serve units over TCP and make their devices."""
         bus = ModbusBus(units, rtu=rtu)

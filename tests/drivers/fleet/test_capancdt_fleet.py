@@ -12,6 +12,7 @@ import pytest
 
 from drivers import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, Quality
 from drivers.lines import capancdt_link
+from tests.drivers.fleet.conftest import BOUND_S, TIMEOUT_S
 
 
 def block(counter: int, *frames: tuple[int, int]) -> bytes:
@@ -89,7 +90,7 @@ async def controller() -> AsyncIterator[Controller]:
     await made.stop()
 
 
-def device(rig: Any, controller: Controller, timeout_s: float = 0.1, **keys: Any) -> Any:
+def device(rig: Any, controller: Controller, timeout_s: float = TIMEOUT_S, **keys: Any) -> Any:
     line = {"protocol": "capancdt", "host": "127.0.0.1", "timeout_s": timeout_s}
     line["data_port"], line["command_port"] = controller.ports
     table = {"model": "capancdt-6200", "inputs": [{"input": 0}, {"input": 1}], **keys}
@@ -188,7 +189,7 @@ async def test_no_new_frame_is_bounded_and_named(rig: Any, controller: Controlle
     began = time.monotonic()
     with pytest.raises(DeviceTimeout, match=r"d0: no new measurement from 127.0.0.1"):
         await made.read()
-    assert 0.09 < time.monotonic() - began < 0.2
+    assert TIMEOUT_S - 0.01 < time.monotonic() - began < BOUND_S
     controller.send(block(1, (10, 10)))
     assert (await made.read())[0].count == 1
 
@@ -219,9 +220,9 @@ async def test_command_port_that_gives_no_range(
     began = time.monotonic()
     with pytest.raises(error, match=text):
         await made.read()
-    assert time.monotonic() - began < 0.3
+    assert time.monotonic() - began < BOUND_S
     controller.reply = good
-    async with asyncio.timeout(2.0):
+    async with asyncio.timeout(30.0):
         await controller.connected.wait()
     controller.send(block(0, (10, 10)))
     while not isinstance((await asyncio.gather(made.read(), return_exceptions=True))[0], dict):
@@ -229,16 +230,16 @@ async def test_command_port_that_gives_no_range(
 
 
 async def test_lost_connection_heals(rig: Any, controller: Controller) -> None:
-    made = await started(rig, controller, timeout_s=0.5)
+    made = await started(rig, controller, timeout_s=2.0)
     waiting = asyncio.create_task(made.read())
     await asyncio.sleep(0)
     controller.drop()
     with pytest.raises(DeviceDisconnected, match="d0: "):
-        await asyncio.wait_for(waiting, 0.4)
-    async with asyncio.timeout(2.0):
+        await asyncio.wait_for(waiting, BOUND_S)
+    async with asyncio.timeout(30.0):
         await controller.connected.wait()
     controller.send(block(0, (10, 10)))
-    async with asyncio.timeout(2.0):
+    async with asyncio.timeout(30.0):
         while not isinstance((await asyncio.gather(made.read(), return_exceptions=True))[0], dict):
             await asyncio.sleep(0.01)
 
@@ -250,12 +251,12 @@ async def test_controller_gone_and_back(rig: Any, controller: Controller) -> Non
         began = time.monotonic()
         with pytest.raises((DeviceDisconnected, DeviceTimeout)):
             await made.read()
-        assert time.monotonic() - began < 0.2
+        assert time.monotonic() - began < BOUND_S
     await controller.start()
-    async with asyncio.timeout(4.0):
+    async with asyncio.timeout(30.0):
         await controller.connected.wait()
     controller.send(block(0, (10, 10)))
-    async with asyncio.timeout(1.0):
+    async with asyncio.timeout(30.0):
         while not isinstance((await asyncio.gather(made.read(), return_exceptions=True))[0], dict):
             await asyncio.sleep(0.01)
 
@@ -270,14 +271,14 @@ async def test_silent_stream_is_connected_anew(
     controller.connected.clear()
     with pytest.raises(DeviceTimeout):
         await made.read()
-    async with asyncio.timeout(1.0):
+    async with asyncio.timeout(30.0):
         await controller.connected.wait()
 
 
 async def test_old_measurements_are_left_out(rig: Any, controller: Controller) -> None:
-    made = await started(rig, controller, window_s=0.05)
+    made = await started(rig, controller, window_s=0.5)
     controller.send(block(1, (10, 10)))
-    await asyncio.sleep(0.08)
+    await asyncio.sleep(0.8)
     controller.send(block(2, (30, 30)))
     await asyncio.sleep(0.005)
     assert (await made.read())[0].count == 1
@@ -300,4 +301,4 @@ async def test_close_during_a_read(rig: Any, controller: Controller) -> None:
     await made.close()
     await made.close()
     with pytest.raises(DeviceDisconnected, match="closed"):
-        await asyncio.wait_for(task, 0.5)
+        await asyncio.wait_for(task, BOUND_S)

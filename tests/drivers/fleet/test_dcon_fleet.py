@@ -13,6 +13,8 @@ import pytest
 
 import drivers
 from drivers import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, Quality
+from drivers.lines import backoff
+from tests.drivers.fleet.conftest import BOUND_S, TIMEOUT_S
 
 NAMES = {"M": "7018R", "2": "0F0600"}
 
@@ -77,7 +79,7 @@ def table(address: int = 1, **keys: Any) -> dict[str, Any]:
 
 
 def made(
-    rig: Any, modules: dict[int, Module], *tables: dict[str, Any], timeout_s: float = 0.05
+    rig: Any, modules: dict[int, Module], *tables: dict[str, Any], timeout_s: float = TIMEOUT_S
 ) -> tuple[Bus, Any, list[drivers.Device]]:
     bus = Bus(modules)
     end = rig.pty(bus.feed)
@@ -148,7 +150,7 @@ async def test_verification_takes_what_there_is(rig: Any) -> None:
 @pytest.mark.parametrize(
     ("fault", "error", "text"),
     [
-        (lambda reply: None, DeviceTimeout, r"no reply to '#01' from address 01 on .* within 0.05 s"),
+        (lambda reply: None, DeviceTimeout, r"no reply to '#01' from address 01 on .* within 0.5 s"),
         (lambda reply: reply[:-1], DeviceGarbled, "no valid reply to '#01' in b'>"),
         (lambda reply: reply[:-3] + b"\r", DeviceGarbled, "5 characters|expected"),
         (lambda reply: reply[:-8] + b"\r", DeviceGarbled, "7 values in .* expected 8"),
@@ -165,7 +167,7 @@ async def test_faults_and_the_next_read(rig: Any, fault: Any, error: type[driver
     began = time.monotonic()
     with pytest.raises(error, match=text) as caught:
         await device.read()
-    assert time.monotonic() - began < 0.15
+    assert time.monotonic() - began < BOUND_S
     assert str(caught.value).startswith("d0: ")
     assert (await device.read())[0].value == 22.22
 
@@ -204,18 +206,16 @@ async def test_late_reply_on_a_quiet_line_is_dropped(rig: Any) -> None:
     assert (await device.read())[0].value == 22.22
 
 
-async def test_dead_module_does_not_starve_the_others(rig: Any) -> None:
+async def test_dead_module_does_not_starve_the_others(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backoff, "FIRST_WAIT_S", 2.0)
     bus, _, [alive, dead] = made(rig, {1: Module(NEW)}, table(1), table(9))
-    slow = 0
     for _ in range(8):
-        began = time.monotonic()
         result, reading = await asyncio.gather(dead.read(), alive.read(), return_exceptions=True)
         assert isinstance(result, DeviceTimeout)
         assert isinstance(reading, dict)
-        slow += time.monotonic() - began > 0.04
-    assert slow == 3
+    assert sum(command[1:3] == "09" for command in bus.commands) == 3
     bus.modules[9] = Module(NEW)
-    async with asyncio.timeout(1.0):
+    async with asyncio.timeout(30.0):
         while isinstance((await asyncio.gather(dead.read(), return_exceptions=True))[0], DeviceTimeout):
             await asyncio.sleep(0.01)
 
@@ -238,7 +238,7 @@ async def test_adapter_unplugged_during_a_command(rig: Any) -> None:
     began = time.monotonic()
     with pytest.raises(DeviceDisconnected):
         await device.read()
-    assert time.monotonic() - began < 1.0
+    assert time.monotonic() - began < BOUND_S
 
 
 async def test_close_during_a_read(rig: Any) -> None:
@@ -248,7 +248,7 @@ async def test_close_during_a_read(rig: Any) -> None:
         await asyncio.sleep(0)
     await device.close()
     with pytest.raises(DeviceDisconnected, match="closed"):
-        await asyncio.wait_for(task, 0.5)
+        await asyncio.wait_for(task, BOUND_S)
 
 
 async def test_cancelled_read_leaves_the_line_usable(rig: Any) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 import drivers
 from drivers import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, Quality
+from tests.drivers.fleet.conftest import BOUND_S, TIMEOUT_S
 
 OLD, NEW = 111, 222
 
@@ -83,14 +84,14 @@ async def test_adam_says_another_type(rig: Any, slave: Any, register: tuple[int,
 async def test_late_answer_is_not_taken_for_a_later_one(rig: Any, slave: Any, lost: int) -> None:
     """Every answer is late by up to three requests, and all of them come just before the next one is due."""
     unit = made(slave)
-    bus, _, [device] = await rig.modbus({1: unit}, adam(), rtu=True, timeout_s=0.05)
+    bus, _, [device] = await rig.modbus({1: unit}, adam(), rtu=True)
     bus.faults.extend([bus.hold] * lost)
     for _ in range(lost):
         with pytest.raises(DeviceTimeout):
             await device.read()
     words(unit, NEW)
     reading = None
-    async with asyncio.timeout(2.0):
+    async with asyncio.timeout(30.0):
         while reading is None:
             with contextlib.suppress(DeviceTimeout):  # spaced out after the third loss
                 reading = (await device.read())[0]
@@ -102,7 +103,7 @@ async def test_late_answer_is_not_taken_for_a_later_one(rig: Any, slave: Any, lo
 async def test_late_answer_between_the_fence_and_the_next_request(rig: Any, slave: Any) -> None:
     """The old answer comes alone while the fence waits, and the fence's own answer is late as well."""
     unit = made(slave)
-    bus, _, [device] = await rig.modbus({1: unit}, adam(), rtu=True, timeout_s=0.05)
+    bus, _, [device] = await rig.modbus({1: unit}, adam(), rtu=True)
     bus.faults.append(bus.hold)
     with pytest.raises(DeviceTimeout):
         await device.read()
@@ -122,7 +123,7 @@ async def test_late_answer_between_the_fence_and_the_next_request(rig: Any, slav
 
 async def test_late_refusal_is_not_taken_for_a_later_one(rig: Any, slave: Any) -> None:
     unit = made(slave)
-    bus, _, [device] = await rig.modbus({1: unit}, adam(), rtu=True, timeout_s=0.05)
+    bus, _, [device] = await rig.modbus({1: unit}, adam(), rtu=True)
     bus.faults.append(lambda frame: bus.hold(with_crc(bytes([1, 0x83, 6]))))
     with pytest.raises(DeviceTimeout):
         await device.read()
@@ -133,7 +134,7 @@ async def test_late_refusal_is_not_taken_for_a_later_one(rig: Any, slave: Any) -
 async def test_late_answer_of_another_unit_of_the_same_size(rig: Any, slave: Any) -> None:
     one, two = made(slave), made(slave)
     words(two, NEW)
-    bus, _, devices = await rig.modbus({1: one, 2: two}, adam(1), adam(2), rtu=True, timeout_s=0.05)
+    bus, _, devices = await rig.modbus({1: one, 2: two}, adam(1), adam(2), rtu=True)
     bus.faults.append(bus.hold)
     with pytest.raises(DeviceTimeout):
         await devices[0].read()
@@ -144,7 +145,7 @@ async def test_late_answer_of_another_unit_of_the_same_size(rig: Any, slave: Any
 async def test_late_answer_of_a_register_read_is_not_taken_for_a_verification(rig: Any, slave: Any) -> None:
     """Values and type codes are both eight registers; only their order tells them apart."""
     unit = made(slave)
-    bus, _, [device] = await rig.modbus({1: unit}, adam(verify=True), rtu=True, timeout_s=0.05)
+    bus, _, [device] = await rig.modbus({1: unit}, adam(verify=True), rtu=True)
     await device.read()
     bus.faults.append(bus.hold)
     with pytest.raises(DeviceTimeout):
@@ -177,12 +178,12 @@ async def test_faults_and_the_next_read(
     rig: Any, slave: Any, fault: Any, error: type[drivers.DriverError], text: str
 ) -> None:
     unit = made(slave)
-    bus, _, [device] = await rig.modbus({1: unit}, adam(), rtu=True, timeout_s=0.05)
+    bus, _, [device] = await rig.modbus({1: unit}, adam(), rtu=True)
     bus.faults.append(fault)
     began = time.monotonic()
     with pytest.raises(error, match=text):
         await device.read()
-    assert time.monotonic() - began < 0.15
+    assert time.monotonic() - began < BOUND_S
     words(unit, NEW)
     assert (await device.read())[0].value == pytest.approx(degc(NEW))
 
@@ -194,7 +195,7 @@ async def test_noise_before_an_answer_is_passed_over(rig: Any, slave: Any) -> No
 
 
 async def test_babble_is_bounded_in_time_and_memory(rig: Any, slave: Any) -> None:
-    bus, end, [device] = await rig.modbus({1: made(slave)}, adam(), rtu=True, timeout_s=0.05)
+    bus, end, [device] = await rig.modbus({1: made(slave)}, adam(), rtu=True)
     stop = asyncio.Event()
 
     async def babble() -> None:
@@ -209,7 +210,7 @@ async def test_babble_is_bounded_in_time_and_memory(rig: Any, slave: Any) -> Non
         began = time.monotonic()
         with pytest.raises((DeviceGarbled, DeviceTimeout)):
             await device.read()
-        assert time.monotonic() - began < 0.2
+        assert time.monotonic() - began < BOUND_S
     stop.set()
     await task
 
@@ -217,7 +218,7 @@ async def test_babble_is_bounded_in_time_and_memory(rig: Any, slave: Any) -> Non
 async def pty_device(rig: Any, unit: Any, make_bus: Callable[..., Any], **line: Any) -> tuple[Any, Any, Any]:
     bus = make_bus({1: unit}, rtu=True)
     end = rig.pty(bus.feed)
-    fleet = rig.fleet({"protocol": "modbus-rtu", "port": end.link, "timeout_s": 0.1, **line}, adam())
+    fleet = rig.fleet({"protocol": "modbus-rtu", "port": end.link, "timeout_s": TIMEOUT_S, **line}, adam())
     return bus, end, fleet.devices["d0"]
 
 
@@ -244,7 +245,7 @@ async def test_adapter_unplugged_and_back(rig: Any, slave: Any, modbus_bus: Any)
         began = time.monotonic()
         with pytest.raises(DeviceDisconnected, match="port0"):
             await device.read()
-        assert time.monotonic() - began < 0.1
+        assert time.monotonic() - began < BOUND_S
     end.start()
     assert (await device.read())[0].value == pytest.approx(degc(OLD))
 
@@ -256,7 +257,7 @@ async def test_adapter_unplugged_during_a_request(rig: Any, slave: Any, modbus_b
     began = time.monotonic()
     with pytest.raises(DeviceDisconnected):
         await device.read()
-    assert time.monotonic() - began < 1.0
+    assert time.monotonic() - began < BOUND_S
 
 
 async def test_port_that_is_no_port(rig: Any, tmp_path: Any) -> None:

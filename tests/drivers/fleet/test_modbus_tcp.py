@@ -13,6 +13,8 @@ import pytest
 
 import drivers
 from drivers import DeviceDisconnected, DeviceGarbled, DeviceRefused, DeviceTimeout, Quality
+from drivers.lines import backoff
+from tests.drivers.fleet.conftest import BOUND_S
 
 VOLTS = {"input": 0}
 PROBE = {"um_per_v": 5.0, "polarity": -1, "standoff_um": 50.0, "volt_min": -9.9, "volt_max": 9.9}
@@ -205,7 +207,7 @@ def exception(code: int) -> Callable[[bytes], bytes]:
         (exception(2), DeviceRefused, r"holding register 0 .count 8. of unit 1 .*illegal data address"),
         (exception(6), DeviceRefused, "device busy"),
         (exception(11), DeviceRefused, "gateway target did not answer"),
-        (lambda frame: None, DeviceTimeout, r"no answer from unit 1 on 127.0.0.1:\d+ within 0.1 s"),
+        (lambda frame: None, DeviceTimeout, r"no answer from unit 1 on 127.0.0.1:\d+ within 0.5 s"),
         (lambda frame: frame[:12], DeviceTimeout, "no answer"),
         (lambda frame: b"HTTP/1.1 400 Bad Request\r\n\r\n", DeviceGarbled, "no Modbus TCP header"),
         (lambda frame: frame[:6] + b"\x02" + frame[7:], DeviceGarbled, "unit 2 answers"),
@@ -256,7 +258,7 @@ async def test_connection_lost_is_told_at_once_and_made_anew(rig: Any, slave: An
     began = time.monotonic()
     with pytest.raises(DeviceDisconnected, match="connection"):
         await device.read()
-    assert time.monotonic() - began < 1.0
+    assert time.monotonic() - began < BOUND_S
     assert (await device.read())[0].quality is Quality.GOOD
     assert end.connections == 2
     await end.stop()
@@ -279,30 +281,28 @@ async def test_host_that_swallows_connections(rig: Any) -> None:
             filler.connect_ex(full.getsockname())
             fillers.append(filler)
         line = {"protocol": "modbus-tcp", "host": "127.0.0.1", "tcp_port": full.getsockname()[1]}
-        line["timeout_s"] = 0.1
+        line["timeout_s"] = 0.5
         fleet = rig.fleet(line, adam6018(), adam6018(address=2), adam6018(address=3))
         began = time.monotonic()
         results = await asyncio.gather(*(d.read() for d in fleet.devices.values()), return_exceptions=True)
         assert all(isinstance(result, DeviceTimeout) for result in results), results
-        assert time.monotonic() - began < 0.25  # one try for all three
+        assert time.monotonic() - began < 1.0  # one try for all three
         for filler in fillers:
             filler.close()
 
 
-async def test_dead_unit_does_not_starve_the_others(rig: Any, slave: Any) -> None:
+async def test_dead_unit_does_not_starve_the_others(rig: Any, slave: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backoff, "FIRST_WAIT_S", 2.0)
     unit = slave()
     unit.block(3, 0, [996] * 8)
-    bus, _, [alive, dead] = await rig.modbus({1: unit}, adam6018(), adam6018(address=9), timeout_s=0.05)
-    waits = []
+    bus, _, [alive, dead] = await rig.modbus({1: unit}, adam6018(), adam6018(address=9))
     for _ in range(8):
-        began = time.monotonic()
         result, _ = await asyncio.gather(dead.read(), alive.read(), return_exceptions=True)
         assert isinstance(result, DeviceTimeout)
-        waits.append(time.monotonic() - began)
-    assert sum(wait > 0.04 for wait in waits) == 3
+    assert sum(frame[6] == 9 for frame in bus.frames) == 3
     assert "next attempt in" in str(result)
     bus.units[9] = unit
-    async with asyncio.timeout(1.0):
+    async with asyncio.timeout(30.0):
         while isinstance((await asyncio.gather(dead.read(), return_exceptions=True))[0], DeviceTimeout):
             await asyncio.sleep(0.01)
 
@@ -328,7 +328,7 @@ async def test_close_during_a_read(rig: Any, slave: Any) -> None:
     await bus.asked.wait()
     await device.close()
     with pytest.raises(DeviceDisconnected):
-        await asyncio.wait_for(task, 0.5)
+        await asyncio.wait_for(task, BOUND_S)
 
 
 async def test_eight_registers_take_well_under_a_millisecond(rig: Any, slave: Any) -> None:

@@ -1,0 +1,223 @@
+"""The two engines of a jump: one believes the channel that has jumped, one takes it less the jump."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from compensator.arrays import NAN
+from compensator.model.engine import Engine, EngineState, Estimate
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.plausibility.guards import TEMPERATURES
+from compensator.service.plausibility.jump_state import Branch, JumpState
+
+#: A value counts as expected within this number of standard deviations.
+NEAR = 4.0
+#: A returned value may differ by this part of the jump from the expected one, at most by the other part.
+_RETURNED, _RETURNED_MOST = 0.2, 0.5
+#: Consecutive samples for which a channel must be back; doubled by each further jump, up to the last number.
+BACK_SAMPLES, MOST_BACK_SAMPLES = 3, 30
+#: Further jumps from which on the shifted engine no longer follows the channel: a loose contact has no level.
+_UNSTEADY = 2
+#: Longest gap that is interpolated once a loose contact is back, in samples: a lost heat is worse than a straight line.
+BRIDGED_SAMPLES = 480
+#: Deviations at which one sample's evidence is clipped: a switched heat is not evidence against a sensor.
+_CLIP = 5.0
+#: Weight of the past in the log likelihood ratio of a suspect channel, by sample: about half an hour.
+_KEEP = 1.0 - 1.0 / 30.0
+#: Y speaks for one engine: its residual within the first, the other's larger by the second, in deviations of Y.
+_FITS, _CONTRADICTS = 3.0, 4.0
+
+
+@dataclass(slots=True)
+class Run:
+    """An engine and its last estimate."""
+
+    engine: Engine
+    estimate: Estimate | None = None
+
+    def branch(self) -> Branch:
+        """Return its state."""
+        return Branch(engine=self.engine.snapshot(), estimate=self.estimate)
+
+
+@dataclass(frozen=True, slots=True)
+class Fed:
+    """Values for the shifted engine, °C, and the channels that have jumped in this sample."""
+
+    values: dict[str, float]
+    jumped: list[str]
+
+
+class JumpEngines:
+    """The engine that takes a channel as it is, and the one that takes it less its jump.
+
+    Parameters
+    ----------
+    believing, shifted : Run
+        The engines.
+    """
+
+    def __init__(self, believing: Run, shifted: Run) -> None:
+        self.believing, self.shifted = believing, shifted
+
+    @classmethod
+    def begin(cls, model: ThermalModel, state: EngineState) -> JumpEngines:
+        """Start both from the state of the compensation's engine."""
+        runs = (_new_run(model), _new_run(model))
+        for run in runs:
+            run.engine.restore(state)
+        return cls(*runs)
+
+    @classmethod
+    def restored(cls, model: ThermalModel, state: JumpState) -> JumpEngines | None:
+        """Return the engines of a state; None if no channel has jumped.
+
+        Raises
+        ------
+        ValueError
+            If the state does not belong to the model, or is incomplete.
+        """
+        believing, shifted = (_run_of(model, branch) for branch in (state.believing, state.shifted))
+        are_both = believing is not None and shifted is not None
+        if are_both != bool(state.shifts_k) or not set(state.shifts_k) <= set(TEMPERATURES):
+            raise ValueError("state of a jump that is incomplete")
+        return cls(believing, shifted) if believing is not None and shifted is not None else None
+
+    def pass_time(self, samples: int, *, held: bool) -> None:
+        """Account for samples that were not measured."""
+        for run in (self.believing, self.shifted):
+            run.estimate = run.engine.skip(samples, held=held)
+
+    def believe_as_shifted(self) -> None:
+        """Give the believing engine the state of the shifted one: the channel has jumped again."""
+        self.believing.engine.restore(self.shifted.engine.snapshot())
+
+    def step(self, offered: Mapping[str, float], fed: Fed, others: Mapping[str, float]) -> None:
+        """Step both by a sample."""
+        for run, values in ((self.believing, offered), (self.shifted, fed.values)):
+            run.estimate = run.engine.step(values["t_q_degc"], values["at_degc"], others)
+
+    def feed(
+        self, state: JumpState, offered: Mapping[str, float], jumped: list[str], change_k: Mapping[str, float]
+    ) -> Fed:
+        """Return what the shifted engine is given: at its own zero, less the jump, or missing at a jump.
+
+        Parameters
+        ----------
+        state : JumpState
+            State of the watch; jumps and returns are entered.
+        offered : mapping of str to float
+            Measured values, °C.
+        jumped : list of str
+            Channels that have jumped in this sample by their rate, or by what the engine expects.
+        change_k : mapping of str to float
+            By channel: part of the permitted change of a sample that the temperature itself makes, K.
+        """
+        values: dict[str, float] = {}
+        new: list[str] = []
+        for name in TEMPERATURES:
+            value = offered[name]
+            expected, std = expected_value(self.shifted.engine, name, values.get("at_degc", NAN))
+            difference = value - expected
+            if math.isnan(value):
+                values[name] = NAN
+            elif name in state.shifts_k:
+                shift = state.shifts_k[name]
+                # A heat that is switched may bring it back for a moment.
+                unsure = min(state.back.get(name, 0), BACK_SAMPLES)
+                is_back = _has_returned(difference, std, shift, state.first_k[name])
+                state.back[name] = state.back.get(name, 0) + 1 if is_back else 0
+                most = max((1 + unsure) * change_k[name], NEAR * std)
+                if is_back:
+                    values[name] = value
+                elif state.again >= _UNSTEADY:
+                    values[name] = NAN
+                elif abs(difference - shift) <= most or not state.is_suspect:
+                    values[name] = value - shift
+                else:
+                    new.append(name)
+                    state.again += 1
+            elif name in jumped:
+                new.append(name)
+            else:
+                values[name] = value
+            if name in new:
+                state.shifts_k[name], state.back[name], values[name] = difference, 0, NAN
+                state.first_k.setdefault(name, difference)
+        return Fed(values, new)
+
+    def weigh(self, state: JumpState, offered: Mapping[str, float], fed: Fed) -> None:
+        """Add a sample to the log likelihood ratio; the jump itself speaks for neither."""
+        cost = 0.0
+        for run, values, sign in ((self.believing, offered, -0.5), (self.shifted, fed.values, 0.5)):
+            for name in TEMPERATURES:
+                if name in fed.jumped or math.isnan(values[name]):
+                    continue
+                expected, std = expected_value(run.engine, name, values["at_degc"])
+                cost += sign * min(((values[name] - expected) / std) ** 2, _CLIP * _CLIP)
+        keep = _KEEP if state.is_suspect else 1.0
+        state.ratio = keep * state.ratio + cost
+
+    def believes(self, y_um: float, std_um: float) -> bool | None:
+        """Return whether a value of Y agrees with the believing engine and contradicts the shifted one.
+
+        Parameters
+        ----------
+        y_um, std_um : float
+            Y on the scale of the prediction, and its standard deviation, µm.
+
+        Returns
+        -------
+        bool or None
+            None before the first sample.
+        """
+        if self.believing.estimate is None or self.shifted.estimate is None:
+            return None
+        for_it, against = abs(y_um - self.believing.estimate.y_um), abs(y_um - self.shifted.estimate.y_um)
+        return for_it < _FITS * std_um and against > for_it + _CONTRADICTS * std_um
+
+
+def count_held(state: JumpState, engine: Engine, at_degc: float) -> None:
+    """Count the samples for which AT is where the engine without it holds it: air that a door let in goes again.
+
+    Parameters
+    ----------
+    state : JumpState
+        State of the watch, which keeps the count.
+    engine : Engine
+        Engine of the compensation.
+    at_degc : float
+        Measured AT, °C.
+    """
+    expected, std = expected_value(engine, "at_degc", NAN)
+    first_k = state.first_k.get("at_degc", NAN)
+    is_back = list(state.shifts_k) == ["at_degc"] and _has_returned(at_degc - expected, std, first_k, first_k)
+    state.at_held = state.at_held + 1 if is_back else 0
+
+
+def expected_value(engine: Engine, name: str, at_degc: float) -> tuple[float, float]:
+    """Return the expected value of a channel and its standard deviation, °C and K."""
+    found = engine.forecast(at_degc)
+    return (found.at_k, found.at_std_k) if name == "at_degc" else (found.t_q_k, found.t_q_std_k)
+
+
+def _has_returned(difference: float, std: float, shift: float, first: float) -> bool:
+    near = max(NEAR * std, _RETURNED * abs(shift))
+    # Where the expectation itself is uncertain by the size of the jump, a return shows nothing.
+    return abs(difference) <= near <= _RETURNED_MOST * abs(first)
+
+
+def _new_run(model: ThermalModel) -> Run:
+    return Run(Engine(model, bridge_samples=BRIDGED_SAMPLES))
+
+
+def _run_of(model: ThermalModel, branch: Branch | None) -> Run | None:
+    if branch is None:
+        return None
+    run = _new_run(model)
+    run.engine.check(branch.engine)
+    run.engine.restore(branch.engine)
+    run.estimate = branch.estimate
+    return run

@@ -1,0 +1,82 @@
+"""State of the watch for jumps of T_Q and AT."""
+
+from __future__ import annotations
+
+import msgspec
+
+from compensator.arrays import NAN
+from compensator.model.engine import EngineState, Estimate
+
+#: Samples without a jump after which earlier ones count no more.
+FORGOTTEN_SAMPLES = 240
+
+
+class Branch(msgspec.Struct, kw_only=True, frozen=True):
+    """State of one of the two engines, and its last estimate (None before the first sample)."""
+
+    engine: EngineState
+    estimate: Estimate | None = None
+
+
+class JumpState(msgspec.Struct, kw_only=True):
+    """State of the watch.
+
+    Parameters
+    ----------
+    level_um : float
+        Mean of measured Y − prediction over the last samples, µm: what a jump is compared with.
+    shifts_k : dict of str to float
+        By channel that has jumped: measured − expected, K. Empty if none has.
+    first_k : dict of str to float
+        The first jump of each of them, K.
+    again : int
+        Jumps after the first one, also of earlier times until `FORGOTTEN_SAMPLES` have passed.
+    quiet : int
+        Samples since the last jump or return.
+    is_suspect : bool
+        Whether these channels are not used; otherwise they are watched.
+    samples : int
+        Samples since the last jump.
+    ratio : float
+        Log likelihood ratio of the believing over the shifted engine.
+    back : dict of str to int
+        Consecutive samples for which each channel has been back.
+    at_held : int
+        Consecutive samples for which AT has been where it was before the jump.
+    y_for : int
+        Consecutive samples for which measured Y has spoken for the believing engine.
+    probes_for : int
+        Probes that have spoken for it.
+    believing, shifted : Branch, optional
+        The two engines; None if no channel has jumped.
+    """
+
+    level_um: float = NAN
+    shifts_k: dict[str, float] = {}
+    first_k: dict[str, float] = {}
+    again: int = 0
+    quiet: int = FORGOTTEN_SAMPLES
+    is_suspect: bool = False
+    samples: int = 0
+    ratio: float = 0.0
+    back: dict[str, int] = {}
+    at_held: int = 0
+    y_for: int = 0
+    probes_for: int = 0
+    believing: Branch | None = None
+    shifted: Branch | None = None
+
+    def start_evidence(self) -> None:
+        """Count the evidence from here on."""
+        self.samples, self.ratio, self.y_for, self.probes_for = 0, 0.0, 0, 0
+
+    def begun(self, *, is_suspect: bool) -> JumpState:
+        """Return the state when a channel has jumped."""
+        again = self.again + 1 if self.quiet < FORGOTTEN_SAMPLES else 0
+        return JumpState(level_um=self.level_um, is_suspect=is_suspect, again=again)
+
+    def ended(self) -> JumpState:
+        """Return the state when all channels are used again; the level of Y − prediction is another one then."""
+        if self.is_suspect:
+            return JumpState(again=self.again, quiet=0)
+        return JumpState(level_um=self.level_um, again=self.again, quiet=self.quiet)

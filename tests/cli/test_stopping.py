@@ -1,0 +1,94 @@
+"""SIGINT and SIGTERM end every program that runs on, also where whoever started it ignored and blocked both."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.receiver.wire import free_port
+
+ROOT = Path(__file__).parents[2]
+#: Starts a program as a script's background does, and worse.
+IGNORING = """
+import os, signal, sys
+both = (signal.SIGINT, signal.SIGTERM)
+for number in both:
+    signal.signal(number, signal.SIG_IGN)
+signal.pthread_sigmask(signal.SIG_BLOCK, both)
+os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+"""
+RECEIVER = """[receiver]
+machine = "vmc-07"
+prefix = "shop/vmc-07"
+connect = ["tcp/127.0.0.1:{port}"]
+offset_max_um = 100.0
+offset_rate_max_um_per_min = 6.0
+"""
+OPCUA = """
+[opcua]
+endpoint = "opc.tcp://127.0.0.1:1"
+offset_node = "ns=2;i=2"
+unit = "um"
+sign = 1
+sign_checked = "simulated"
+"""
+PROBES = """[probes]
+prefix = "shop/vmc-07"
+connect = ["tcp/127.0.0.1:{port}"]
+send_within_s = 900.0
+state_file = "state.json"
+[[dprnt]]
+address = "127.0.0.1:1"
+sign = -1
+sign_checked = "simulated"
+retry_s = 0.1
+"""
+ROUTER = '{mode: "router", listen: {endpoints: ["tcp/127.0.0.1:{port}"]}, scouting: {multicast: {enabled: false}}}'
+EXAMPLE = (ROOT / "deploy/machine.example.toml").read_text(encoding="utf-8")
+MACHINE = (
+    EXAMPLE.replace(":7447", ":{port}")
+    .replace("/var/lib/compensator/vmc-07/", "")
+    .replace("192.168.10.22", "127.0.0.1")
+)
+COMMAND = ["-m", "compensator"]
+PROGRAMS = {
+    "receiver": (["-m", "compensator.receiver", "--config", "file.json5"], RECEIVER),
+    "follow.py": ([str(ROOT / "deploy/receiver/follow.py"), "file.json5"], RECEIVER),
+    "run": ([*COMMAND, "run", "--config", "file.json5"], MACHINE),
+    "bridge opcua": ([*COMMAND, "bridge", "opcua", "--config", "file.json5"], RECEIVER + OPCUA),
+    "bridge probes": ([*COMMAND, "bridge", "probes", "--config", "file.json5"], PROBES),
+    "router": ([*COMMAND, "router", "--config", "file.json5"], ROUTER),
+    "watch": ([*COMMAND, "watch", "--connect", "tcp/127.0.0.1:{port}"], ""),
+}
+
+#: What a program has written when it is at work; otherwise its first line.
+READY = {"run": "running", "router": "listens"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_ends_when_started_with_the_signals_ignored_and_blocked(
+    tmp_path: Path, name: str, number: signal.Signals
+) -> None:
+    words, text = PROGRAMS[name]
+    port = free_port()
+    (tmp_path / "file.json5").write_text(text.replace("{port}", str(port)))
+    command = [sys.executable, "-c", IGNORING, *(word.replace("{port}", str(port)) for word in words)]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        assert process.stdout is not None
+        shown = ""
+        while READY.get(name, "\n") not in shown:
+            line = process.stdout.readline()
+            assert line, shown
+            shown += line
+        process.send_signal(number)
+        shown += process.communicate(timeout=50)[0]
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == 0 and "Traceback" not in shown, shown
