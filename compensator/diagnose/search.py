@@ -20,6 +20,7 @@ from compensator.diagnose.fit import Fit, Start, Term, fit_terms, settled
 from compensator.diagnose.likelihood import Likelihood, learned_rest
 from compensator.diagnose.points import Points, Rest
 from compensator.diagnose.scan import Grid, Scan
+from compensator.diagnose.standard_errors import deviations
 from compensator.diagnose.switching import switchings
 from compensator.model.effects.hypothesis import Hypothesis, Place, proposals
 
@@ -230,11 +231,12 @@ class Search:
         return fit
 
     def _pruned(self, fit: Fit) -> Fit:
-        """Leave out every effect that is not worth its cost, or too small to name."""
+        """Leave out every effect that is not worth its cost, too small to name, or not known apart from the others."""
         while fit.terms:
             fewer = [settled(fit_terms(fit.likelihood, fit.starts(i))) for i in range(len(fit.terms))]
             best = max(range(len(fewer)), key=lambda i: self.criterion.score(fewer[i]))
             small = [i for i, term in enumerate(fit.terms) if not self.criterion.is_worth_naming(term, fewer[i], fit)]
+            small = small or [i for i, (size, std) in enumerate(deviations(fit)) if std > size]
             if self.criterion.score(fewer[best]) <= self.criterion.score(fit):
                 if not small:
                     return fit

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from compensator.arrays import Matrix, Vector
-from compensator.diagnose.fit import Fit, Term, fit_terms, summed
+from compensator.diagnose.fit import Fit, Term, fit_terms, response, summed
 from compensator.diagnose.likelihood import Likelihood
 
 #: The parameter that is a time.
@@ -22,45 +22,73 @@ def standard_errors(fit: Fit) -> list[dict[str, float]]:
 
     Where the calibration states no error of the base's paths, none is counted.
     """
-    natural = np.array([v for term in fit.terms for v in (*term.values, *term.amplitudes)])
-    if natural.size == 0:
+    if not fit.terms:
         return []
-    points, rest = fit.likelihood.points, fit.rest
-    likelihood = Likelihood(points, rest.without_own_error()) if points.is_exact else fit.likelihood
-
-    def moved(values: Vector) -> list[Term]:
-        one = iter(values.tolist())
-        return [
-            dataclasses.replace(
-                term,
-                values=tuple(itertools.islice(one, len(term.values))),
-                amplitudes=tuple(itertools.islice(one, len(term.amplitudes))),
-            )
-            for term in fit.terms
-        ]
-
-    def predicted(values: Vector) -> Vector:
-        total = summed(likelihood.points.evidence, moved(values))
-        return likelihood.projected(likelihood.points.averaged(total[:, None]))[:, 0]
+    points = fit.likelihood.points
+    exact = Likelihood(points, fit.rest.without_own_error()) if points.is_exact else fit.likelihood
 
     def named(values: Vector) -> Vector:
-        return np.array([v for term in moved(values) for v in term.named.values()])
+        return np.array([v for term in _moved(fit, values) for v in term.named.values()])
 
-    steps = 1e-3 * np.abs(natural) + 1e-9
-    jacobian = _slopes(predicted, natural, steps)
-    scale = np.linalg.norm(jacobian, axis=0)
-    scale[scale == 0.0] = 1.0
-    _, s, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    inverse = vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None]
-    spread = _slopes(named, natural, steps) @ inverse
+    spread = _slopes(named, _values(fit)) @ _root(fit, exact)
     errors = iter(np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread), 0.0)).tolist())
     return [dict(zip(term.named, errors, strict=False)) for term in fit.terms]
 
 
-def _slopes(function: Callable[[Vector], Vector], at: Vector, steps: Vector) -> Matrix:
+def deviations(fit: Fit) -> list[tuple[float, float]]:
+    """Return what each effect moves, and how well that is known whatever the others do, standard deviations, µm.
+
+    Two effects may be known together and not apart: then each has an error of its own that the other makes up for, in
+    this record and not on another day.
+    """
+    points, found = fit.likelihood.points, []
+    root = _root(fit, fit.likelihood)
+    for i in range(len(fit.terms)):
+
+        def added(values: Vector, i: int = i) -> Vector:
+            columns = response(points.evidence, _moved(fit, values)[i])
+            return points.averaged(columns[:, None])[:, 0]
+
+        spread = _slopes(added, _values(fit)) @ root
+        found.append((float(np.std(added(_values(fit)))), float(np.sqrt(np.sum(np.var(spread, axis=0))))))
+    return found
+
+
+def _root(fit: Fit, likelihood: Likelihood) -> Matrix:
+    """Return a root of the covariance of all parameters: searched ones and amplitudes of each effect in turn."""
+
+    def predicted(values: Vector) -> Vector:
+        total = summed(likelihood.points.evidence, _moved(fit, values))
+        return likelihood.projected(likelihood.points.averaged(total[:, None]))[:, 0]
+
+    jacobian = _slopes(predicted, _values(fit))
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale[scale == 0.0] = 1.0
+    _, s, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
+    return np.asarray(vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None])
+
+
+def _values(fit: Fit) -> Vector:
+    return np.array([v for term in fit.terms for v in (*term.values, *term.amplitudes)])
+
+
+def _moved(fit: Fit, values: Vector) -> list[Term]:
+    """Return the terms of a fit with other values of all parameters."""
+    one = iter(values.tolist())
+    return [
+        dataclasses.replace(
+            term,
+            values=tuple(itertools.islice(one, len(term.values))),
+            amplitudes=tuple(itertools.islice(one, len(term.amplitudes))),
+        )
+        for term in fit.terms
+    ]
+
+
+def _slopes(function: Callable[[Vector], Vector], at: Vector) -> Matrix:
     """Return the derivatives of a function by each of its arguments, shape (values, arguments)."""
     columns = []
-    for i, step in enumerate(steps.tolist()):
+    for i, step in enumerate((1e-3 * np.abs(at) + 1e-9).tolist()):
         above, below = at.copy(), at.copy()
         above[i] += step
         below[i] -= step
