@@ -55,6 +55,11 @@ USERS = {
         Command("identify", "fit a model to measured runs", "identify run.csv --validate other.csv --out model.toml"),
         Command("simulate", "run a model over measured data", "simulate run.csv --model quill --out predicted.csv"),
         Command(
+            "compare",
+            "compare models on the same measured data",
+            "compare run.csv --model model.toml --model diagnosis/model.toml --page comparison.html",
+        ),
+        Command(
             "diagnose",
             "find what a model lacks, from measured data",
             "diagnose day.mcap --model model.toml --out diagnosis",

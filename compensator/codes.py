@@ -550,6 +550,11 @@ class DataRemark(Code):
         "Measured values of Y were far from the prediction and agreed with each other; the prediction follows them.",
         "Find out what moved: a collision, a new clamping, or another feature.",
     )
+    NOT_VALIDATED = (
+        "not_validated",
+        "The validation data lack a channel of the extended model; only the base model was validated on them.",
+        "Validate on data with this channel.",
+    )
 
 
 class ServiceWarning(Code):

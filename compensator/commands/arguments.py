@@ -84,6 +84,19 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     _column(parser)
 
 
+def compare(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `compare`."""
+    add = parser.add_argument
+    add("data", type=Path, nargs="+", metavar="DATA", help="one or more tables (CSV, MAT), or recordings, with Y")
+    words = "a model file, or quill; repeated for each model"
+    add("--model", action="append", required=True, metavar="MODEL", help=words)
+    words = "compare from this hour of each file on; the models run from its start (0)"
+    add("--from", dest="from_h", type=_number(0.0, 1e6), default=0.0, metavar="H", help=words)
+    add("--out", type=Path, metavar="CSV", help="also write measured Y, predictions and residuals as a table")
+    _page(parser)
+    _column(parser)
+
+
 def loop(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `loop`."""
     add = parser.add_argument
@@ -159,6 +172,10 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
     add("--model", required=True, help="a model file, or quill")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
+    words = "search up to this hour, validate both models on the rest"
+    add("--fit-until", type=_number(0.0, 1e6), metavar="H", help=words)
+    words = "data that take no part in the search, to validate both models; may be repeated"
+    add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
     _page(parser)
     _column(parser)
     _y_std(parser)

@@ -112,6 +112,23 @@ class Measurement(display.Shown):
         data = to_grid(self.table, period_s)
         return SampledData(records=data.records, remarks=(*self.remarks, *data.remarks))
 
+    def before(self, hour: float) -> Measurement:
+        """Return the rows before an hour from the start.
+
+        Raises
+        ------
+        DataError
+            If there are none.
+        """
+        t_s = self.table.t_s - np.min(self.table.t_s)
+        keep = t_s < hour * 3600.0
+        if not keep.any():
+            raise DataError(f"{self.name}: no rows before {hour:g} h, expected data to search in")
+        columns = {name: values[keep] for name, values in self.table.columns.items()}
+        rows = np.asarray(self.table.rows)[keep].tolist()
+        table = dataclasses.replace(self.table, t_s=self.table.t_s[keep], columns=columns, rows=rows)
+        return dataclasses.replace(self, table=table)
+
     def contents(self) -> list[display.Table]:
         """Return what it shows: span, samples, columns, remarks."""
         return [display.Table(title=self.name, head=["", ""], rows=self._rows())]
@@ -222,6 +239,22 @@ def measurements(
         label = recordings[0].name
         found.append(Measurement(table=table, label=label, origins=origins, roles=roles, remarks=left_out))
     return found
+
+
+def check_validation(fitted: Sequence[Measurement], validation: Sequence[Measurement]) -> None:
+    """Refuse to validate a model on data that were used to make it, or a copy of them.
+
+    Raises
+    ------
+    UsageError
+        Naming the data.
+    """
+    used = {origin.sha256 for measured in fitted for origin in measured.origins}
+    for measured in validation:
+        for origin in measured.origins:
+            if origin.sha256 in used:
+                named = origin.path or origin.name
+                raise UsageError(f"--validate {named}: is used for the fit, expected another run")
 
 
 def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:

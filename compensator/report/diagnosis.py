@@ -10,6 +10,7 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.diagnose.ceiling import ceiling, falls_short, remainder
 from compensator.diagnose.found_effect import FoundEffect
+from compensator.diagnose.free_run import is_contradicted
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.summary import (
     SHOWN,
@@ -23,6 +24,7 @@ from compensator.diagnose.summary import (
     verdict,
 )
 from compensator.model.effects.seen import unit_of_channel
+from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel
 from compensator.report.advice import advice_blocks
 from compensator.report.held_out import TimeAxis, waterfall
@@ -51,10 +53,14 @@ def tone_of(found: Mapping[str, Any]) -> Tone:
         Content of `diagnosis.json`.
     """
     tone = TONES[found["verdict"]]
+    if is_contradicted(found):
+        return "warn"
     return "warn" if tone == "good" and found["effects"] and falls_short(found) else tone
 
 
-def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Page:
+def page_of(
+    diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str], free_run: Sequence[FreeRunErrors] = ()
+) -> Page:
     """Make the page.
 
     Parameters
@@ -65,10 +71,13 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
         The extended model as written, with its hash.
     remarks : sequence of str
         Remarks on the data.
+    free_run : sequence of FreeRunErrors
+        Errors of both models in free run as the service runs.
     """
     time = TimeAxis.of(diagnosis)
-    found = figures(diagnosis)
+    found = figures(diagnosis, free_run)
     blocks: list[Block] = [waterfall(diagnosis), ceiling(found)]
+    blocks += [table_of(free_run)] if free_run else []
     blocks += [_before_and_after(time, diagnosis), error_table(diagnosis)]
     blocks += [_effect(time, diagnosis, effect) for effect in diagnosis.effects]
     blocks += remainder(found)

@@ -21,6 +21,7 @@ from compensator.identify.summary import (
     share_left,
     verdict,
 )
+from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel
 from compensator.report.page import (
     Block,
@@ -41,7 +42,11 @@ from compensator.report.page import (
 
 
 def page_of(
-    calibration: Calibration, criticism: Criticism, model: ThermalModel, comparison: Sequence[Comparison] = ()
+    calibration: Calibration,
+    criticism: Criticism,
+    model: ThermalModel,
+    comparison: Sequence[Comparison] = (),
+    free_run: Sequence[FreeRunErrors] = (),
 ) -> Page:
     """Make the page.
 
@@ -55,9 +60,13 @@ def page_of(
         The model as written, with its hash.
     comparison : sequence of Comparison
         Coefficients compared with those of another model.
+    free_run : sequence of FreeRunErrors
+        Errors in free run as the service runs.
     """
-    errors = errors_of(calibration)
-    blocks: list[Block] = [_prediction(calibration), _residuals(calibration), error_table(calibration)]
+    errors = errors_of(calibration, free_run)
+    blocks: list[Block] = [_prediction(calibration), _residuals(calibration)]
+    blocks += [table_of(free_run)] if free_run else []
+    blocks.append(error_table(calibration))
     blocks += warnings_of(criticism.warnings)
     if comparison:
         blocks.append(comparison_table(comparison))

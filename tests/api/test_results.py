@@ -61,7 +61,11 @@ def test_an_identification_shows_draws_and_writes_itself(tmp_path: Path, found: 
 def test_terminal_notebook_and_page_show_the_same_tables(tmp_path: Path, found: object) -> None:
     page = found.page(tmp_path / "page.html").read_text(encoding="utf-8")
     tables = found.tables()
-    assert [table.title for table in tables] == ["Gains and time constants", "Errors in free run"]
+    assert [table.title for table in tables] == [
+        "Gains and time constants",
+        "Error in free run",
+        "Errors of the fit: zero from the data",
+    ]
     for shown in (page, found._repr_html_(), found.summary()):
         for table in tables:
             assert all(html.escape(cell) in shown for row in table.rows for cell in row)
