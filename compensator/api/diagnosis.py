@@ -26,7 +26,7 @@ from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.summary import contents, figures
-from compensator.display import Table, Words
+from compensator.display import Listing, Table, Words
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.model_writer import write_model
 from compensator.model.simulation import require_channels
@@ -76,7 +76,7 @@ class DiagnosisResult(Paged):
         """Return the content of `diagnosis.json`."""
         return figures(self.diagnosis, self.free_run)
 
-    def contents(self) -> list[str | Table | Words]:
+    def contents(self) -> list[str | Table | Words | Listing]:
         """Return the content: verdict, errors, effects with their parameters, warnings."""
         return list(contents(self.diagnosis, self.remarks, self.free_run))
 

@@ -59,11 +59,18 @@ def demo(parser: argparse.ArgumentParser) -> None:
 
 
 def run(parser: argparse.ArgumentParser) -> None:
-    """Describe the argument of `run`, `check` and `probe`; `adopt` and `back` have it as well."""
+    """Describe the argument of `run` and `probe`; `adopt` and `back` have it as well."""
     parser.add_argument("--config", required=True, metavar="FILE", help="configuration of the service")
 
 
-check = probe = run
+probe = run
+
+
+def check(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `check`."""
+    run(parser)
+    words = "check whether the service could run this model (a file, or quill) in place of its own"
+    parser.add_argument("--model", metavar="MODEL", help=words)
 
 
 def simulate(parser: argparse.ArgumentParser) -> None:

@@ -7,6 +7,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from compensator.channel_lines import channel_lines, unusable_names
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
 from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_rms, remainder
@@ -15,7 +18,7 @@ from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import free_run_sentence
 from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
-from compensator.display import Table, Words, warnings_of, with_std
+from compensator.display import Listing, Table, Words, warnings_of, with_std
 from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.simulation import SCORE_HEAD, Scores
 
@@ -237,7 +240,7 @@ def name(effect: FoundEffect) -> str:
 
 def contents(
     diagnosis: Diagnosis, remarks: Sequence[Remark], free_run: Sequence[FreeRunErrors] = ()
-) -> Iterator[str | Table | Words]:
+) -> Iterator[str | Table | Words | Listing]:
     """Yield the content for terminal and notebook: verdict, tables, explanations, warnings and remarks."""
     found = figures(diagnosis, free_run)
     yield verdict(found)
@@ -251,12 +254,33 @@ def contents(
         if effect.rivals:
             yield rivals(effect)
     yield from remainder(found)
+    yield from channels_to_configure(diagnosis)
     if hidden := hiding_lines(found):
         yield Words(title="What could hide", lines=hidden)
     if advice := advice_lines(diagnosis.advice):
         yield Words(title="What to measure and test next", lines=advice)
     yield from warnings_of(diagnosis.warnings)
     yield from warnings_of(remarks, "Remarks on the data")
+
+
+def channels_to_configure(diagnosis: Diagnosis) -> list[Listing | Words]:
+    """Return the lines of the configuration for the channels that the extended model needs; empty without any."""
+    new = [name for name in diagnosis.model.channels if name not in diagnosis.evidence.model.channels]
+    if not new:
+        return []
+    ranges = {}
+    for name in new:
+        values = np.concatenate([run.channels[name] for run in diagnosis.evidence.runs if name in run.channels])
+        ranges[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
+    title = (
+        "The extended model needs these channels in the service's configuration. Where they are not there yet, paste, "
+        "and name device and input of the sensor"
+    )
+    found: list[Listing | Words] = [Listing(title=title, lines=channel_lines(new, ranges))]
+    if bad := unusable_names(new):
+        words = f"{', '.join(bad)}: no name for a channel (small letters, digits, _). Rename the column and repeat."
+        found.append(Words(title="Names", lines=[words], kind="warning"))
+    return found
 
 
 def error_table(diagnosis: Diagnosis) -> Table:

@@ -14,6 +14,7 @@ from compensator.diagnose.free_run import is_contradicted
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.summary import (
     SHOWN,
+    channels_to_configure,
     error_table,
     explanation,
     figures,
@@ -81,6 +82,7 @@ def page_of(
     blocks += [_before_and_after(time, diagnosis), error_table(diagnosis)]
     blocks += [_effect(time, diagnosis, effect) for effect in diagnosis.effects]
     blocks += remainder(found)
+    blocks += channels_to_configure(diagnosis)
     if hidden := hiding_lines(found):
         blocks.append(Words(title="What could hide", lines=hidden))
     blocks += advice_blocks(diagnosis)

@@ -17,7 +17,7 @@ from typing import Literal
 
 from compensator.atomic_write import atomic_write
 from compensator.codes import explain
-from compensator.display import Cell, CodeLink, Link, Table, Words, sentence_of, text_of, warnings_of
+from compensator.display import Cell, CodeLink, Link, Listing, Table, Words, sentence_of, text_of, warnings_of
 from compensator.report.drawing import svg
 from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
 
@@ -54,7 +54,7 @@ class Section:
     blocks: Sequence[Block]
 
 
-Block = Figure | Row | Table | Words | Details | Section
+Block = Figure | Row | Table | Words | Listing | Details | Section
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,6 +171,9 @@ def _block(block: Block, numbers: Iterator[int], level: int) -> str:
         items = "".join(f"<li>{_inline(line)}</li>" for line in block.lines)
         sign = '<span aria-hidden="true">⚠ </span>' if block.kind == "warning" else ""
         return f'<div class="words {block.kind}">{_heading(block.title, level, sign)}<ul>{items}</ul></div>'
+    if isinstance(block, Listing):
+        lines = f'<div class="scroll" tabindex="0"><pre>{html.escape(block.lines)}</pre></div>'
+        return f"<p>{html.escape(block.title)}:</p>{lines}"
     inner = "".join(_block(part, numbers, level + 1) for part in block.blocks)
     if isinstance(block, Details):
         return f"<details><summary>{_heading(block.title, level)}</summary>{inner}</details>"
@@ -237,6 +240,7 @@ __all__ = [
     "Figure",
     "Line",
     "Link",
+    "Listing",
     "Marks",
     "Page",
     "Row",

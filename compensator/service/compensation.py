@@ -65,7 +65,11 @@ class Compensation:
         names = {channel.name for channel in config.channel}
         missing = [name for name in self._engine.channels if name not in names]
         if missing:
-            raise ServiceError(f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured")
+            names_missing = " and ".join(map(repr, missing))
+            raise ServiceError(
+                f"model {model.name}: an effect needs channel {names_missing}, which is not configured; `compensator "
+                "check` prints the lines to paste"
+            )
         self._guards = SensorGuards(config.channel, config.guards, self._period_min)
         self.plausibility = PlausibilityCheck(config, model)
         self._jumps = JumpWatch(config, model)
