@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,7 +17,7 @@ import numpy as np
 from compensator import __version__
 from compensator.api.files import ModelLike, Paged, as_in_file, model_of
 from compensator.arrays import Vector
-from compensator.atomic_write import require_folder
+from compensator.atomic_write import atomic_write, require_folder
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import DataRemark, Remark
 from compensator.data.measurement import DataLike, Measurement, check_validation, measurements, runs_in
@@ -25,11 +26,12 @@ from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
 from compensator.diagnose.free_run import BASE, EXTENDED, HELD_OUT, SEARCHED
 from compensator.diagnose.outcome import Diagnosis
+from compensator.diagnose.series import series_of
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Listing, Table, Words
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.model_writer import write_model
-from compensator.model.simulation import require_channels
+from compensator.model.simulation import csv_rows, require_channels
 from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
 
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from compensator.report.page import Page
 
 #: Files that `save` writes into a folder.
-FILES = ("model.toml", "diagnosis.json", "report.html")
+FILES = ("model.toml", "diagnosis.json", "report.html", "series.csv")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -86,8 +88,8 @@ class DiagnosisResult(Paged):
         Parameters
         ----------
         path : path
-            A name that ends in .toml: the model file. Any other name: a folder for `model.toml`, `diagnosis.json` and
-            `report.html`, which is created if it does not exist.
+            A name that ends in .toml: the model file. Any other name: a folder for `model.toml`, `diagnosis.json`,
+            `report.html` and `series.csv` (all curves), which is created if it does not exist.
 
         Raises
         ------
@@ -99,16 +101,19 @@ class DiagnosisResult(Paged):
             write_model(target, self.model)
         else:
             require_folder(target)
-            self.save_all(target)
+            self.save_all(target, series=True)
         return target
 
-    def save_all(self, folder: Path, *, also: Path | None = None) -> None:
-        """Write model, `diagnosis.json` and page into a folder, and the page also to another file."""
+    def save_all(self, folder: Path, *, also: Path | None = None, series: bool = False) -> None:
+        """Write model, `diagnosis.json`, page and, if wanted, curves into a folder; the page also to another file."""
         folder.mkdir(parents=True, exist_ok=True)
-        model, found, page = (folder / name for name in FILES)
+        model, found, page, curves = (folder / name for name in FILES)
         write_model(model, self.model)
         found.write_text(json.dumps(self.to_dict(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
         self.write_page(page, also=also)
+        if series:
+            with atomic_write(curves) as file:
+                csv.writer(file, lineterminator="\n").writerows(csv_rows(series_of(self.diagnosis)))
 
     def as_page(self) -> Page:
         """Return the content of the page."""

@@ -117,7 +117,7 @@ def loop(parser: argparse.ArgumentParser) -> None:
 
 def export(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `export`."""
-    words = "recordings of one machine, in any order"
+    words = "recordings of one machine in any order, or a folder of them"
     parser.add_argument("recording", type=Path, nargs="+", metavar="FILE.mcap", help=words)
     parser.add_argument("--out", type=Path, required=True, metavar="CSV")
     words = "machine in a shop's recording (watch --record), such as shop/vmc-07"
@@ -178,7 +178,13 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
     add("--model", required=True, help="a model file, or quill")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for diagnosis.json, model.toml, report.html and series.csv",
+    )
     words = "search up to this hour, validate both models on the rest"
     add("--fit-until", type=_number(0.0, 1e6), metavar="H", help=words)
     words = "data that take no part in the search, to validate both models; may be repeated"

@@ -49,7 +49,7 @@ def diagnose_files(
     validate: Sequence[Path] = (),
     also: Path | None = None,
 ) -> Answer:
-    """Diagnose files and write `diagnosis.json`, `model.toml` and `report.html` into a folder."""
+    """Diagnose files and write `diagnosis.json`, `model.toml`, `report.html` and `series.csv` into a folder."""
     checked_folder(out, "--out", read=(*data, *validate, Path(model)), names=FILES)
     base = model_of(model)
     measured = measurements(data, "data", columns)
@@ -65,8 +65,8 @@ def diagnose_files(
             progress=progress,
             executor=executor,
         )
-    found.save_all(out, also=also)
-    model_file, page = out / FILES[0], out / FILES[2]
-    paths = {"model": str(model_file), "model_sha256": found.model.sha256, "report": str(page)}
-    text = f"{found.summary()}\n\nmodel: {model_file}\n{pages_text(page, also)}"
+    found.save_all(out, also=also, series=True)
+    model_file, page, curves = out / FILES[0], out / FILES[2], out / FILES[3]
+    paths = {"model": str(model_file), "model_sha256": found.model.sha256, "report": str(page), "series": str(curves)}
+    text = f"{found.summary()}\n\nmodel: {model_file}\ncurves: {curves}\n{pages_text(page, also)}"
     return Answer(found.to_dict() | paths, text)

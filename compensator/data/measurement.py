@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from compensator import display
 from compensator.codes import Remark
-from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings
+from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings, read_workbook
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
 from compensator.data.record import SampledData, SampledRecord, require
@@ -24,6 +24,7 @@ from compensator.data.screening import check_y_std
 from compensator.data.table import Table
 from compensator.errors import DataError, UsageError
 from compensator.input_file import read_file, sha256_of_file
+from compensator.recording.reading import recordings_in
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -223,7 +224,9 @@ def measurements(
             found.append(source)
         elif isinstance(source, (str, os.PathLike)):
             path = Path(source)
-            if path.suffix.lower() == ".mcap":
+            if path.is_dir():
+                recordings += recordings_in([path])
+            elif path.suffix.lower() == ".mcap":
                 recordings.append(path)
             else:
                 found.append(_of_file(path, roles))
@@ -265,6 +268,8 @@ def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
     left_out: tuple[Remark, ...] = ()
     if path.suffix.lower() == ".mat":
         table, left_out = read_mat(path, roles)
+    elif path.suffix.lower() in (".xlsx", ".xlsm"):
+        table = read_workbook(path, roles)
     else:
         table = read_csv(path, data, roles)
     table, remarks = table.measurements_only()
