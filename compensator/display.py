@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from compensator.codes import Remark
+from compensator.codes import Remark, explained_by
 
 #: Cells of a column of numbers: digits, signs, errors, percent, and dashes for missing values.
 _NUMBER = re.compile(
@@ -28,8 +28,8 @@ class CodeLink:
 
     @property
     def word(self) -> str:
-        """The code without its subject."""
-        return self.code.split(":", maxsplit=1)[0]
+        """The code whose words explain it."""
+        return explained_by(self.code)
 
 
 @dataclass(frozen=True, slots=True)

@@ -288,6 +288,11 @@ def watch(parser: argparse.ArgumentParser) -> None:
     add("--wait", type=_number(0.0, 86_400.0), default=0.0, metavar="S", help="with --once: how long to listen, s (0)")
     add("--page", action="store_true", help="serve a live page on 127.0.0.1 instead of the terminal view")
     add("--port", type=int, default=8710, help="port of the page (8710; 0: any free port)")
+    words = "with --page: serve it, read only, on this address of the computer, for a tablet at the machine; without "
+    words += "encryption, for whoever has the address that is printed, which ends in a token"
+    add("--bind", metavar="ADDRESS", help=words)
+    words = "with --bind: file with the token, made if it does not exist (default: a new token at each start)"
+    add("--token", type=Path, metavar="FILE", help=words)
     words = "record all messages of all machines as MCAP in this folder"
     add("--record", type=Path, metavar="FOLDER", help=words)
     add("--foxglove", action="store_true", help="serve Foxglove on 127.0.0.1 (needs the extra foxglove)")
