@@ -44,6 +44,7 @@ def headline(
     channels: Mapping[str, Mapping[str, Any]],
     until_ns: int | None,
     now_ns: int,
+    std_um: float | None = None,
 ) -> Headline:
     """Return the headline of a machine.
 
@@ -59,7 +60,23 @@ def headline(
         When the offset will be held, ns since 1970 UTC; None if nothing is missing or it is unknown.
     now_ns : int
         Now, ns since 1970 UTC.
+    std_um : float, optional
+        Standard deviation of the offset, µm.
     """
+    found = _headline(shown, tone, reasons, channels, until_ns, now_ns)
+    if found.cut == "no" or std_um is None:
+        return found
+    return found._replace(text=f"{found.text} Offset ±{std_um:.1f} µm (one standard deviation).")
+
+
+def _headline(
+    shown: str,
+    tone: str,
+    reasons: Sequence[str],
+    channels: Mapping[str, Mapping[str, Any]],
+    until_ns: int | None,
+    now_ns: int,
+) -> Headline:
     if shown in (WatchWarning.SILENT, WatchWarning.UNKNOWN, State.FAULT, State.STARTING):
         return Headline("no", "Do not cut to size", " ".join(_words([*reasons[:1], shown])))
     lost = _lost(channels, reasons)
@@ -72,7 +89,8 @@ def headline(
         minutes = max(until_ns - now_ns, 0) / 60e9
         held = f"Predicted for another {minutes:.0f} min, then held."
         parts = [*lost[:1], held, *lost[1:]]
-        return Headline("until", f"May cut until {here(until_ns):%H:%M}", " ".join(parts))
+        may = "Cut with care" if any(reason.partition(":")[0] in _DOUBTS for reason in reasons) else "May cut"
+        return Headline("until", f"{may} until {here(until_ns):%H:%M}", " ".join(parts))
     suspects = [reason.partition(":")[2] for reason in reasons if reason.startswith(f"{Reason.IMPLAUSIBLE}:")]
     if len(suspects) > 1:
         others = " or ".join(f"{NAMES.get(name, name)} is wrong" for name in suspects if name != "model")

@@ -301,6 +301,7 @@ class WatchedMachine:
             channels=self._measured(now_ns)["channels"],
             until_ns=None if isinstance(until, UnsetType) else until,
             now_ns=now_ns,
+            std_um=self._offset.y_offset_std_um if self._offset is not None else None,
         )
 
     @staticmethod

@@ -48,6 +48,17 @@ def test_each_state_says_whether_one_may_cut(shown: str, reasons: tuple[str, ...
     assert found.cut == cut and words in found.text
 
 
+def test_a_doubt_in_the_model_beside_a_lost_couple_asks_for_care() -> None:
+    found = of("degraded", "t_q_missing", "implausible:model", "predicting", until_min=29.0, t_q_degc="open_circuit")
+    assert found.cut == "until" and found.word.startswith("Cut with care until ")
+
+
+def test_the_standard_deviation_stands_beside_what_may_be_cut() -> None:
+    options: dict[str, Any] = {"tone": "good", "reasons": (), "channels": {}, "until_ns": None, "now_ns": NOW_NS}
+    assert "±0.4 µm" in headline(shown="ok", std_um=0.42, **options).text
+    assert "±" not in headline(shown="fault", std_um=0.42, **options).text
+
+
 def test_warnings_of_a_machine_that_is_ok_ask_for_care() -> None:
     assert of("ok", tone="warn").cut == "care"
 
