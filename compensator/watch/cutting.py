@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from compensator.codes import Reason, SampleQuality, State, WatchWarning, explain
-from compensator.watch.words import here
+from compensator.report.local_time import here
 
 #: Names of channels at the machine.
 NAMES: Mapping[str, str] = {"t_q_degc": "T_Q", "at_degc": "AT", "y_um": "Y", "heat_w": "Heat"}
@@ -82,7 +82,8 @@ def _headline(
     lost = _lost(channels, reasons)
     if shown == State.HOLD:
         why = lost or _words([reason for reason in reasons if reason != Reason.PREDICTING][-1:])
-        return Headline("no", "Do not cut to size", " ".join(["The offset is frozen.", *why]))
+        frozen = [] if Reason.OPERATOR_HOLD in reasons else ["The offset is frozen."]
+        return Headline("no", "Do not cut to size", " ".join([*frozen, *why]))
     if Reason.PREDICTING in reasons:
         if until_ns is None:
             return Headline("care", "Cut with care", " ".join([*lost, "Predicted for a limited time, then held."]))

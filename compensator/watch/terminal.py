@@ -13,11 +13,12 @@ from rich.text import Text
 
 from compensator.clock import NS
 from compensator.codes import SampleQuality, WatchWarning
+from compensator.report.local_time import here, zone
 from compensator.report.notation import plain, signed
 from compensator.watch.day import STYLES, drawn, evenly, sparkline
 from compensator.watch.history import StateInterval, state_intervals
 from compensator.watch.shop import Shop, headline
-from compensator.watch.words import SIGNS, age, here, probe_text, zone
+from compensator.watch.words import SIGNS, age, probe_text
 
 #: Columns of the table of a shop: heading, minimum width of the terminal.
 _COLUMNS = (

@@ -212,7 +212,7 @@ def test_the_shop_says_what_to_do_and_times_are_of_the_viewers_zone(tmp_path: Pa
     with PageServer(shop, lambda: STATUS, 0) as served:
         text, console = drawn(served.address, tmp_path, 400)
         assert console == ""
-        assert "<li><b>✗ shop/vmc-07 hold: Do not cut to size. </b>The offset is frozen. An operator" in text
+        assert "<li><b>✗ shop/vmc-07 hold: Do not cut to size. </b>An operator has frozen the offset. Send" in text
         text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 1400, zone="Asia/Tokyo")
     assert console == ""
     assert "Asia/Tokyo, UTC+09:00" in text and text.count("time of day, UTC+09:00") == 4
