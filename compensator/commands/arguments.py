@@ -133,6 +133,11 @@ def bridge(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--check", action="store_true", help="check the file without opening a connection")
 
 
+def completion(parser: argparse.ArgumentParser) -> None:
+    """Describe the argument of `completion`."""
+    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help="the shell")
+
+
 def explain(parser: argparse.ArgumentParser) -> None:
     """Describe the argument of `explain`."""
     parser.add_argument(

@@ -21,7 +21,7 @@ from compensator.model.thermal_model import ThermalModel
 
 #: References with which every model is compared.
 NOTHING, PERSISTENCE = "no compensation", "persistence"
-TITLE = "Error in free run"
+TITLE = "Error in free run, µm: rms about the zero and about the mean, mean absolute, peak to peak"
 NOTE = (
     "Free run: from the first sample, at rest; measured Y counts from its first value, as in the service. About the "
     "mean: without the residual's mean. Persistence: the last Y measured before the samples is held."
@@ -174,17 +174,12 @@ class FreeRunErrors:
 
 def table_of(rows: Sequence[FreeRunErrors]) -> Table:
     """Return the errors as a table, the same on every page and in every command."""
-    several = len(rows) > 1
-    return Table(
-        title=TITLE,
-        head=["data", "model", *FREE_RUN_HEAD] if several else ["", *FREE_RUN_HEAD],
-        rows=[
-            [*([f"{one.name} ({one.role})" if not i else ""] if several else []), name, *row.free_run_cells()]
-            for one in rows
-            for i, (name, row) in enumerate(one.scores.items())
-        ],
-        note=NOTE,
-    )
+    lines: list[list[str]] = []
+    for one in rows:
+        if len(rows) > 1:
+            lines.append([f"{one.name} ({one.role})", *[""] * len(FREE_RUN_HEAD)])
+        lines += [[name, *row.free_run_cells()] for name, row in one.scores.items()]
+    return Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=lines, note=NOTE)
 
 
 def in_words(scores: Mapping[str, Any], model: str) -> str:

@@ -20,7 +20,7 @@ COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_t
 #: Columns of `Scores.cells`.
 SCORE_HEAD = ("rms µm", "peak to peak µm", "fit %")
 #: Columns of `Scores.free_run_cells`.
-FREE_RUN_HEAD = ("rms µm about the zero", "about the mean", "mean absolute µm", "peak to peak µm", "fit %")
+FREE_RUN_HEAD = ("about zero", "about mean", "mean abs.", "peak to peak", "fit %")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

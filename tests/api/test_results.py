@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 import compensator as tc
 from compensator.api.simulation_result import SimulationResult
 from compensator.display import with_std
+from compensator.model.free_run import TITLE
 from tests.api.tables import arrays, frame, write_run
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W
 
@@ -63,7 +64,7 @@ def test_terminal_notebook_and_page_show_the_same_tables(tmp_path: Path, found: 
     tables = found.tables()
     assert [table.title for table in tables] == [
         "Gains and time constants",
-        "Error in free run",
+        TITLE,
         "Errors of the fit: zero from the data",
     ]
     for shown in (page, found._repr_html_(), found.summary()):
