@@ -120,7 +120,12 @@ USERS = {
         Command("check", "validate a configuration without opening devices", "check --config machine.toml"),
         Command("probe", "read every device once", "probe --config machine.toml"),
         Command("run", "run the service", "run --config machine.toml"),
-        Command("completion", "print a script by which a shell completes commands and options", "completion bash"),
+        Command(
+            "completion",
+            "print a script by which a shell completes commands and options",
+            "completion bash",
+            "completion:run",
+        ),
     ),
 }
 COMMANDS = tuple(command for commands in USERS.values() for command in commands)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from datetime import UTC, datetime
 
-from compensator.clock import NS
+from compensator.clock import NS, SystemClock
 
 
 def here(time_ns: int) -> datetime:
@@ -40,3 +40,8 @@ def shown(t_s: float) -> str:
 def zone_at(t_s: float) -> str:
     """Return the zone that `shown` is in, such as `UTC`."""
     return "UTC" if math.isnan(t_s) else zone(here(round(t_s * NS)))
+
+
+def today() -> str:
+    """Return today's date in this computer's zone."""
+    return f"{here(SystemClock().utc_ns()):%Y-%m-%d}"

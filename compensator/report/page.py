@@ -15,11 +15,13 @@ from itertools import chain, count, repeat
 from pathlib import Path
 from typing import Literal
 
+from compensator import __version__
 from compensator.atomic_write import atomic_write
 from compensator.codes import explain
 from compensator.display import Cell, CodeLink, Link, Listing, Table, Words, sentence_of, text_of, warnings_of
 from compensator.report.drawing import svg
-from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
+from compensator.report.figure import Bar, Figure, Line, Marks, Span, Stems, Strip
+from compensator.report.local_time import today
 
 Tone = Literal["good", "warn", "bad"]
 #: Widths of a single figure and of one in a row, inches: the text of both stays readable.
@@ -69,21 +71,26 @@ class Page:
         The content, in order.
     tone : {"good", "warn", "bad"}
         Shown with the verdict as a sign, a word and a colour.
+    data : str
+        Names of the data that it is made from, for its last line.
     """
 
     title: str
     verdict: str
     blocks: Sequence[Block] = field(default_factory=tuple)
     tone: Tone = "good"
+    data: str = ""
 
 
-def html_of(page: Page) -> str:
+def html_of(page: Page, *, date: str = "") -> str:
     """Return a page as HTML.
 
     Parameters
     ----------
     page : Page
         Its content.
+    date : str
+        Date for its last line.
     """
     style = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
     title = html.escape(page.title)
@@ -94,8 +101,14 @@ def html_of(page: Page) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style></head><body>'
         f'<main><h1>{title}</h1><p class="verdict {page.tone}"><b>{TONE_WORDS[page.tone]}</b>'
-        f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}</main></body></html>"
+        f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}{_origin(page, date)}</main></body></html>"
     )
+
+
+def _origin(page: Page, date: str) -> str:
+    """Return the last line: version, date, data."""
+    parts = [f"compensator {__version__}", date, f"data: {page.data}" if page.data else ""]
+    return f'<p class="note">{html.escape(", ".join(filter(None, parts)))}.</p>'
 
 
 def write_page(path: Path, page: Page) -> Path:
@@ -114,7 +127,7 @@ def write_page(path: Path, page: Page) -> Path:
         The same path.
     """
     with atomic_write(path) as file:
-        file.write(html_of(page))
+        file.write(html_of(page, date=today()))
     return path
 
 
@@ -233,6 +246,7 @@ def _inline(cell: Cell) -> str:
 
 # Figures are blocks of a page, too.
 __all__ = [
+    "Bar",
     "Block",
     "Cell",
     "CodeLink",
