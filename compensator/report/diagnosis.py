@@ -145,8 +145,8 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         y_label="residual, µm",
         lines=tuple(lines),
         edges=time.edges,
-        note="Measured − predicted: each block was left out of the search that predicts it. At the dashed edges another "
-        "search predicts: a jump there is none of the machine." + time.note,
+        note="Measured − predicted: each block was left out of the search that predicts it. At the dashed edges "
+        "another search predicts: a jump there is none of the machine." + time.note,
     )
 
 
