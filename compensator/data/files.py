@@ -88,16 +88,19 @@ def _lines(path: Path, text: str, roles: Mapping[str, str]) -> tuple[list[list[s
         lines, first, separators = lines[1:], 3, excel[1]
     else:
         separators = ",;\t"
+    separator = next((one for one in separators if time_names(roles) & _names(lines[:1], one)), ",")
     try:
-        for separator in separators:
-            header = next(csv.reader(lines[:1], delimiter=separator), [])
-            if time_names(roles) & {name.strip() for name in header}:
-                break
-        else:
-            separator = ","
         return list(csv.reader(lines, delimiter=separator)), first, separator
     except csv.Error as error:
         raise DataError(f"{path}: not a CSV table: {error}") from error
+
+
+def _names(header: Sequence[str], separator: str) -> set[str]:
+    """Return the names of a header; none if it cannot be split so."""
+    try:
+        return {name.strip() for name in next(csv.reader(header, delimiter=separator), [])}
+    except csv.Error:
+        return set()
 
 
 def _header(path: Path, cells: Sequence[str], roles: Mapping[str, str]) -> list[str]:
