@@ -44,6 +44,8 @@ class ComparisonResult(Paged):
         Hour from which samples were compared.
     samples : int
         Number of samples compared.
+    data : str
+        Names of the data.
     in_frame : bool
         Whether tables are DataFrames.
     """
@@ -54,6 +56,7 @@ class ComparisonResult(Paged):
     t_h: Vector
     from_h: float
     samples: int
+    data: str = ""
     in_frame: bool = False
 
     @property
@@ -120,7 +123,7 @@ class ComparisonResult(Paged):
             y_label="measured − predicted, µm",
             # The first colour is that of the measured curve above.
             lines=(
-                Line("no error", self.t_h[[0, -1]], self.t_h[[0, -1]] * 0.0),
+                Line("zero", self.t_h[[0, -1]], self.t_h[[0, -1]] * 0.0),
                 *(Line(name, self.t_h, self.residuals[name]) for name in predicted),
             ),
             height=2.6,
@@ -131,11 +134,17 @@ class ComparisonResult(Paged):
             y_label="Y, µm",
             lines=tuple(lines),
             below=(residuals,),
-            note=NOTE,
+            note="Above measured and predicted deformation, below measured − predicted.",
         )
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)
         tone: Any = "good" if best in self._models else "bad"
-        return Page(title="Comparison of models", verdict=self._verdict(), blocks=[*self.tables(), figure], tone=tone)
+        return Page(
+            title="Comparison of models",
+            verdict=self._verdict(),
+            blocks=[*self.tables(), figure],
+            tone=tone,
+            data=self.data,
+        )
 
     def plot(self) -> Plot:
         """Plot measured and predicted deformation, and the error of each model, over time."""
@@ -193,5 +202,6 @@ def compare(
         t_h=runs.t_h,
         from_h=from_h,
         samples=runs.samples,
+        data=", ".join(dict.fromkeys(one.label for one in measured)),
         in_frame=any(one.in_frame for one in measured),
     )
