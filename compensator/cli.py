@@ -7,17 +7,21 @@ data, 3 an audit found a difference.
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import json
 import logging
+import re
+import shutil
 import sys
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from compensator import __version__
 from compensator.blas import one_thread_from_start
 from compensator.commands import Answer, arguments
 from compensator.commands.stopping import stoppable
+from compensator.commands.wrapping import wrapped
 from compensator.errors import CompensatorError
 from drivers.errors import DriverError
 
@@ -55,6 +59,11 @@ USERS = {
     "calibration engineer": (
         Command("identify", "fit a model to measured runs", "identify run.csv --validate other.csv --out model.toml"),
         Command("simulate", "run a model over measured data", "simulate run.csv --model quill --out predicted.csv"),
+        Command(
+            "compare",
+            "compare models on the same measured data",
+            "compare run.csv --model model.toml --model diagnosis/model.toml --page comparison.html",
+        ),
         Command(
             "diagnose",
             "find what a model lacks, from measured data",
@@ -112,6 +121,12 @@ USERS = {
         Command("check", "validate a configuration without opening devices", "check --config machine.toml"),
         Command("probe", "read every device once", "probe --config machine.toml"),
         Command("run", "run the service", "run --config machine.toml"),
+        Command(
+            "completion",
+            "print a script by which a shell completes commands and options",
+            "completion bash",
+            "completion:run",
+        ),
     ),
 }
 COMMANDS = tuple(command for commands in USERS.values() for command in commands)
@@ -143,7 +158,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     if answer is None:
         return 0
-    sys.stdout.write((json.dumps(answer.result) if given.json else answer.text) + "\n")
+    text = json.dumps(answer.result) if given.json else answer.text
+    if sys.stdout.isatty() and not given.json:
+        text = wrapped(text, shutil.get_terminal_size().columns)
+    sys.stdout.write(f"{text}\n")
     return answer.code
 
 
@@ -162,11 +180,32 @@ def _in_words(error: Exception) -> str:
     return str(error)
 
 
+def _did_you_mean(word: str, names: Sequence[str]) -> str:
+    """Return a question for the names that are like a word; empty if there are none."""
+    near = difflib.get_close_matches(word.partition("=")[0].lower(), names, n=2)
+    return f"; did you mean {' or '.join(near)}?" if near else ""
+
+
 class _Parser(argparse.ArgumentParser):
     """Argument parser that reports wrong usage in one line, like every other error."""
 
+    _words: Sequence[str] = ()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Keep the words, so that an error can name an option that was mistyped."""
+        self._words = sys.argv[1:] if args is None else args
+        return super().parse_known_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
         """End with exit code 2."""
+        wrong = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
+        if wrong is not None and (near := _did_you_mean(wrong[1], re.findall(r"[^', ]+", wrong[2]))):
+            message = f"{message[: wrong.start()]}{wrong[1]!r} is unknown{near}"
+        options = [name for action in self._actions for name in action.option_strings]
+        for word in self._words:
+            name = word.partition("=")[0]
+            if name.startswith("--") and not any(option.startswith(name) for option in options):
+                message += _did_you_mean(name, options)
         self.exit(2, f"{self.prog}: {message}; `{self.prog} --help` lists all options\n")
 
 
@@ -190,6 +229,14 @@ def _parser() -> argparse.ArgumentParser:
         one.add_argument("--json", action="store_true", help="print the result as JSON")
         command.describe(one)
     return parser
+
+
+def options_of(command: Command) -> list[str]:
+    """Return the options of a command, each by its longest name."""
+    parser = _Parser(command.name)
+    command.describe(parser)
+    found = [max(action.option_strings, key=len) for action in parser._actions if action.option_strings]
+    return [*found, "--json", "--debug"]
 
 
 def _overview() -> str:

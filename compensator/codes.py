@@ -550,6 +550,11 @@ class DataRemark(Code):
         "Measured values of Y were far from the prediction and agreed with each other; the prediction follows them.",
         "Find out what moved: a collision, a new clamping, or another feature.",
     )
+    NOT_VALIDATED = (
+        "not_validated",
+        "The validation data lack a channel of the extended model; only the base model was validated on them.",
+        "Validate on data with this channel.",
+    )
 
 
 class ServiceWarning(Code):
@@ -945,6 +950,63 @@ WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
 )
 
 
+#: Code with its suffix → (meaning, action), where the suffix calls for words of its own.
+SUFFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        f"{Reason.IMPLAUSIBLE}:t_q_degc": (
+            "Measured and predicted Y diverge as they would if T_Q were wrong; the model, too, may lack something.",
+            "Compare T_Q with a second thermometer at the same place; check couple, terminals and mounting. If it is "
+            "right, run `compensator diagnose` on the recordings.",
+        ),
+        f"{Reason.IMPLAUSIBLE}:at_degc": (
+            "Measured and predicted Y diverge as they would if AT were wrong; the model, too, may lack something.",
+            "Compare AT with the air beside the machine; look for sun, draught or coolant mist on the sensor. If it is "
+            "right, run `compensator diagnose` on the recordings.",
+        ),
+        f"{Reason.IMPLAUSIBLE}:y_um": (
+            "Measured and predicted Y diverge as they would if the displacement sensor were wrong; the offset does not "
+            "use it.",
+            "Check the displacement sensor for chips, coolant and a loose mount; until then do not calibrate with it.",
+        ),
+        f"{Reason.IMPLAUSIBLE}:model": (
+            "Measured and predicted Y diverge, and no sensor explains it: the model lacks an effect.",
+            "Run `compensator diagnose` on the recordings, then `compensator adopt`.",
+        ),
+        f"{Reason.SUSPECT_CHANNEL}:t_q_degc": (
+            "T_Q has jumped and is not used until it returns, or until the model or measured Y agrees with it.",
+            "Check the couple of T_Q and its plug; if it is right, send resume; if it was replaced, send zero.",
+        ),
+        f"{Reason.SUSPECT_CHANNEL}:at_degc": (
+            "AT has jumped and is not used until it returns, or until the model or measured Y agrees with it.",
+            "Check the couple of AT and its plug; if it is right, send resume; if it was replaced, send zero.",
+        ),
+        f"{Reason.OUTSIDE_VALIDITY}:t_q_degc": (
+            "T_Q is outside the range in which the machine was calibrated.",
+            "Bring the machine back into the range, or calibrate over a wider one.",
+        ),
+        f"{Reason.OUTSIDE_VALIDITY}:at_degc": (
+            "AT is outside the range in which the machine was calibrated.",
+            "Bring the air of the shop back into the range, or calibrate over a wider one.",
+        ),
+        f"{Reason.OUTSIDE_VALIDITY}:heat_w": (
+            "The heat is outside the range in which the machine was calibrated.",
+            "Run slower, or calibrate at this speed and load.",
+        ),
+    }
+)
+
+
+def explained_by(code: str) -> str:
+    """Return the code whose words explain another one: itself with its suffix where that has its own, or without it.
+
+    Examples
+    --------
+    >>> explained_by("implausible:y_um"), explained_by("channel_missing:coolant_degc")
+    ('implausible:y_um', 'channel_missing')
+    """
+    return code if code in SUFFIX_WORDS else code.partition(":")[0]
+
+
 def explain(code: str) -> tuple[str, str] | None:
     """Return the meaning and the action of a code, or None if it is unknown.
 
@@ -953,4 +1015,4 @@ def explain(code: str) -> tuple[str, str] | None:
     >>> explain("ok")[1]
     'Nothing.'
     """
-    return WORDS.get(code.partition(":")[0])
+    return SUFFIX_WORDS.get(code) or WORDS.get(code.partition(":")[0])

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from compensator.codes import Remark
+from compensator.codes import Remark, explained_by
 
 #: Cells of a column of numbers: digits, signs, errors, percent, and dashes for missing values.
 _NUMBER = re.compile(
@@ -28,8 +28,8 @@ class CodeLink:
 
     @property
     def word(self) -> str:
-        """The code without its subject."""
-        return self.code.split(":", maxsplit=1)[0]
+        """The code whose words explain it."""
+        return explained_by(self.code)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +127,37 @@ class Words:
         return f"<p>{html.escape(self.title)}</p><ul>{lines}</ul>"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Listing:
+    """Lines to copy, such as those of a configuration.
+
+    Parameters
+    ----------
+    title : str
+        A sentence above.
+    lines : str
+        The lines, as they are pasted.
+    """
+
+    title: str
+    lines: str
+
+    def text(self) -> str:
+        """Return the sentence and the lines."""
+        return f"{self.title}:\n{self.lines}"
+
+    def html(self) -> str:
+        """Return the listing as HTML without style, for a notebook."""
+        return f"<p>{html.escape(self.title)}</p><pre>{html.escape(self.lines)}</pre>"
+
+
 class Shown:
     """A result with a display: text by `summary()` and `repr`, HTML in a notebook."""
 
     __slots__ = ()
 
-    def contents(self) -> Sequence[str | Table | Words]:
-        """Return the content: sentences, tables, and lists of sentences, in order."""
+    def contents(self) -> Sequence[str | Table | Words | Listing]:
+        """Return the content: sentences, tables, lists of sentences, and lines to copy, in order."""
         raise NotImplementedError
 
     def tables(self) -> list[Table]:
@@ -153,7 +177,7 @@ class Shown:
         )
 
 
-def text_of_all(parts: Iterable[str | Table | Words]) -> str:
+def text_of_all(parts: Iterable[str | Table | Words | Listing]) -> str:
     """Return sentences, tables and lists as text, an empty line between them."""
     return "\n\n".join(part if isinstance(part, str) else part.text() for part in parts)
 

@@ -240,6 +240,9 @@ class Status(Message, frozen=True, kw_only=True):
         The tolerance with which it is compared, µm.
     loop : LoopStatus, optional
         How the loop is; only with `[loop]` in the configuration.
+    predicts_until_utc_ns : int, optional
+        Time of the sample from which on the offset is held if the missing temperature does not return, ns since 1970
+        UTC; only while the model predicts.
     """
 
     state: State
@@ -258,6 +261,7 @@ class Status(Message, frozen=True, kw_only=True):
     wanted_std_um: float | UnsetType | None = UNSET
     wanted_tolerance_um: float | UnsetType | None = UNSET
     loop: LoopStatus | UnsetType = UNSET
+    predicts_until_utc_ns: int | UnsetType = UNSET
 
 
 # No control characters, line ends or marks of the direction; `$` would accept a line end after the last character, and

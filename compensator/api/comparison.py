@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from compensator.api.files import ModelLike, Paged, model_of
-from compensator.arrays import Mask, Vector
+from compensator.arrays import Vector
+from compensator.atomic_write import atomic_write
 from compensator.blas import one_thread
 from compensator.data.frames import frame_of
 from compensator.data.measurement import DataLike, measurements
-from compensator.data.record import require
 from compensator.display import Table
 from compensator.errors import DataError, UsageError
-from compensator.model.simulation import SCORE_HEAD, Scores, require_channels, scores, simulate
+from compensator.model.free_run import NOTE, NOTHING, PERSISTENCE, TITLE, free_runs, in_words
+from compensator.model.simulation import FREE_RUN_HEAD, Scores, csv_rows
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
     from compensator.report.page import Page
-
-#: References with which every model is compared.
-NOTHING, PERSISTENCE = "no compensation", "persistence"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False, eq=False)
@@ -37,24 +36,37 @@ class ComparisonResult(Paged):
         Scores of each model by name, of no compensation, and of persistence (the last Y measured before the samples).
     residuals : dict of str to numpy.ndarray, shape (n,)
         Measured − predicted of each, µm; NaN outside the samples.
+    y_um : numpy.ndarray, shape (n,)
+        Measured deformation from its first value, µm; NaN outside the samples.
     t_h : numpy.ndarray, shape (n,)
         Time, h; files follow each other.
     from_h : float
         Hour from which samples were compared.
+    samples : int
+        Number of samples compared.
+    data : str
+        Names of the data.
     in_frame : bool
         Whether tables are DataFrames.
     """
 
     scores: dict[str, Scores]
     residuals: dict[str, Vector]
+    y_um: Vector
     t_h: Vector
     from_h: float
+    samples: int
+    data: str = ""
     in_frame: bool = False
 
     @property
-    def samples(self) -> int:
-        """Number of samples compared."""
-        return int(np.sum(np.isfinite(self.residuals[NOTHING])))
+    def predictions(self) -> dict[str, Vector]:
+        """Predicted deformation of each model, shape (n,), µm; NaN outside the samples."""
+        return {name: self.y_um - self.residuals[name] for name in self._models}
+
+    @property
+    def _models(self) -> list[str]:
+        return [name for name in self.scores if name not in (NOTHING, PERSISTENCE)]
 
     @property
     def table(self) -> Any:
@@ -71,31 +83,77 @@ class ComparisonResult(Paged):
         return {"from_h": self.from_h, "samples": self.samples, "scores": found}
 
     def contents(self) -> list[str | Table]:
-        """Return the content: the number of samples, and the errors of each model."""
-        table = Table(
-            title="Errors on the same samples",
-            head=["", *SCORE_HEAD],
-            rows=[[name, *row.cells()] for name, row in self.scores.items()],
-        )
-        return [f"{self.samples} samples in free run" + (f" from {self.from_h:g} h on" if self.from_h else ""), table]
+        """Return the content: the verdict, the number of samples, and the errors of each model."""
+        rows = [[name, *row.free_run_cells()] for name, row in self.scores.items()]
+        return [self._verdict(), Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=rows, note=NOTE)]
+
+    def _verdict(self) -> str:
+        best = min(self.scores, key=lambda name: self.scores[name].rms_um)
+        from_hour = f" from {self.from_h:g} h on" if self.from_h else ""
+        words = best
+        if best in self._models:
+            words = f"{best}, {in_words({name: dataclasses.asdict(row) for name, row in self.scores.items()}, best)}"
+        return f"Smallest error: {words}; {self.samples} samples{from_hour}."
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write time, measured Y, and each prediction and residual as CSV; cells outside the samples are empty.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        columns = {"t_s": self.t_h * 3600.0, "y_um": self.y_um}
+        for name, values in self.predictions.items():
+            columns |= {f"y_pred_um {name}": values, f"residual_um {name}": self.residuals[name]}
+        with atomic_write(Path(path)) as file:
+            csv.writer(file, lineterminator="\n").writerows(csv_rows(columns))
+        return Path(path)
 
     def as_page(self) -> Page:
         """Return the content of the page."""
         from compensator.report.page import Figure, Line, Page
 
-        lines = tuple(Line(name, self.t_h, values) for name, values in self.residuals.items())
-        figure = Figure(title="Error in free run", x_label="time, h", y_label="measured − predicted, µm", lines=lines)
-        samples = self.contents()[0]
+        predicted = self.predictions
+        lines = [Line("measured", self.t_h, self.y_um)]
+        lines += [Line(name, self.t_h, values) for name, values in predicted.items()]
+        residuals = Figure(
+            title="",
+            x_label="time, h",
+            y_label="measured − predicted, µm",
+            # The first colour is that of the measured curve above.
+            lines=(
+                Line("zero", self.t_h[[0, -1]], self.t_h[[0, -1]] * 0.0),
+                *(Line(name, self.t_h, self.residuals[name]) for name in predicted),
+            ),
+            height=2.6,
+        )
+        figure = Figure(
+            title="Measured and predicted deformation in free run, and the residuals",
+            x_label="time, h",
+            y_label="Y, µm",
+            lines=tuple(lines),
+            below=(residuals,),
+            note="Above measured and predicted deformation, below measured − predicted.",
+        )
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)
-        words = f"Smallest error: {best}, {self.scores[best].rms_um:.2f} µm rms. {samples}."
-        return Page(title="Comparison of models", verdict=words, blocks=[figure, *self.tables()], tone="good")
+        tone: Any = "good" if best in self._models else "bad"
+        return Page(
+            title="Comparison of models",
+            verdict=self._verdict(),
+            blocks=[*self.tables(), figure],
+            tone=tone,
+            data=self.data,
+        )
 
     def plot(self) -> Plot:
-        """Plot the error of each model over time."""
+        """Plot measured and predicted deformation, and the error of each model, over time."""
         from compensator.api.plotting import stacked
 
-        curves = [(name, self.t_h, values) for name, values in self.residuals.items()]
-        return stacked([("measured − predicted, µm", curves)])[0]
+        curves = [("measured", self.t_h, self.y_um)]
+        curves += [(name, self.t_h, values) for name, values in self.predictions.items()]
+        residuals = [(name, self.t_h, values) for name, values in self.residuals.items()]
+        return stacked([("Y, µm", curves), ("measured − predicted, µm", residuals)])[0]
 
 
 @one_thread
@@ -118,7 +176,7 @@ def compare(
     Returns
     -------
     ComparisonResult
-        rms, peak to peak and fit of each model, of no compensation, and of persistence.
+        Errors of each model, of no compensation, and of persistence.
 
     Raises
     ------
@@ -134,40 +192,16 @@ def compare(
     if len(periods) != 1:
         raise UsageError(f"compare: {len(found)} model(s) of {len(periods)} sample periods, expected models of one")
     measured = measurements(data, "data", columns, needed=True)
-    times: list[Vector] = []
-    parts: dict[str, list[Vector]] = {name: [] for name in ("y", *found, NOTHING, PERSISTENCE)}
-    begin_h = 0.0
-    for one in measured:
-        for record in one.at_period(periods.copy().pop()).records:
-            require(one.name, record, ("t_q_degc", "at_degc", "y_um"))
-            for model in found.values():
-                require_channels(model, record, one.name)
-            runs = {name: simulate(model, record, source=one.name) for name, model in found.items()}
-            residuals = {name: run["residual_um"] for name, run in runs.items()}
-            y = next(iter(runs.values()))["y_um"]
-            known = np.all([np.isfinite(values) for values in (y, *residuals.values())], axis=0)
-            scored = known & (record.t_s >= from_h * 3600.0)
-            residuals |= {NOTHING: y, PERSISTENCE: y - _last_before(y, known, scored)}
-            parts["y"].append(np.where(scored, y, np.nan))
-            for name, values in residuals.items():
-                parts[name].append(np.where(scored, values, np.nan))
-            times.append(record.t_s / 3600.0 + begin_h)
-        begin_h += one.hours
-    joined = {name: np.concatenate(values) for name, values in parts.items()}
-    y = joined.pop("y")
-    if not np.isfinite(y).any():
+    runs = free_runs(found, measured, from_h=from_h)
+    if not runs.samples:
         raise DataError(f"{measured[0].name}: no y_um from {from_h:g} h on, expected measured Y")
     return ComparisonResult(
-        scores={name: scores(y, y - residual) for name, residual in joined.items()},
-        residuals=joined,
-        t_h=np.concatenate(times),
+        scores=runs.scores,
+        residuals=runs.residuals,
+        y_um=runs.y_um,
+        t_h=runs.t_h,
         from_h=from_h,
+        samples=runs.samples,
+        data=", ".join(dict.fromkeys(one.label for one in measured)),
         in_frame=any(one.in_frame for one in measured),
     )
-
-
-def _last_before(y: Vector, known: Mask, scored: Mask) -> float:
-    """Return the last value measured before the scored samples; the first of all if there is none."""
-    before = y[known & (np.arange(y.size) < (int(np.argmax(scored)) if scored.any() else y.size))]
-    first = y[known][:1]
-    return float(before[-1] if before.size else first[0] if first.size else np.nan)

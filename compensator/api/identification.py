@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -10,18 +11,20 @@ from compensator import __version__
 from compensator.api.files import ModelLike, as_in_file, model_of
 from compensator.api.identification_result import IdentificationResult
 from compensator.blas import one_thread
-from compensator.data.measurement import PERIOD_S, DataLike, Measurement, measurements, runs_in
+from compensator.data.measurement import PERIOD_S, DataLike, Measurement, check_validation, measurements, runs_in
 from compensator.data.screening import require_y_noise, screen_temperatures
 from compensator.errors import UsageError
 from compensator.identify.calibration import calibrate
 from compensator.identify.comparison import compare
 from compensator.identify.criticism import criticise
 from compensator.identify.settings import Method, Settings
-from compensator.identify.summary import figures
+from compensator.identify.summary import MODEL, figures
+from compensator.model.free_run import FreeRunErrors
+from compensator.model.thermal_model import ThermalModel
 from compensator.progress import Progress, unreported
 
 #: Figures that a model file keeps in its provenance.
-_KEPT = ("method", "parts", "warnings", "remarks", "ttf")
+_KEPT = ("method", "free_run", "parts", "warnings", "remarks", "ttf")
 _DEFAULT = Settings()
 
 
@@ -108,7 +111,7 @@ def identify(
         role: measurements(given, name, columns, needed=role == "fit")
         for role, name, given in (("fit", "data", data), ("etve", "etve", etve), ("validation", "validate", validate))
     }
-    _check_validation(sources)
+    check_validation([*sources["fit"], *sources["etve"]], sources["validation"])
     remarks: list[str] = []
     runs = {}
     for role, measured in sources.items():
@@ -130,15 +133,28 @@ def identify(
         progress=progress,
     )
     criticism = criticise(calibration)
-    found = figures(calibration, criticism)
+    free_run = _free_run(calibration.model, sources, fit_until_h)
+    found = figures(calibration, criticism, free_run)
     model = as_in_file(calibration.model, {key: found[key] for key in _KEPT if key in found})
     return IdentificationResult(
         model=model,
         calibration=calibration,
         criticism=criticism,
         comparison=tuple(compare(model, model_of(reference))) if reference is not None else (),
+        free_run=free_run,
         in_frame=any(measured.in_frame for measured in sources["fit"]),
     )
+
+
+def _free_run(
+    model: ThermalModel, sources: Mapping[str, Sequence[Measurement]], fit_until_h: float | None
+) -> tuple[FreeRunErrors, ...]:
+    """Return the errors in free run on each of the data that has measured Y, fitted ones first."""
+    until_h = math.inf if fit_until_h is None else fit_until_h
+    found = [FreeRunErrors.of({MODEL: model}, [one], "fitted", until_h=until_h) for one in sources["fit"]]
+    found += [FreeRunErrors.of({MODEL: model}, [one], "held out", from_h=until_h) for one in sources["fit"]]
+    found += [FreeRunErrors.of({MODEL: model}, [one], "held out") for one in sources["validation"]]
+    return tuple(one for one in found if one.samples)
 
 
 def _orders(name: str, meaning: str, values: Sequence[int]) -> tuple[int, int, int]:
@@ -155,16 +171,6 @@ def _gain_and_time(tdtf: Sequence[float]) -> tuple[float, float]:
     except (TypeError, ValueError) as error:
         raise UsageError(f"tdtf {tdtf!r}, expected two numbers: gain in µm/K and time constant in min") from error
     return gain, tau_min
-
-
-def _check_validation(sources: Mapping[str, Sequence[Measurement]]) -> None:
-    """Refuse to validate a model on fitted data, or a copy of them."""
-    fitted = {origin.sha256 for role in ("fit", "etve") for measured in sources[role] for origin in measured.origins}
-    for measured in sources["validation"]:
-        for origin in measured.origins:
-            if origin.sha256 in fitted:
-                named = origin.path or origin.name
-                raise UsageError(f"--validate {named}: is used for the fit, expected another run")
 
 
 def _provenance(

@@ -18,6 +18,7 @@ from compensator.identify.calibration import Calibration, joined
 from compensator.identify.comparison import Row
 from compensator.identify.criticism import Criticism
 from compensator.identify.summary import contents, estimates, figures
+from compensator.model.free_run import FreeRunErrors
 from compensator.model.model_writer import write_model
 from compensator.model.thermal_model import ThermalModel
 
@@ -40,6 +41,8 @@ class IdentificationResult(Paged):
         Step, impulse and frequency responses, correlations of the residuals, warnings.
     comparison : tuple of Row
         Coefficients compared with those of a reference model; empty without one.
+    free_run : tuple of FreeRunErrors
+        Errors in free run as the service runs, on each of the data.
     in_frame : bool
         Whether tables are DataFrames.
     """
@@ -48,6 +51,7 @@ class IdentificationResult(Paged):
     calibration: Calibration
     criticism: Criticism
     comparison: tuple[Row, ...] = ()
+    free_run: tuple[FreeRunErrors, ...] = ()
     in_frame: bool = False
 
     @property
@@ -76,11 +80,11 @@ class IdentificationResult(Paged):
 
     def contents(self) -> list[str | Table | Words]:
         """Return the content: verdict, parameters, errors in free run, warnings."""
-        return list(contents(self.calibration, self.criticism, self.comparison))
+        return list(contents(self.calibration, self.criticism, self.comparison, self.free_run))
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures, as `compensator identify --json` prints them."""
-        found = figures(self.calibration, self.criticism)
+        found = figures(self.calibration, self.criticism, self.free_run)
         if self.comparison:
             found["comparison"] = [dataclasses.asdict(row) for row in self.comparison]
         return found
@@ -102,7 +106,7 @@ class IdentificationResult(Paged):
         """Return the content of the page."""
         from compensator.report.identification import page_of
 
-        return page_of(self.calibration, self.criticism, self.model, self.comparison)
+        return page_of(self.calibration, self.criticism, self.model, self.comparison, self.free_run)
 
     def plot(self) -> Plot:
         """Plot measured and predicted deformation, and the residual; held-out parts are shaded."""

@@ -92,12 +92,14 @@ def simulate(
             parts.append(run.table)
     order = CORRECTED_COLUMNS if correct else COLUMNS
     methods = _methods(corrected)
+    free = None if correct else _scores(parts)
     result = SimulationResult(
         table={name: _joined(parts, name) for name in order if any(name in part for part in parts)},
         records=len(parts),
         remarks=tuple(remarks),
-        scores=(methods[-1][1] if methods else None) if correct else _scores(parts),
+        scores=(methods[-1][1] if methods else None) if free is None else free[0],
         beside=dict(methods[:-1]),
+        nothing=None if free is None else free[1],
     )
     if not any(one.in_frame for one in measured):
         return result
@@ -112,10 +114,12 @@ def _joined(parts: list[dict[str, Vector]], name: str) -> Vector:
     return np.concatenate([part.get(name, np.full(part["t_s"].size, np.nan)) for part in parts])
 
 
-def _scores(parts: list[dict[str, Vector]]) -> Scores | None:
+def _scores(parts: list[dict[str, Vector]]) -> tuple[Scores, Scores] | None:
+    """Return the errors of the model and of no compensation on the same samples; None without measured Y."""
     if not any("y_um" in part for part in parts):
         return None
-    return scores(_joined(parts, "y_um"), _joined(parts, "y_pred_um"))
+    y, predicted = _joined(parts, "y_um"), _joined(parts, "y_pred_um")
+    return scores(y, predicted), scores(y, np.where(np.isfinite(predicted), 0.0, np.nan))
 
 
 def _y_std(one: Measurement, record: SampledRecord, period_s: float, given: float | None) -> Vector:

@@ -13,7 +13,8 @@ from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
 from compensator.codes import Remark
 from compensator.display import Shown, Table, Words, text_of_all, warnings_of
-from compensator.model.simulation import SCORE_HEAD, Scores, csv_rows
+from compensator.model.free_run import NOTE, NOTHING, TITLE, in_words
+from compensator.model.simulation import FREE_RUN_HEAD, SCORE_HEAD, Scores, csv_rows
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -36,6 +37,8 @@ class SimulationResult(Shown, Mapping[str, Vector]):
     beside : dict of str to Scores
         Of a corrected run: the same without compensation, with the last measured Y held, and of the model alone.
         All are then of the measured rows after the first, each predicted from earlier rows.
+    nothing : Scores or None
+        Of a free run: the same without compensation.
     """
 
     table: dict[str, Vector]
@@ -43,6 +46,7 @@ class SimulationResult(Shown, Mapping[str, Vector]):
     remarks: tuple[Remark, ...]
     scores: Scores | None
     beside: dict[str, Scores] = field(default_factory=dict)
+    nothing: Scores | None = None
 
     def __getitem__(self, name: str) -> Vector:
         return self.table[name]
@@ -60,6 +64,8 @@ class SimulationResult(Shown, Mapping[str, Vector]):
             found |= asdict(self.scores)
         if self.beside:
             found["beside"] = {name: asdict(row) for name, row in self.beside.items()}
+        if self.nothing is not None:
+            found["no_compensation"] = asdict(self.nothing)
         return found
 
     def contents(self) -> list[str | Table | Words]:
@@ -70,8 +76,12 @@ class SimulationResult(Shown, Mapping[str, Vector]):
             rows = [[name, *row.cells()] for name, row in (*self.beside.items(), ("model corrected", self.scores))]
             title = "Errors at the measured rows after the first, each predicted from earlier rows"
             parts.append(Table(title=title, head=["", *SCORE_HEAD], rows=rows))
-        elif self.scores is not None:
-            parts.append(Table(head=["", *SCORE_HEAD], rows=[["measured − predicted", *self.scores.cells()]]))
+        elif self.scores is not None and self.nothing is not None:
+            by_name = {"model": self.scores, NOTHING: self.nothing}
+            words = in_words({name: asdict(row) for name, row in by_name.items()}, "model")
+            parts.append(f"{words[0].upper()}{words[1:]}.")
+            cells = [[name, *row.free_run_cells()] for name, row in by_name.items()]
+            parts.append(Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=cells, note=NOTE))
         elif "y_free_um" in self.table:
             parts.append("No errors: after the first measured Y, which is the zero, none was measured and taken.")
         return [*parts, *warnings_of(self.remarks, "Remarks")]

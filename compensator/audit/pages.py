@@ -13,6 +13,7 @@ from compensator.audit.comparison import Comparison, worst_utc
 from compensator.audit.findings import Difference, utc
 from compensator.audit.result import RecordingAudit
 from compensator.audit.series import Audit
+from compensator.audit.verdict import partly, verdict
 from compensator.codes import AuditFinding, RecordingEnd
 from compensator.recording.chain import NOTHING
 from compensator.report.envelope import Envelope, line_of
@@ -72,29 +73,8 @@ def audit_page(found: Audit) -> Page:
     return Page(title=title, verdict=verdict(found), blocks=blocks, tone=_tone(found))
 
 
-def verdict(found: Audit) -> str:
-    """Return the verdict in one sentence, with the number of samples and files."""
-    files = f"{len(found.files)} recording(s)"
-    if not found.clean:
-        wrong = []
-        if found.findings_count:
-            wrong.append(f"{found.findings_count} finding(s)")
-        if found.differing:
-            wrong.append(f"{found.differing} sample(s) that differ in the replay")
-        return f"Not proven: {' and '.join(wrong)} in {files} with {found.samples} samples."
-    if _partly(found):
-        return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
-    words = f"Proven: {found.samples} samples in {files} are unchanged, and the replay reproduces every offset"
-    return words + (", signed with the given key." if found.signed else "; no signature was checked.")
-
-
-def _partly(found: Audit) -> bool:
-    """Return whether a part could not be checked."""
-    return not found.samples or any(not file.last or file.not_replayed for file in found.files)
-
-
 def _tone(found: Audit) -> Tone:
-    return "bad" if not found.clean else "warn" if _partly(found) else "good"
+    return "bad" if not found.clean else "warn" if partly(found) else "good"
 
 
 def _span(found: Audit) -> str:

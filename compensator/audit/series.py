@@ -12,6 +12,7 @@ from typing import Any
 from compensator.audit.findings import Difference, Fault, Finding, utc
 from compensator.audit.recording_audit import audit_recording
 from compensator.audit.result import RecordingAudit
+from compensator.audit.verdict import partly, verdict
 from compensator.codes import AuditFinding, AuditRemark, RecordingEnd, Remark
 from compensator.errors import UsageError
 from compensator.recording.chain import NOTHING
@@ -365,14 +366,17 @@ class _Series:
 
 
 def summary(found: Audit) -> str:
-    """Return the verdict in a few lines of text."""
+    """Return the verdict, and what it rests on, in a few lines of text."""
+    sign = "✗" if not found.clean else "⚠" if partly(found) else "✓"
     files, samples = len(found.files), found.samples
     span = ", " + " to ".join(map(utc, found.span_ns)) if found.span_ns else ""
-    lines = [f"{samples} samples of {found.machines} in {files} file(s){span}"]
+    lines = [f"{sign} {verdict(found)}", f"{samples} samples of {found.machines} in {files} file(s){span}"]
     if not samples:
         lines.append("No sample was replayed.")
     elif not found.differing:
-        lines.append("The replay reproduces every estimate and every offset, bit for bit.")
+        every = "of the samples that it could replay" if not found.clean or partly(found) else ""
+        words = ["The replay reproduces every estimate and every offset", every]
+        lines.append(f"{' '.join(filter(None, words))}, bit for bit.")
     else:
         lines.append(f"{found.differing} sample(s) differ in the replay. The first of them:")
         lines += found.difference.lines() if found.difference else []

@@ -59,11 +59,18 @@ def demo(parser: argparse.ArgumentParser) -> None:
 
 
 def run(parser: argparse.ArgumentParser) -> None:
-    """Describe the argument of `run`, `check` and `probe`; `adopt` and `back` have it as well."""
+    """Describe the argument of `run` and `probe`; `adopt` and `back` have it as well."""
     parser.add_argument("--config", required=True, metavar="FILE", help="configuration of the service")
 
 
-check = probe = run
+probe = run
+
+
+def check(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `check`."""
+    run(parser)
+    words = "check whether the service could run this model (a file, or quill) in place of its own"
+    parser.add_argument("--model", metavar="MODEL", help=words)
 
 
 def simulate(parser: argparse.ArgumentParser) -> None:
@@ -84,6 +91,19 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     _column(parser)
 
 
+def compare(parser: argparse.ArgumentParser) -> None:
+    """Describe the arguments of `compare`."""
+    add = parser.add_argument
+    add("data", type=Path, nargs="+", metavar="DATA", help="one or more tables (CSV, MAT), or recordings, with Y")
+    words = "a model file, or quill; repeated for each model"
+    add("--model", action="append", required=True, metavar="MODEL", help=words)
+    words = "compare from this hour of each file on; the models run from its start (0)"
+    add("--from", dest="from_h", type=_number(0.0, 1e6), default=0.0, metavar="H", help=words)
+    add("--out", type=Path, metavar="CSV", help="also write measured Y, predictions and residuals as a table")
+    _page(parser)
+    _column(parser)
+
+
 def loop(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `loop`."""
     add = parser.add_argument
@@ -97,7 +117,7 @@ def loop(parser: argparse.ArgumentParser) -> None:
 
 def export(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `export`."""
-    words = "recordings of one machine, in any order"
+    words = "recordings of one machine in any order, or a folder of them"
     parser.add_argument("recording", type=Path, nargs="+", metavar="FILE.mcap", help=words)
     parser.add_argument("--out", type=Path, required=True, metavar="CSV")
     words = "machine in a shop's recording (watch --record), such as shop/vmc-07"
@@ -111,6 +131,11 @@ def bridge(parser: argparse.ArgumentParser) -> None:
     words = "TOML with [receiver] and [opcua], or with [probes] and its sources"
     parser.add_argument("--config", required=True, metavar="FILE", help=words)
     parser.add_argument("--check", action="store_true", help="check the file without opening a connection")
+
+
+def completion(parser: argparse.ArgumentParser) -> None:
+    """Describe the argument of `completion`."""
+    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help="the shell")
 
 
 def explain(parser: argparse.ArgumentParser) -> None:
@@ -158,7 +183,17 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("data", type=Path, nargs="+", metavar="DATA", help="one or more CSV or MAT files, or recordings")
     add("--model", required=True, help="a model file, or quill")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for diagnosis.json, model.toml and report.html")
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for diagnosis.json, model.toml, report.html and series.csv",
+    )
+    words = "search up to this hour, validate both models on the rest"
+    add("--fit-until", type=_number(0.0, 1e6), metavar="H", help=words)
+    words = "data that take no part in the search, to validate both models; may be repeated"
+    add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
     _page(parser)
     _column(parser)
     _y_std(parser)
@@ -258,6 +293,11 @@ def watch(parser: argparse.ArgumentParser) -> None:
     add("--wait", type=_number(0.0, 86_400.0), default=0.0, metavar="S", help="with --once: how long to listen, s (0)")
     add("--page", action="store_true", help="serve a live page on 127.0.0.1 instead of the terminal view")
     add("--port", type=int, default=8710, help="port of the page (8710; 0: any free port)")
+    words = "with --page: serve it, read only, on this address of the computer, for a tablet at the machine; without "
+    words += "encryption, for whoever has the address that is printed, which ends in a token"
+    add("--bind", metavar="ADDRESS", help=words)
+    words = "with --bind: file with the token, made if it does not exist (default: a new token at each start)"
+    add("--token", type=Path, metavar="FILE", help=words)
     words = "record all messages of all machines as MCAP in this folder"
     add("--record", type=Path, metavar="FOLDER", help=words)
     add("--foxglove", action="store_true", help="serve Foxglove on 127.0.0.1 (needs the extra foxglove)")

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import argparse
 
-from compensator.commands import Answer, log_warnings, warnings_as_json
-from compensator.service.compensation import Compensation
+from compensator.channel_lines import channel_lines
+from compensator.commands import Answer, log, log_warnings, warnings_as_json
+from compensator.model.model_file import read_model_bytes
+from compensator.service.compensation import Compensation, model_of
 from compensator.service.loading import load
+from compensator.service.transfer.model_store import check_model
 
 
 def run(arguments: argparse.Namespace) -> Answer:
     """Run the command."""
     setup = load(arguments.config)
     config, model = setup.config, setup.model
+    if arguments.model is not None:
+        model = model_of(config, read_model_bytes(arguments.model), source=arguments.model)
+    configured = {channel.name for channel in config.channel}
+    if missing := [name for name in model.channels if name not in configured]:
+        return _without_channels(arguments.config, model.name, missing)
     checks = Compensation(config, model).describe_checks()
+    if arguments.model is not None:
+        check_model(config, read_model_bytes(arguments.model), source=arguments.model)
     warnings = setup.warnings()
     log_warnings(arguments.config, warnings)
     machine, devices = config.machine.name, setup.fleet.devices
@@ -39,3 +49,12 @@ def run(arguments: argparse.Namespace) -> Answer:
         "checks": checks,
     }
     return Answer(result, text)
+
+
+def _without_channels(path: str, model: str, missing: list[str]) -> Answer:
+    """Return the lines to paste for the channels that a model needs and the configuration lacks."""
+    words = f"{path}: model {model} needs channel {' and '.join(missing)}, which is not configured"
+    log.error("compensator: %s", words)
+    lines = channel_lines(missing)
+    result = {"ok": False, "model": model, "missing_channels": missing, "lines": lines}
+    return Answer(result, f"# Paste into {path}; name device and input of the sensor.\n{lines}", 2)

@@ -31,6 +31,8 @@ def run(arguments: argparse.Namespace) -> Answer:
         columns=roles_of(given.column),
         y_std_um=given.y_std,
         scheduler=given.scheduler,
+        fit_until_h=given.fit_until,
+        validate=given.validate,
         also=page,
     )
 
@@ -43,17 +45,28 @@ def diagnose_files(
     columns: Mapping[str, str] | None = None,
     y_std_um: float | None = None,
     scheduler: str | None = None,
+    fit_until_h: float | None = None,
+    validate: Sequence[Path] = (),
     also: Path | None = None,
 ) -> Answer:
-    """Diagnose files and write `diagnosis.json`, `model.toml` and `report.html` into a folder."""
-    checked_folder(out, "--out", read=(*data, Path(model)), names=FILES)
+    """Diagnose files and write `diagnosis.json`, `model.toml`, `report.html` and `series.csv` into a folder."""
+    checked_folder(out, "--out", read=(*data, *validate, Path(model)), names=FILES)
     base = model_of(model)
     measured = measurements(data, "data", columns)
     values = sum(one.hours * 3600.0 / base.period_s * len(one.table.columns) for one in measured)
     with progress_bar("searching") as progress, workers(FOLDS if values > ALONE else 1, scheduler) as executor:
-        found = diagnose(base, measured, y_std_um=y_std_um, progress=progress, executor=executor)
-    found.save_all(out, also=also)
-    model_file, page = out / FILES[0], out / FILES[2]
-    paths = {"model": str(model_file), "model_sha256": found.model.sha256, "report": str(page)}
-    text = f"{found.summary()}\n\nmodel: {model_file}\n{pages_text(page, also)}"
+        found = diagnose(
+            base,
+            measured,
+            columns=columns,
+            y_std_um=y_std_um,
+            fit_until_h=fit_until_h,
+            validate=validate,
+            progress=progress,
+            executor=executor,
+        )
+    found.save_all(out, also=also, series=True)
+    model_file, page, curves = out / FILES[0], out / FILES[2], out / FILES[3]
+    paths = {"model": str(model_file), "model_sha256": found.model.sha256, "report": str(page), "series": str(curves)}
+    text = f"{found.summary()}\n\nmodel: {model_file}\ncurves: {curves}\n{pages_text(page, also)}"
     return Answer(found.to_dict() | paths, text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import difflib
 
-from compensator.codes import SUFFIXES, WORDS
+from compensator.codes import SUFFIX_WORDS, SUFFIXES, WORDS
 from compensator.commands import Answer
 from compensator.errors import UsageError
 from compensator.receiver.reasons import WORDS as RECEIVER_WORDS
@@ -29,4 +29,5 @@ def run(arguments: argparse.Namespace) -> Answer:
         known_suffixes = () if suffixes is None else suffixes or ("CHANNEL",)
         expected = ", ".join([name, *(f"{name}:{one}" for one in known_suffixes)])
         raise UsageError(f"{arguments.code}: unknown suffix {suffix!r}, expected {expected}")
+    words = SUFFIX_WORDS.get(code, words)
     return Answer({"code": code, "means": words[0], "do": words[1]}, f"{words[0]}\n{words[1]}")

@@ -6,20 +6,24 @@ import argparse
 import itertools
 import logging
 import re
+import secrets
 import sys
 import threading
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import msgspec
 from rich.console import Console
 from rich.live import Live
 
+from compensator.atomic_write import replace_file
 from compensator.clock import SystemClock
 from compensator.commands import Answer
 from compensator.commands.stopping import until_stopped
 from compensator.config import LoadedConfig, load_config
 from compensator.errors import ServiceError, UsageError
+from compensator.input_file import KEY_BYTES, read_file
 from compensator.service.session import services_text
 from compensator.watch.listener import Listener, Sink, Source, of_endpoints, of_file, of_settings
 from compensator.watch.past import last_day
@@ -52,6 +56,10 @@ def run(arguments: argparse.Namespace) -> Answer | None:
         shop.add_recorded(
             loaded.config.zenoh.prefix, last_day(folder, loaded.config.machine.name, SystemClock().utc_ns())
         )
+    if arguments.bind is not None and not arguments.page:
+        raise UsageError("--bind: is for --page, which is not given")
+    if arguments.token is not None and arguments.bind is None:
+        raise UsageError("--token: is for --bind, which is not given")
     other = arguments.page or arguments.record or arguments.foxglove
     if arguments.once or (arguments.json and not other):
         return _once(arguments, source, shop)
@@ -74,12 +82,25 @@ def run(arguments: argparse.Namespace) -> Answer | None:
         if arguments.page:
             from compensator.watch.server import PageServer
 
-            server = stack.enter_context(PageServer(shop, watch.status, arguments.port))
+            options = {"host": arguments.bind, "token": _token(arguments.token)} if arguments.bind else {}
+            server = stack.enter_context(PageServer(shop, watch.status, arguments.port, **options))
             log.info("compensator: live page at %s (Ctrl-C ends it)", server.address)
         listener = stack.enter_context(Listener(source, *sinks, on_connection=watch.connection))
         listener.start()
         watch.show(terminal=sys.stdout.isatty() and not other, lines=not other)
     return Answer(*recorder.answer()) if recorder is not None else None
+
+
+def _token(path: Path | None) -> str:
+    """Return the token of the page: of its file, which is made if it does not exist, or a new one."""
+    if path is None:
+        return secrets.token_urlsafe(16)
+    try:
+        return read_file(path, KEY_BYTES).decode("ascii", "replace").strip()
+    except FileNotFoundError:
+        token = secrets.token_urlsafe(16)
+        replace_file(path, f"{token}\n".encode(), mode=0o600)
+        return token
 
 
 def _source(arguments: argparse.Namespace, loaded: LoadedConfig | None) -> Source:

@@ -19,13 +19,13 @@ from compensator.atomic_write import atomic_write
 from compensator.data.files import measured_probes
 from compensator.errors import DataError
 from compensator.messages import EstimateMessage, Offset, Probe, Sample, number
-from compensator.recording.reading import machines_in, messages
+from compensator.recording.reading import machines_in, messages, recordings_in
 
 log = logging.getLogger("compensator")
 
 PathLike = str | os.PathLike[str]
 
-_ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "residual_um")
+_ESTIMATE = ("heat_w", "y_dtf_um", "y_tdtf_um", "y_pred_um", "y_std_um", "y_ref_um", "residual_um")
 _OFFSET = ("y_offset_um", "y_offset_rate_um_per_min", "y_offset_std_um", "state")
 
 
@@ -33,13 +33,14 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     """Write the recordings of one machine as one CSV, in the order of their samples.
 
     Columns: `time_utc`, `t_s`, `seq`, the mean of every channel by its name and its quality, the estimate, the
-    offset, its state and reasons. `heat_w` is the estimate; a measured heat is in `heat_measured_w`. Where no
+    offset, its state and reasons. `heat_w` is the estimate; a measured heat is in `heat_measured_w`. `y_um` is as
+    measured, and `y_ref_um` its value at the zero: `y_um` − `y_ref_um` counts from the zero of `y_pred_um`. Where no
     displacement sensor measured Y, `y_um` is the deformation that a touch probe showed, at the sample of its time.
 
     Parameters
     ----------
     recordings : path or sequence of paths
-        The MCAP files, in any order.
+        The MCAP files, in any order; a folder stands for those in it.
     out : path
         The CSV.
     machine : str
@@ -55,7 +56,8 @@ def export(recordings: PathLike | Sequence[PathLike], out: PathLike, machine: st
     DataError
         If one is no recording or has no samples, or they are of several machines.
     """
-    paths = [Path(recordings)] if isinstance(recordings, (str, os.PathLike)) else [Path(path) for path in recordings]
+    given = [recordings] if isinstance(recordings, (str, os.PathLike)) else recordings
+    paths = recordings_in(map(Path, given))
     rows: dict[int, dict[str, Any]] = {}
     probes: list[list[Probe]] = []
     periods_s: dict[int, float] = {}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 import warnings
+import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -15,6 +17,8 @@ import numpy as np
 
 from compensator.codes import DataRemark, ProbeCode, Remark
 from compensator.config import ROLES
+from compensator.data.cells import text_of, with_points
+from compensator.data.frames import table_in_memory
 from compensator.data.table import TIMES, Table, check_columns, table_of, time_names
 from compensator.errors import DataError
 from compensator.messages import Probe, number
@@ -22,8 +26,8 @@ from compensator.recording.reading import messages
 
 #: First bytes of files that are mistaken for tables, and what to do with such a file.
 _OTHER_FILES = (
-    (b"PK\x03\x04", "a workbook (XLSX, ODS) or ZIP archive, expected a table; save it as CSV in UTF-8"),
-    (b"\xd0\xcf\x11\xe0", "an old workbook (XLS), expected a table; save it as CSV in UTF-8"),
+    (b"PK\x03\x04", "a workbook or ZIP archive by its content, expected a table; name it FILE.xlsx, or save it as CSV"),
+    (b"\xd0\xcf\x11\xe0", "an old workbook (XLS), expected a table; save it as CSV"),
     (b"\x1f\x8b", "compressed (gzip), expected a table; unpack it first"),
     (b"\x89MCAP0\r\n", "a recording by its content, expected a table; name it FILE.mcap"),
     (b"MATLAB 5.0 MAT", "a MAT file by its content, expected a table; name it FILE.mat"),
@@ -32,6 +36,8 @@ _OTHER_FILES = (
 )
 #: Largest table: bytes of its file, rows, and cells; each cell takes some hundred bytes while it is read.
 TABLE_BYTES, ROWS, CELLS = 1_000_000_000, 10_000_000, 50_000_000
+#: First line by which Excel names the separator.
+_SEPARATOR = re.compile(r"sep=([,;\t])", re.IGNORECASE)
 #: What scipy raises for a damaged MAT file, besides its own error.
 _DAMAGED = (zlib.error, ValueError, TypeError, LookupError, EOFError, ArithmeticError, MemoryError, OSError)
 #: How to save what only MATLAB can read.
@@ -51,31 +57,50 @@ def read_csv(path: Path, data: bytes, roles: Mapping[str, str]) -> Table:
     for begin, kind in _OTHER_FILES:
         if data.startswith(begin):
             raise DataError(f"{path}: {kind}")
-    cells, rows = data.count(b",") + data.count(b"\n"), data.count(b"\n")
+    rows = data.count(b"\n")
+    cells = rows + sum(map(data.count, (b",", b";", b"\t")))
     if cells > CELLS or rows > ROWS:
         raise DataError(f"{path}: {rows} rows of {cells} cells, expected at most {ROWS} and {CELLS}; split the table")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(
-            f"{path}: not UTF-8 text ({error.reason} at byte {error.start}), expected a table: CSV in UTF-8"
-        ) from error
-    try:
-        lines = list(csv.reader(text.splitlines()))
-    except csv.Error as error:
-        raise DataError(f"{path}: not a CSV table: {error}") from error
+    lines, first, separator = _lines(path, text_of(path, data), roles)
     if len(lines) < 2:
         found = "a header without data" if lines else "empty"
         raise DataError(f"{path}: {found}, expected a header and data")
     header = _header(path, lines[0], roles)
-    numbered = [(row, cells) for row, cells in enumerate(lines[1:], start=2) if cells]
+    numbered = [(row, cells) for row, cells in enumerate(lines[1:], start=first) if cells]
     for row, line in numbered:
         if len(line) != len(header):
             raise DataError(f"{path}: row {row}: {len(line)} cells, expected {len(header)}")
     columns = zip(*(line for _, line in numbered), strict=True) if numbered else ([] for _ in header)
     # Keep cells as text: numpy would truncate or convert them.
     arrays = {name: np.array(cells, dtype=object) for name, cells in zip(header, columns, strict=True)}
-    return table_of(str(path), arrays, roles=roles, rows=[row for row, _ in numbered], has="the header has")
+    numbers = [row for row, _ in numbered]
+    if separator != ",":
+        arrays = with_points(str(path), arrays, numbers)
+    return table_of(str(path), arrays, roles=roles, rows=numbers, has="the header has")
+
+
+def _lines(path: Path, text: str, roles: Mapping[str, str]) -> tuple[list[list[str]], int, str]:
+    """Return the cells of all lines, the number of the line after the header, and what stands between cells."""
+    lines = text.splitlines()
+    first = 2
+    if lines and (excel := _SEPARATOR.fullmatch(lines[0].strip())):
+        # Excel's own first line names the separator.
+        lines, first, separators = lines[1:], 3, excel[1]
+    else:
+        separators = ",;\t"
+    separator = next((one for one in separators if time_names(roles) & _names(lines[:1], one)), ",")
+    try:
+        return list(csv.reader(lines, delimiter=separator)), first, separator
+    except csv.Error as error:
+        raise DataError(f"{path}: not a CSV table: {error}") from error
+
+
+def _names(header: Sequence[str], separator: str) -> set[str]:
+    """Return the names of a header; none if it cannot be split so."""
+    try:
+        return {name.strip() for name in next(csv.reader(header, delimiter=separator), [])}
+    except csv.Error:
+        return set()
 
 
 def _header(path: Path, cells: Sequence[str], roles: Mapping[str, str]) -> list[str]:
@@ -84,10 +109,6 @@ def _header(path: Path, cells: Sequence[str], roles: Mapping[str, str]) -> list[
     for name, count in Counter(header).items():
         if count > 1:
             raise DataError(f"{path}: the header names column {name[:64]!r} twice, expected each name once")
-    if not time_names(roles) & set(header):
-        for separator, word in ((";", "semicolons"), ("\t", "tabs")):
-            if cells and separator in cells[0]:
-                raise DataError(f"{path}: {word} between its cells, expected commas, and a dot in numbers: 20.5")
     return header
 
 
@@ -140,6 +161,28 @@ def _fields(value: Any) -> Mapping[str, Any]:
     """Return the fields of a MATLAB struct, none of anything else."""
     names = getattr(getattr(value, "dtype", None), "names", None)
     return {name: value[name].item() for name in names} if names and value.size == 1 else {}
+
+
+def read_workbook(path: Path, roles: Mapping[str, str]) -> Table:
+    """Read the first sheet of an Excel workbook, where pandas and openpyxl are installed.
+
+    Raises
+    ------
+    DataError
+        If they are not, or it cannot be read; the message says how to save a CSV.
+    """
+    as_csv = "save the sheet as CSV (File, Save As, CSV UTF-8)"
+    try:
+        import pandas
+
+        frame = pandas.read_excel(path, sheet_name=0, engine="openpyxl", nrows=ROWS)
+    except ImportError as error:
+        needs = "an Excel workbook, which needs pandas and openpyxl"
+        raise DataError(f"{path}: {needs}; install them, or {as_csv}") from error
+    except (zipfile.BadZipFile, *_DAMAGED) as error:
+        why = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
+        raise DataError(f"{path}: not a workbook that can be read ({why}); {as_csv}") from error
+    return table_in_memory(str(path), frame, roles, rows=range(2, len(frame) + 2))
 
 
 def read_recordings(paths: Sequence[Path], roles: Mapping[str, str]) -> tuple[Table, tuple[Remark, ...]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ def has_local_time(frame: Any, roles: Mapping[str, str]) -> bool:
     return bool(pandas.api.types.is_datetime64_dtype(time.dtype))
 
 
-def table_in_memory(name: str, data: Any, roles: Mapping[str, str]) -> Table:
+def table_in_memory(name: str, data: Any, roles: Mapping[str, str], rows: Sequence[int] | None = None) -> Table:
     """Make a table of a DataFrame or a mapping of arrays.
 
     Parameters
@@ -43,6 +43,8 @@ def table_in_memory(name: str, data: Any, roles: Mapping[str, str]) -> Table:
         DataFrame without a column of that name.
     roles : mapping of str to str
         Column name for each role; those of the time are used here.
+    rows : sequence of int, optional
+        Number of each row for messages; from 0 where it is not given.
 
     Raises
     ------
@@ -50,7 +52,7 @@ def table_in_memory(name: str, data: Any, roles: Mapping[str, str]) -> Table:
         As :func:`table_of`.
     """
     cells = _frame_columns(name, data, roles) if is_frame(data) else {str(k): v for k, v in data.items()}
-    return table_of(name, cells, roles=roles)
+    return table_of(name, cells, roles=roles, rows=rows)
 
 
 def _frame_columns(name: str, frame: Any, roles: Mapping[str, str]) -> dict[str, Any]:

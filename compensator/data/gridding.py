@@ -18,6 +18,11 @@ from compensator.errors import DataError
 MOST_SAMPLES = 6_000_000
 #: A stretch of so many rows in order that overlaps another one was recorded by a clock that was set back.
 STRETCH_ROWS = 10
+#: Time between rows and length of a table below which its time is hardly one of seconds, s, from this number of rows.
+_FASTEST_S, _SHORTEST_S, _UNIT_ROWS = 0.2, 600.0, 100
+#: No heat makes T_Q change by so much from one minute to the next, K, in more than a fifth of so many minutes. A table
+#: in minutes has rows at most 6 of them apart and is at most 44,640 long, a month.
+_FASTEST_K, _UNIT_SHARE, _UNIT_MINUTES, _UNIT_STEP_S, _UNIT_SPAN_S = 2.0, 0.8, 5, 6.0, 44_640.0
 #: Number of stretches that a remark lists.
 _SHOWN = 3
 #: Share of rows without a temperature, outside long gaps, from which it is remarked on.
@@ -40,6 +45,7 @@ def to_grid(table: Table, period_s: float) -> SampledData:
         If a value or time cannot have been measured.
     """
     _check_size(table, period_s)
+    _check_unit_of_time(table)
     _check_clock(table, period_s)
     remarks = []
     t_s = table.t_s
@@ -168,6 +174,34 @@ def _check_size(table: Table, period_s: float) -> None:
         raise DataError(
             f"{name}: row {row}: its time makes {samples:.3g} samples of {period_s:g} s, "
             f"expected at most {MOST_SAMPLES}"
+        )
+
+
+def _check_unit_of_time(table: Table) -> None:
+    """Refuse a `t_s` that is hardly one of seconds: in hours or minutes a day would last half a minute or so.
+
+    Raises
+    ------
+    DataError
+        Naming the unit that it may have.
+    """
+    t_s = np.sort(table.t_s)
+    if table.start_utc_s is not None or t_s.size < _UNIT_ROWS:
+        return
+    step, span = float(np.median(np.diff(t_s))), float(np.ptp(t_s))
+    if step < _FASTEST_S and span < _SHORTEST_S:
+        raise DataError(f"{table.name}: t_s runs over {span:.3g} in {t_s.size} rows: hours? expected seconds")
+    t_q = table.columns.get("t_q_degc")
+    if t_q is None or span > _UNIT_SPAN_S or step > _UNIT_STEP_S:
+        return
+    minute = np.floor((table.t_s - t_s[0]) / 60.0).astype(int)
+    means = _mean_by_slot(minute, t_q, int(minute.max()) + 1)
+    changes = np.abs(np.diff(means))
+    changes = changes[np.isfinite(changes)]
+    if changes.size >= _UNIT_MINUTES and (fast := float(np.quantile(changes, _UNIT_SHARE))) > _FASTEST_K:
+        raise DataError(
+            f"{table.name}: t_q_degc changes by {fast:.1f} K from one minute to the next: t_s in minutes? expected "
+            "seconds"
         )
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from compensator import display
 from compensator.codes import Remark
-from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings
+from compensator.data.files import TABLE_BYTES, read_csv, read_mat, read_recordings, read_workbook
 from compensator.data.frames import has_local_time, hash_of, is_frame, table_in_memory
 from compensator.data.gridding import to_grid
 from compensator.data.record import SampledData, SampledRecord, require
@@ -24,6 +24,7 @@ from compensator.data.screening import check_y_std
 from compensator.data.table import Table
 from compensator.errors import DataError, UsageError
 from compensator.input_file import read_file, sha256_of_file
+from compensator.recording.reading import recordings_in
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -111,6 +112,23 @@ class Measurement(display.Shown):
         """
         data = to_grid(self.table, period_s)
         return SampledData(records=data.records, remarks=(*self.remarks, *data.remarks))
+
+    def before(self, hour: float) -> Measurement:
+        """Return the rows before an hour from the start.
+
+        Raises
+        ------
+        DataError
+            If there are none.
+        """
+        t_s = self.table.t_s - np.min(self.table.t_s)
+        keep = t_s < hour * 3600.0
+        if not keep.any():
+            raise DataError(f"{self.name}: no rows before {hour:g} h, expected data to search in")
+        columns = {name: values[keep] for name, values in self.table.columns.items()}
+        rows = np.asarray(self.table.rows)[keep].tolist()
+        table = dataclasses.replace(self.table, t_s=self.table.t_s[keep], columns=columns, rows=rows)
+        return dataclasses.replace(self, table=table)
 
     def contents(self) -> list[display.Table]:
         """Return what it shows: span, samples, columns, remarks."""
@@ -206,7 +224,9 @@ def measurements(
             found.append(source)
         elif isinstance(source, (str, os.PathLike)):
             path = Path(source)
-            if path.suffix.lower() == ".mcap":
+            if path.is_dir():
+                recordings += recordings_in([path])
+            elif path.suffix.lower() == ".mcap":
                 recordings.append(path)
             else:
                 found.append(_of_file(path, roles))
@@ -224,6 +244,22 @@ def measurements(
     return found
 
 
+def check_validation(fitted: Sequence[Measurement], validation: Sequence[Measurement]) -> None:
+    """Refuse to validate a model on data that were used to make it, or a copy of them.
+
+    Raises
+    ------
+    UsageError
+        Naming the data.
+    """
+    used = {origin.sha256 for measured in fitted for origin in measured.origins}
+    for measured in validation:
+        for origin in measured.origins:
+            if origin.sha256 in used:
+                named = origin.path or origin.name
+                raise UsageError(f"--validate {named}: is used for the fit, expected another run")
+
+
 def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
     try:
         data = read_file(path, TABLE_BYTES)
@@ -232,6 +268,8 @@ def _of_file(path: Path, roles: Mapping[str, str]) -> Measurement:
     left_out: tuple[Remark, ...] = ()
     if path.suffix.lower() == ".mat":
         table, left_out = read_mat(path, roles)
+    elif path.suffix.lower() in (".xlsx", ".xlsm"):
+        table = read_workbook(path, roles)
     else:
         table = read_csv(path, data, roles)
     table, remarks = table.measurements_only()

@@ -19,6 +19,8 @@ from compensator.errors import DataError, UsageError
 TIMES = ("t_s", "time_utc")
 #: Largest number of columns.
 COLUMNS = 1000
+#: A column with more words than this share of its numbers is one of words, and left out.
+_WORDS = 0.1
 #: Columns of an exported recording that the service computed.
 EXPORTED = (
     "seq",
@@ -27,6 +29,7 @@ EXPORTED = (
     "y_tdtf_um",
     "y_pred_um",
     "y_std_um",
+    "y_ref_um",
     "residual_um",
     "y_offset_um",
     "y_offset_rate_um_per_min",
@@ -147,10 +150,13 @@ def table_of(
             raise DataError(f"{name}: {column} has {values.size} values, {time_column} {size}, expected equally many")
         if column in (time_column, "time_utc"):
             continue
-        if (converted := _numbers(name, column, values, rows)) is not None:
+        is_needed = column in ROLES or column in (roles or {}).values()
+        if (converted := _numbers(name, column, values, rows, is_needed=is_needed)) is not None:
             numbers[column] = converted
-    reader = _numbers if time_column == "t_s" else _seconds
-    time = reader(name, time_column, arrays[time_column], rows)
+    if time_column == "t_s":
+        time = _numbers(name, time_column, arrays[time_column], rows, is_needed=True)
+    else:
+        time = _seconds(name, time_column, arrays[time_column], rows)
     assert time is not None
     if np.isnan(time).any():
         raise DataError(f"{name}: row {rows[int(np.argmax(np.isnan(time)))]}: time is missing")
@@ -197,20 +203,28 @@ def _flat(name: str, column: str, values: Any) -> np.ndarray[Any, Any]:
     return array.ravel()
 
 
-def _numbers(name: str, column: str, values: np.ndarray[Any, Any], rows: Sequence[int]) -> Vector | None:
-    """Return a column as numbers, None where it holds something else and has no role."""
+def _numbers(
+    name: str, column: str, values: np.ndarray[Any, Any], rows: Sequence[int], *, is_needed: bool
+) -> Vector | None:
+    """Return a column as numbers, None where most of it is something else and it is not needed."""
     if values.dtype.kind in "biuf":
         numbers = values.astype(np.float64)
     else:
-        numbers = np.empty(values.size)
+        numbers, others = np.full(values.size, np.nan), []
         for i, cell in enumerate(values.tolist()):
             try:
                 numbers[i] = _number(cell)
-            except (ValueError, TypeError, OverflowError) as error:
-                if column not in (*ROLES, "t_s"):
-                    return None
-                where = f"{name}: row {rows[i]}: {column}"
-                raise DataError(f"{where} = {str(cell).strip()[:40]!r}, expected a number") from error
+            except (ValueError, TypeError, OverflowError):
+                others.append(i)
+        # A column of words is left out; one word among numbers, such as Excel's #NV, would cost the whole channel.
+        if others and not is_needed and len(others) > _WORDS * np.sum(np.isfinite(numbers)):
+            return None
+        if others:
+            cell, more = str(values[others[0]]).strip()[:40], f" ({len(others)} like it)" if len(others) > 1 else ""
+            raise DataError(
+                f"{name}: row {rows[others[0]]}: {column} = {cell!r}{more}, expected a number, or an empty cell where "
+                "it is missing"
+            )
     if np.isinf(numbers).any():
         i = int(np.argmax(np.isinf(numbers)))
         raise DataError(f"{name}: row {rows[i]}: {column} = {numbers[i]}, expected a finite number")

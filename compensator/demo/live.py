@@ -7,6 +7,7 @@ inject sensor faults.
 from __future__ import annotations
 
 import asyncio
+import re
 import shutil
 import sys
 import threading
@@ -44,6 +45,10 @@ CHECKS = """
 t_q_below_at_after_min = 15.0
 false_alarm_days = 30.0
 """
+#: A value that stands still is noticed after this time here, min; a real machine allows hours, as air may be still.
+STUCK_AFTER_MIN = {"t_q": 15.0, "at": 15.0, "y": 3.0}
+#: A value that stands still is counted from the first whole sample on, and a fault is published with the next sample.
+_SEEN_MIN = 2.0
 #: Faults of an input by typed command, and faults of a whole device by sensor.
 INPUT_FAULTS = {"break": "open", "freeze": "frozen"}
 UNPLUG = {"t_q": "silence", "at": "silence", "y": "disconnect"}
@@ -94,10 +99,18 @@ def run_live(out: Path, *, hours: float, seed: int, port: int, typed: IO[str] | 
     with hardware(world) as devices:
         config = folder / "config.toml"
         model = "../conduction/calibration/model.toml"
-        text = configuration(MACHINE, devices.lines, port, model, prefix=PREFIX) + CHECKS
+        text = _noticing(configuration(MACHINE, devices.lines, port, model, prefix=PREFIX)) + CHECKS
         config.write_text(text, encoding="utf-8")
         asyncio.run(_serve(config, world, devices, hours, lambda: _explain(out, config, port), typed or sys.stdin))
     return recordings
+
+
+def _noticing(text: str) -> str:
+    """Return a configuration in which a frozen value is noticed while somebody watches."""
+    for name, minutes in zip(("t_q_degc", "at_degc", "y_um"), STUCK_AFTER_MIN.values(), strict=True):
+        before, channel, after = text.partition(f'[[channel]]\nname = "{name}"\n')
+        text = before + channel + re.sub(r"stuck_after_min = [\d.]+", f"stuck_after_min = {minutes}", after, count=1)
+    return text
 
 
 def _clear(recordings: Path) -> None:
@@ -181,6 +194,7 @@ def apply_fault(line: str, breakable: Breakable) -> str:
             faults.set(UNPLUG[name])
         else:
             faults.set(INPUT_FAULTS[word], input=number)
-        return f"{word} {name}: done; visible within two minutes"
+        seen_min = _SEEN_MIN + (STUCK_AFTER_MIN[name] if word == "freeze" else 0.0)
+        return f"{word} {name}: done; visible within {seen_min:g} minutes"
     words = ", ".join([*INPUT_FAULTS, "unplug"])
     return f"{line.strip()!r}: expected one of {words} with one of {', '.join(breakable)}; or mend"

@@ -7,14 +7,19 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from compensator.channel_lines import channel_lines, unusable_names
 from compensator.codes import ModelWarning, Remark
 from compensator.diagnose.advice_words import advice_lines, advice_table
 from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_rms, remainder
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
+from compensator.diagnose.free_run import free_run_sentence
 from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
-from compensator.display import Table, Words, warnings_of, with_std
+from compensator.display import Listing, Table, Words, warnings_of, with_std
+from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.simulation import SCORE_HEAD, Scores
 
 _VERDICTS = {
@@ -79,7 +84,7 @@ _UNITS = {
 _FIGURES = ("parameters", "deployable", "explanation", "rms_before_um", "rms_after_um")
 
 
-def figures(diagnosis: Diagnosis) -> dict[str, Any]:
+def figures(diagnosis: Diagnosis, free_run: Sequence[FreeRunErrors] = ()) -> dict[str, Any]:
     """Return the content of `diagnosis.json`."""
     return {
         "verdict": diagnosis.verdict,
@@ -105,6 +110,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, Any]:
         "warnings": list(map(str, diagnosis.warnings)),
         "warning_codes": [warning.code for warning in diagnosis.warnings],
         **_could_hide(diagnosis.could_hide),
+        "free_run": [one.to_dict() for one in free_run],
     }
 
 
@@ -167,14 +173,14 @@ def verdict(found: Mapping[str, Any]) -> str:
     elif _without_a_name(found):
         words = _WITHOUT_A_NAME
     before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
-    share = f" {sentence}" if (sentence := explained(found)) else ""
+    share = "".join(f" {sentence}" for sentence in (explained(found), free_run_sentence(found)) if sentence)
     with_remainder = f", {after:.2f} with the remainder" if found.get("remainder") else ""
     if not found["effects"]:
         hidden = "".join(f" {line}" for line in hiding_lines(found)[:1])
         return f"{words} Residual {before:.2f} µm rms{with_remainder}, sensor noise {noise:.2f}.{hidden}{share}"
     return (
-        f"{words} {_names(found['effects'])}. On held-out data the residual was {before:.2f} µm rms without and is "
-        f"{named_rms(found):.2f} µm rms with them{with_remainder} (sensor noise {noise:.2f}).{share}"
+        f"{words} {_names(found['effects'])}. On held-out data, with a fitted zero, the residual was {before:.2f} µm "
+        f"rms without and is {named_rms(found):.2f} µm rms with them{with_remainder} (sensor noise {noise:.2f}).{share}"
     )
 
 
@@ -232,10 +238,14 @@ def name(effect: FoundEffect) -> str:
     return _names([_place(effect.term)])
 
 
-def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | Table | Words]:
+def contents(
+    diagnosis: Diagnosis, remarks: Sequence[Remark], free_run: Sequence[FreeRunErrors] = ()
+) -> Iterator[str | Table | Words | Listing]:
     """Yield the content for terminal and notebook: verdict, tables, explanations, warnings and remarks."""
-    found = figures(diagnosis)
+    found = figures(diagnosis, free_run)
     yield verdict(found)
+    if free_run:
+        yield table_of(free_run)
     yield error_table(diagnosis)
     yield ceiling(found)
     for i, effect in enumerate(diagnosis.effects, start=1):
@@ -244,12 +254,33 @@ def contents(diagnosis: Diagnosis, remarks: Sequence[Remark]) -> Iterator[str | 
         if effect.rivals:
             yield rivals(effect)
     yield from remainder(found)
+    yield from channels_to_configure(diagnosis)
     if hidden := hiding_lines(found):
         yield Words(title="What could hide", lines=hidden)
     if advice := advice_lines(diagnosis.advice):
         yield Words(title="What to measure and test next", lines=advice)
     yield from warnings_of(diagnosis.warnings)
     yield from warnings_of(remarks, "Remarks on the data")
+
+
+def channels_to_configure(diagnosis: Diagnosis) -> list[Listing | Words]:
+    """Return the lines of the configuration for the channels that the extended model needs; empty without any."""
+    new = [name for name in diagnosis.model.channels if name not in diagnosis.evidence.model.channels]
+    if not new:
+        return []
+    ranges = {}
+    for name in new:
+        values = np.concatenate([run.channels[name] for run in diagnosis.evidence.runs if name in run.channels])
+        ranges[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
+    title = (
+        "The extended model needs these channels in the service's configuration. Where they are not there yet, paste, "
+        "and name device and input of the sensor"
+    )
+    found: list[Listing | Words] = [Listing(title=title, lines=channel_lines(new, ranges))]
+    if bad := unusable_names(new):
+        words = f"{', '.join(bad)}: no name for a channel (small letters, digits, _). Rename the column and repeat."
+        found.append(Words(title="Names", lines=[words], kind="warning"))
+    return found
 
 
 def error_table(diagnosis: Diagnosis) -> Table:
@@ -265,7 +296,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     if diagnosis.ceiling:
         rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
     return Table(
-        title="Errors on held-out data",
+        title="Errors on held-out data, zero fitted",
         head=["", *SCORE_HEAD],
         rows=[*rows, ["sensor noise alone", f"{diagnosis.noise_floor_um:.2f}", "", ""]],
         note=f"Held-out data: {diagnosis.held_out}.",

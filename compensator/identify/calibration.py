@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,8 @@ class Part:
     model, nothing, persistence : Scores
         Of the model, of no compensation (y counted from the run's start), and of the last value measured before
         the part.
+    inputs : dict of str to numpy.ndarray, shape (n,)
+        `t_q_degc`, `at_degc`, and `heat_w` where it is known.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Part:
     model: Scores
     nothing: Scores
     persistence: Scores
+    inputs: Mapping[str, Vector] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -439,4 +442,6 @@ def _part(run: Run, predicted: Vector, mask: Mask, role: str, period_s: float) -
         model=scores(y, predicted[mask]),
         nothing=scores(y, np.full(y.size, start)),
         persistence=scores(y, np.full(y.size, held)),
+        inputs={"t_q_degc": run.t_q_degc[mask], "at_degc": run.at_degc[mask]}
+        | ({"heat_w": run.heat_w[mask]} if run.heat_w is not None else {}),
     )

@@ -10,9 +10,14 @@ from compensator.display import Table, Words, warnings_of, with_std
 from compensator.identify.calibration import Calibration
 from compensator.identify.comparison import Row
 from compensator.identify.criticism import Criticism
+from compensator.model.free_run import NOTHING, FreeRunErrors, in_words, table_of
+from compensator.model.simulation import SCORE_HEAD
+
+#: Name of the identified model among the errors in free run.
+MODEL = "model"
 
 
-def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
+def figures(calibration: Calibration, criticism: Criticism, free_run: Sequence[FreeRunErrors] = ()) -> dict[str, Any]:
     """Return all figures, warnings and remarks, as `--json` prints them."""
     model = calibration.model
     result: dict[str, Any] = {
@@ -27,7 +32,7 @@ def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
             }
             for path, fit in zip(criticism.paths, calibration.paths, strict=True)
         },
-        **errors_of(calibration),
+        **errors_of(calibration, free_run),
         "noise": dict(calibration.noise),
         "warnings": [str(warning) for warning in criticism.warnings],
         "warning_codes": [warning.code for warning in criticism.warnings],
@@ -43,9 +48,13 @@ def figures(calibration: Calibration, criticism: Criticism) -> dict[str, Any]:
     return result
 
 
-def errors_of(calibration: Calibration) -> dict[str, Any]:
-    """Return the errors in free run: of each part of the data, and on the held-out folds."""
+def errors_of(calibration: Calibration, free_run: Sequence[FreeRunErrors] = ()) -> dict[str, Any]:
+    """Return the errors: in free run as the service runs, and of each part of the data and the held-out folds.
+
+    Those of parts and folds have the zero (and the fitted ones the initial state) from the data.
+    """
     return {
+        "free_run": [one.to_dict() for one in free_run],
         "parts": [
             {
                 "name": part.name,
@@ -71,8 +80,19 @@ def verdict(errors: Mapping[str, Any]) -> str:
     errors : mapping
         Result of :func:`errors_of`; a model file contains them in its provenance.
     """
+    runs = {role: [one for one in errors.get("free_run", ()) if one["role"] == role] for role in ("held out", "fitted")}
+    if runs["held out"]:
+        count, worst = len(runs["held out"]), _worst(runs["held out"])
+        several = f"; the worst of {count}" if count > 1 else ""
+        return f"On data that were not used for the fit: {in_words(worst['scores'], MODEL)}{several}."
+    if runs["fitted"]:
+        return (
+            f"On the fitted data: {in_words(_worst(runs['fitted'])['scores'], MODEL)}. On held-out blocks of time, "
+            f"with zero and initial state fitted: {errors['folds_rms_um']:.2f} µm rms. There is no separate validation "
+            "run; give one with --validate."
+        )
     held_out = [part for part in errors["parts"] if part["role"] == "held out"]
-    if held_out:
+    if held_out:  # a model file of version 0.1.0
         worst = max(held_out, key=lambda part: float(part["rms_um"]))
         return (
             f"On data that were not used for the fit: {worst['rms_um']:.2f} µm rms "
@@ -87,8 +107,15 @@ def verdict(errors: Mapping[str, Any]) -> str:
     )
 
 
+def _worst(runs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    return max(runs, key=lambda one: float(one["scores"][MODEL]["rms_um"]))
+
+
 def share_left(errors: Mapping[str, Any]) -> float:
     """Return the ratio of the held-out error to that without compensation, the largest of all parts."""
+    runs = [one["scores"] for one in errors.get("free_run", ()) if one["role"] == "held out"]
+    if runs:
+        return max(float(one[MODEL]["rms_um"] / one[NOTHING]["rms_um"]) for one in runs)
     held_out = [part for part in errors["parts"] if part["role"] == "held out"]
     if held_out:
         return max(float(part["rms_um"] / part["no_compensation_rms_um"]) for part in held_out)
@@ -117,7 +144,10 @@ def estimates(criticism: Criticism) -> dict[str, Estimate]:
 
 
 def contents(
-    calibration: Calibration, criticism: Criticism, comparison: Sequence[Row] = ()
+    calibration: Calibration,
+    criticism: Criticism,
+    comparison: Sequence[Row] = (),
+    free_run: Sequence[FreeRunErrors] = (),
 ) -> Iterator[str | Table | Words]:
     """Yield the content for terminal and notebook: sentences, tables, warnings and remarks."""
     model = calibration.model
@@ -127,8 +157,10 @@ def contents(
         else "direct: from T_Q − AT to the deformation, heat unknown"
     )
     yield f"model {model.name} ({what}; method {calibration.settings.method})"
-    yield verdict(errors_of(calibration))
+    yield verdict(errors_of(calibration, free_run))
     yield parameter_table(calibration, criticism)
+    if free_run:
+        yield table_of(free_run)
     yield error_table(calibration)
     if comparison:
         yield comparison_table(comparison)
@@ -155,31 +187,20 @@ def parameter_table(calibration: Calibration, criticism: Criticism) -> Table:
 
 
 def error_table(calibration: Calibration) -> Table:
-    """Return the errors in free run: a row for each part of the data, one for the folds and one for the ARX fit."""
+    """Return the errors of the fit: a row for each part of the data, one for the folds and one for the ARX fit."""
     arx_rms = f"{calibration.arx_rms_um:.2f}" if math.isfinite(calibration.arx_rms_um) else "unstable"
     rows = [
-        [
-            part.name,
-            part.role,
-            f"{part.hours:.1f}",
-            f"{part.model.fit_pct:.2f}",
-            f"{part.model.rms_um:.2f}",
-            f"{part.model.peak_to_peak_um:.2f}",
-            f"{part.nothing.rms_um:.2f}",
-            f"{part.persistence.rms_um:.2f}",
-        ]
+        [part.name, part.role, f"{part.hours:.1f}", *part.model.cells(), f"{part.nothing.rms_um:.2f}"]
         for part in calibration.parts
     ]
-    rows.append(
-        ["blocks of the fit, cross-validated", "held out", "", "", f"{calibration.folds_rms_um:.2f}", "", "", ""]
-    )
-    rows.append(["ARX of the same structure", "fitted", "", "", arx_rms, "", "", ""])
+    rows.append(["blocks of the fit, cross-validated", "held out", "", f"{calibration.folds_rms_um:.2f}", "", "", ""])
+    rows.append(["ARX of the same structure", "fitted", "", arx_rms, "", "", ""])
     return Table(
-        title="Errors in free run",
-        head=["data", "part", "h", "fit %", "rms µm", "peak to peak µm", "uncompensated µm", "persistence µm"],
+        title="Errors of the fit: zero from the data",
+        head=["data", "part", "h", *SCORE_HEAD, "uncompensated µm"],
         rows=rows,
-        note="Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖). Persistence: the last value before the part is held. "
-        "Runs that were not fitted are zeroed at the mean of their first hour.",
+        note="Fitted runs: zero and initial state are fitted. Runs that were not fitted: the zero is the mean of their "
+        "first hour. Fit: 100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖).",
     )
 
 

@@ -19,6 +19,8 @@ COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_t
 
 #: Columns of `Scores.cells`.
 SCORE_HEAD = ("rms µm", "peak to peak µm", "fit %")
+#: Columns of `Scores.free_run_cells`.
+FREE_RUN_HEAD = ("about zero", "about mean", "mean abs.", "peak to peak", "fit %")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,16 +32,25 @@ class Scores:
     fit_pct : float
         100 · (1 − ‖y − ŷ‖ / ‖y − mean y‖), %.
     rms_um, peak_to_peak_um : float
-        Of the error, µm.
+        Of the error, µm; the rms about the zero.
+    rms_about_mean_um, mean_abs_um : float
+        Standard deviation and mean absolute value of the error, µm.
     """
 
     fit_pct: float
     rms_um: float
     peak_to_peak_um: float
+    rms_about_mean_um: float = math.nan
+    mean_abs_um: float = math.nan
 
     def cells(self) -> list[str]:
         """Return them as cells of a table below `SCORE_HEAD`."""
         return [f"{self.rms_um:.2f}", f"{self.peak_to_peak_um:.2f}", f"{self.fit_pct:.2f}"]
+
+    def free_run_cells(self) -> list[str]:
+        """Return them as cells of a table below `FREE_RUN_HEAD`."""
+        values = (self.rms_um, self.rms_about_mean_um, self.mean_abs_um, self.peak_to_peak_um, self.fit_pct)
+        return [f"{value:.2f}" for value in values]
 
 
 def require_channels(model: ThermalModel, record: SampledRecord, name: str) -> None:
@@ -141,6 +152,8 @@ def scores(y: Vector, y_pred: Vector) -> Scores:
         fit_pct=100.0 * (1.0 - float(np.linalg.norm(error)) / spread) if spread > 0 else math.nan,
         rms_um=float(np.sqrt(np.mean(error**2))),
         peak_to_peak_um=float(np.ptp(error)),
+        rms_about_mean_um=float(np.std(error)),
+        mean_abs_um=float(np.mean(np.abs(error))),
     )
 
 

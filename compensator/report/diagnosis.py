@@ -10,9 +10,11 @@ import numpy as np
 from compensator.arrays import Vector
 from compensator.diagnose.ceiling import ceiling, falls_short, remainder
 from compensator.diagnose.found_effect import FoundEffect
+from compensator.diagnose.free_run import is_contradicted
 from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.summary import (
     SHOWN,
+    channels_to_configure,
     error_table,
     explanation,
     figures,
@@ -23,6 +25,7 @@ from compensator.diagnose.summary import (
     verdict,
 )
 from compensator.model.effects.seen import unit_of_channel
+from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel
 from compensator.report.advice import advice_blocks
 from compensator.report.held_out import TimeAxis, waterfall
@@ -38,6 +41,8 @@ from compensator.report.page import (
     warnings_of,
 )
 
+#: Causes that are drawn below the first picture.
+CAUSES = 3
 #: Tone of each verdict.
 TONES: dict[str, Tone] = {"adequate": "good", "explained": "good", "partly_explained": "warn", "unexplained": "warn"}
 
@@ -51,10 +56,14 @@ def tone_of(found: Mapping[str, Any]) -> Tone:
         Content of `diagnosis.json`.
     """
     tone = TONES[found["verdict"]]
+    if is_contradicted(found):
+        return "warn"
     return "warn" if tone == "good" and found["effects"] and falls_short(found) else tone
 
 
-def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Page:
+def page_of(
+    diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str], free_run: Sequence[FreeRunErrors] = ()
+) -> Page:
     """Make the page.
 
     Parameters
@@ -65,13 +74,19 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
         The extended model as written, with its hash.
     remarks : sequence of str
         Remarks on the data.
+    free_run : sequence of FreeRunErrors
+        Errors of both models in free run as the service runs.
     """
     time = TimeAxis.of(diagnosis)
-    found = figures(diagnosis)
-    blocks: list[Block] = [waterfall(diagnosis), ceiling(found)]
-    blocks += [_before_and_after(time, diagnosis), error_table(diagnosis)]
+    found = figures(diagnosis, free_run)
+    blocks: list[Block] = [_picture(time, diagnosis)] if diagnosis.effects else []
+    if len(diagnosis.effects) + (diagnosis.remainder is not None) != 1:
+        blocks.append(waterfall(diagnosis))
+    blocks += [table_of(free_run)] if free_run else []
+    blocks += [_before_and_after(time, diagnosis), error_table(diagnosis), ceiling(found)]
     blocks += [_effect(time, diagnosis, effect) for effect in diagnosis.effects]
     blocks += remainder(found)
+    blocks += channels_to_configure(diagnosis)
     if hidden := hiding_lines(found):
         blocks.append(Words(title="What could hide", lines=hidden))
     blocks += advice_blocks(diagnosis)
@@ -80,7 +95,41 @@ def page_of(diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -
         blocks.append(_ranking(diagnosis))
     blocks.append(_details(time, diagnosis, model, remarks))
     title = f"Diagnosis: what {model.name} lacks"
-    return Page(title=title, verdict=verdict(found), blocks=blocks, tone=tone_of(found))
+    sources = model.provenance.get("diagnosis", {}).get("data", [])
+    data = ", ".join(str(one.get("file") or one["table"]) for one in sources)
+    return Page(title=title, verdict=verdict(found), blocks=blocks, tone=tone_of(found), data=data)
+
+
+def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
+    """Show the residual of the base model, the effects over it, and below it what the largest of them act by."""
+    total = np.sum([effect.signal for effect in diagnosis.effects], axis=0)
+    causes = {cause[0]: cause for effect in diagnosis.effects if (cause := _cause(diagnosis, effect)) is not None}
+    below = tuple(
+        Figure(
+            title="",
+            x_label="time, h",
+            y_label=unit,
+            lines=(time.line(label, values),),
+            edges=time.unnamed_runs,
+            height=1.7,
+        )
+        for label, unit, values in list(causes.values())[:CAUSES]
+    )
+    one = len(diagnosis.effects) == 1
+    words = name(diagnosis.effects[0]) if one else f"the {len(diagnosis.effects)} effects found"
+    return Figure(
+        title=f"Measured − predicted by the base model, and {words}",
+        x_label="time, h",
+        y_label="Y, µm",
+        lines=(
+            time.line("residual of the base model", diagnosis.residual_after + total, weight=0.9),
+            time.line("effect" if one else "all effects", total, weight=2.2),
+        ),
+        edges=time.runs,
+        below=below,
+        note="Residual of the fit to all data, zero and initial state fitted. Below: what the effects act by."
+        + time.note,
+    )
 
 
 def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
@@ -96,7 +145,8 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         y_label="residual, µm",
         lines=tuple(lines),
         edges=time.edges,
-        note="Measured − predicted: each block was left out of the search that predicts it." + time.note,
+        note="Measured − predicted: each block was left out of the search that predicts it. At the dashed edges "
+        "another search predicts: a jump there is none of the machine." + time.note,
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import matplotlib as mpl
 import matplotlib.dates as mdates
 import numpy as np
+from dateutil.tz import tzlocal  # type: ignore[import-untyped]
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
@@ -132,9 +133,10 @@ def _axes(axes: Axes, figure: Figure, unit: float) -> None:
     if figure.x_limits is not None:
         axes.set_xlim(figure.x_limits[0] / unit, figure.x_limits[1] / unit)
     if figure.clock:
-        locator = mdates.AutoDateLocator(tz="UTC", minticks=3, maxticks=9)  # type: ignore[no-untyped-call]
+        zone = tzlocal() if figure.local else "UTC"
+        locator = mdates.AutoDateLocator(tz=zone, minticks=3, maxticks=9)  # type: ignore[no-untyped-call]
         axes.xaxis.set_major_locator(locator)
-        formatter = mdates.ConciseDateFormatter(locator, tz="UTC")  # type: ignore[no-untyped-call]
+        formatter = mdates.ConciseDateFormatter(locator, tz=zone)  # type: ignore[no-untyped-call]
         axes.xaxis.set_major_formatter(formatter)
     axes.set_xlabel(_plain(figure.x_label))
     axes.set_ylabel(_plain(figure.y_label))

@@ -137,6 +137,8 @@ class Figure:
         Draw the unit circle, with equal axes.
     clock : bool
         x is a time, s since 1970 UTC.
+    local : bool
+        Such a time is shown in this computer's zone, not in UTC.
     x_limits : tuple of float, optional
         Ends of the x axis, the same for figures below each other.
     note : str
@@ -161,6 +163,7 @@ class Figure:
     y_log: bool = False
     unit_circle: bool = False
     clock: bool = False
+    local: bool = False
     x_limits: tuple[float, float] | None = None
     note: str = ""
     height: float = 3.4

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from compensator.errors import CompensatorError, UsageError
 from compensator.input_file import resolved
+from compensator.report.local_time import today
 from compensator.report.page import Figure, Page, Row, html_of, write_page
 
 SUFFIXES = (".html", ".pdf", ".png")
@@ -111,11 +112,11 @@ def write(path: Path, page: Page) -> Path:
         source, printed = Path(name) / "page.html", Path(name) / f"page{suffix}"
         if suffix == ".pdf":
             # Older browsers ignore the rule of the print style that opens details.
-            source.write_text(html_of(page).replace("<details>", "<details open>"), encoding="utf-8")
+            source.write_text(html_of(page, date=today()).replace("<details>", "<details open>"), encoding="utf-8")
             options = ["--no-pdf-header-footer", "--print-to-pdf-no-header", f"--print-to-pdf={printed}"]
         else:
             first = _first_figure(page)
-            source.write_text(html_of(_excerpt(page, first)), encoding="utf-8")
+            source.write_text(html_of(_excerpt(page, first), date=today()), encoding="utf-8")
             height = _PNG_HEAD + round(_PNG_WIDTH / 9.0 * (first.full_height if first else 0.0))
             options = [f"--window-size={_PNG_WIDTH},{height}", f"--force-device-scale-factor={_PNG_SCALE}"]
             options += ["--hide-scrollbars", f"--screenshot={printed}"]

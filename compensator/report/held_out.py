@@ -138,6 +138,11 @@ class TimeAxis:
         return tuple(replace(edge, name="") for edge in self.edges)
 
     @property
+    def unnamed_runs(self) -> tuple[Edges, ...]:
+        """Starts of runs without an entry of the legend."""
+        return tuple(replace(edge, name="") for edge in self.runs)
+
+    @property
     def note(self) -> str:
         """Words on several runs, for a note."""
         return f" {int(self.run[-1]) + 1} runs, drawn one after another." if self.runs else ""

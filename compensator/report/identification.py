@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,8 +22,10 @@ from compensator.identify.summary import (
     share_left,
     verdict,
 )
+from compensator.model.free_run import FreeRunErrors, table_of
 from compensator.model.thermal_model import ThermalModel
 from compensator.report.page import (
+    Bar,
     Block,
     Details,
     Figure,
@@ -41,7 +44,11 @@ from compensator.report.page import (
 
 
 def page_of(
-    calibration: Calibration, criticism: Criticism, model: ThermalModel, comparison: Sequence[Comparison] = ()
+    calibration: Calibration,
+    criticism: Criticism,
+    model: ThermalModel,
+    comparison: Sequence[Comparison] = (),
+    free_run: Sequence[FreeRunErrors] = (),
 ) -> Page:
     """Make the page.
 
@@ -55,9 +62,13 @@ def page_of(
         The model as written, with its hash.
     comparison : sequence of Comparison
         Coefficients compared with those of another model.
+    free_run : sequence of FreeRunErrors
+        Errors in free run as the service runs.
     """
-    errors = errors_of(calibration)
-    blocks: list[Block] = [_prediction(calibration), _residuals(calibration), error_table(calibration)]
+    errors = errors_of(calibration, free_run)
+    blocks: list[Block] = [_prediction(calibration)]
+    blocks += [table_of(free_run)] if free_run else []
+    blocks.append(error_table(calibration))
     blocks += warnings_of(criticism.warnings)
     if comparison:
         blocks.append(comparison_table(comparison))
@@ -66,7 +77,10 @@ def page_of(
     blocks.append(Section(title="Residual analysis", blocks=[_correlations(view) for view in criticism.residuals]))
     blocks.append(_choice(calibration))
     blocks.append(_provenance(calibration, model))
-    return Page(title=f"Calibration: {model.name}", verdict=verdict(errors), blocks=blocks, tone=tone_of(errors))
+    data = ", ".join(str(entry.get("file") or entry["table"]) for entry in model.provenance.get("data", []))
+    return Page(
+        title=f"Calibration: {model.name}", verdict=verdict(errors), blocks=blocks, tone=tone_of(errors), data=data
+    )
 
 
 def tone_of(errors: Mapping[str, Any]) -> Tone:
@@ -83,27 +97,42 @@ def _joined(parts: Sequence[Part]) -> tuple[Vector, Vector, Vector, tuple[Span, 
 
 
 def _prediction(calibration: Calibration) -> Figure:
+    """Show measured and predicted deformation; below it, on the same axis, the residual and what the model ran from."""
     t, y, predicted, spans = _joined(calibration.parts)
+    unnamed = tuple(Span("", span.first, span.last) for span in spans)
+
+    def panel(y_label: str, *lines: Line) -> Figure:
+        return Figure(title="", x_label="time, h", y_label=y_label, lines=lines, spans=unnamed, height=2.0)
+
+    temperatures = [
+        Line(name, t, values)
+        for name, key in (("T_Q", "t_q_degc"), ("AT", "at_degc"))
+        if np.isfinite(values := _input(calibration.parts, key)).any()
+    ]
+    heat = _input(calibration.parts, "heat_w")
+    below = [panel("residual, µm", Line("measured − predicted", t, y - predicted))]
+    below += [panel("temperature, °C", *temperatures)] if temperatures else []
+    below += [panel("heat, W", Line("heat, known", t, heat))] if np.isfinite(heat).any() else []
     return Figure(
         title="Measured and predicted deformation, free run from T_Q and AT",
         x_label="time, h",
         y_label="Y, µm",
         lines=(Line("measured", t, y), Line("predicted", t, predicted)),
         spans=spans,
-        note="Measured Y is not fed back." + (" Shaded: held out from fitting and selection." if spans else ""),
+        below=tuple(below),
+        note=f"Measured Y is not fed back. Samples of {calibration.model.period_s:g} s: faster rows are averaged."
+        + (" Shaded: held out from fitting and selection." if spans else ""),
     )
 
 
-def _residuals(calibration: Calibration) -> Figure:
-    t, y, predicted, spans = _joined(calibration.parts)
-    return Figure(
-        title="Residual, measured − predicted",
-        x_label="time, h",
-        y_label="residual, µm",
-        lines=(Line("residual", t, y - predicted),),
-        spans=spans,
-        height=2.6,
-    )
+def _input(parts: Sequence[Part], key: str) -> Vector:
+    """Return an input of all parts on the time axis of `joined`; NaN where it is unknown."""
+    values: list[Vector] = []
+    for i, part in enumerate(parts):
+        if i and part.name != parts[i - 1].name:
+            values.append(np.array([np.nan]))
+        values.append(part.inputs.get(key, np.full(part.t_s.size, np.nan)))
+    return np.concatenate(values)
 
 
 def _coefficients(calibration: Calibration) -> Details:
@@ -139,15 +168,35 @@ def _path_section(view: PathView) -> Block:
     phase = Line("phase", view.frequency_per_h, view.phase_deg)
     shown = (
         plot("step response", "time, h", unit, step, limits=(view.gain,), note=settles),
-        plot("poles and zeros, z plane", "real part", "imaginary part", unit_circle=True, marks=poles),
+        _time_constants(view),
     )
     folded = (
+        plot("poles and zeros, z plane", "real part", "imaginary part", unit_circle=True, marks=poles),
         plot("impulse response", "time, h", f"{unit} per sample", impulse),
         plot("magnitude", "frequency, 1/h", unit, magnitude, x_log=True, y_log=True),
         plot("phase", "frequency, 1/h", "degrees", phase, x_log=True),
     )
-    details = Details(title=f"{view.name}: impulse response and Bode diagram", blocks=[Row(figures=folded)])
+    details = Details(
+        title=f"{view.name}: poles and zeros, impulse response, Bode diagram", blocks=[Row(figures=folded)]
+    )
     return Section(title=view.name, blocks=[Row(figures=shown), details])
+
+
+def _time_constants(view: PathView) -> Figure:
+    """Show the time constants as bars: on a z plane slow poles are dots on top of each other at 1."""
+    bars = tuple(
+        Bar(f"time constant {i}", f"{with_std(tau, std)} min", 0.0, tau, 1)
+        for i, (tau, std) in enumerate(zip(view.taus_min, view.taus_std_min, strict=True), start=1)
+        if math.isfinite(tau) and tau > 0.0
+    )
+    return Figure(
+        title=f"{view.name}: time constants",
+        x_label="time constant, min",
+        y_label="mode",
+        bars=bars,
+        height=1.1 + 0.5 * max(len(bars), 1),
+        note="With standard errors." if bars else "No real time constant.",
+    )
 
 
 def _correlations(view: ResidualView) -> Block:
@@ -204,6 +253,7 @@ def _choice(calibration: Calibration) -> Block:
 
 
 def _provenance(calibration: Calibration, model: ThermalModel) -> Block:
+    asked = model.provenance.get("asked", {})
     rows = [
         ["model", model.name],
         ["kind", model.kind],
@@ -212,6 +262,9 @@ def _provenance(calibration: Calibration, model: ThermalModel) -> Block:
     ]
     for entry in model.provenance.get("data", []):
         rows.append([f"{entry['role']}: {entry.get('file') or entry['table']}", entry["sha256"]])
+    if asked.get("columns"):
+        rows.append(["columns by role", ", ".join(asked["columns"])])
+    rows.append(["sample period, s", f"{model.period_s:g}"])
     for name, (low, high) in model.validity.items():
         rows.append([f"valid for {name}", f"{low:g} to {high:g}"])
     for name, value in calibration.noise.items():

@@ -15,11 +15,13 @@ from itertools import chain, count, repeat
 from pathlib import Path
 from typing import Literal
 
+from compensator import __version__
 from compensator.atomic_write import atomic_write
 from compensator.codes import explain
-from compensator.display import Cell, CodeLink, Link, Table, Words, sentence_of, text_of, warnings_of
+from compensator.display import Cell, CodeLink, Link, Listing, Table, Words, sentence_of, text_of, warnings_of
 from compensator.report.drawing import svg
-from compensator.report.figure import Figure, Line, Marks, Span, Stems, Strip
+from compensator.report.figure import Bar, Figure, Line, Marks, Span, Stems, Strip
+from compensator.report.local_time import today
 
 Tone = Literal["good", "warn", "bad"]
 #: Widths of a single figure and of one in a row, inches: the text of both stays readable.
@@ -54,7 +56,7 @@ class Section:
     blocks: Sequence[Block]
 
 
-Block = Figure | Row | Table | Words | Details | Section
+Block = Figure | Row | Table | Words | Listing | Details | Section
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,21 +71,26 @@ class Page:
         The content, in order.
     tone : {"good", "warn", "bad"}
         Shown with the verdict as a sign, a word and a colour.
+    data : str
+        Names of the data that it is made from, for its last line.
     """
 
     title: str
     verdict: str
     blocks: Sequence[Block] = field(default_factory=tuple)
     tone: Tone = "good"
+    data: str = ""
 
 
-def html_of(page: Page) -> str:
+def html_of(page: Page, *, date: str = "") -> str:
     """Return a page as HTML.
 
     Parameters
     ----------
     page : Page
         Its content.
+    date : str
+        Date for its last line.
     """
     style = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
     title = html.escape(page.title)
@@ -94,8 +101,14 @@ def html_of(page: Page) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style></head><body>'
         f'<main><h1>{title}</h1><p class="verdict {page.tone}"><b>{TONE_WORDS[page.tone]}</b>'
-        f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}</main></body></html>"
+        f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}{_origin(page, date)}</main></body></html>"
     )
+
+
+def _origin(page: Page, date: str) -> str:
+    """Return the last line: version, date, data."""
+    parts = [f"compensator {__version__}", date, f"data: {page.data}" if page.data else ""]
+    return f'<p class="note">{html.escape(", ".join(filter(None, parts)))}.</p>'
 
 
 def write_page(path: Path, page: Page) -> Path:
@@ -114,7 +127,7 @@ def write_page(path: Path, page: Page) -> Path:
         The same path.
     """
     with atomic_write(path) as file:
-        file.write(html_of(page))
+        file.write(html_of(page, date=today()))
     return path
 
 
@@ -171,6 +184,9 @@ def _block(block: Block, numbers: Iterator[int], level: int) -> str:
         items = "".join(f"<li>{_inline(line)}</li>" for line in block.lines)
         sign = '<span aria-hidden="true">⚠ </span>' if block.kind == "warning" else ""
         return f'<div class="words {block.kind}">{_heading(block.title, level, sign)}<ul>{items}</ul></div>'
+    if isinstance(block, Listing):
+        lines = f'<div class="scroll" tabindex="0"><pre>{html.escape(block.lines)}</pre></div>'
+        return f"<p>{html.escape(block.title)}:</p>{lines}"
     inner = "".join(_block(part, numbers, level + 1) for part in block.blocks)
     if isinstance(block, Details):
         return f"<details><summary>{_heading(block.title, level)}</summary>{inner}</details>"
@@ -230,6 +246,7 @@ def _inline(cell: Cell) -> str:
 
 # Figures are blocks of a page, too.
 __all__ = [
+    "Bar",
     "Block",
     "Cell",
     "CodeLink",
@@ -237,6 +254,7 @@ __all__ = [
     "Figure",
     "Line",
     "Link",
+    "Listing",
     "Marks",
     "Page",
     "Row",

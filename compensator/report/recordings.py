@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from compensator.clock import NS
 from compensator.codes import AuditRemark, RecordingEnd, Remark, State, explain
 from compensator.report.envelope import line_of
 from compensator.report.history import (
@@ -23,6 +24,7 @@ from compensator.report.history import (
     ProbeShown,
     Spread,
 )
+from compensator.report.local_time import here, shown, zone, zone_at
 from compensator.report.notation import plain, signed
 from compensator.report.page import (
     Block,
@@ -42,7 +44,6 @@ from compensator.report.page import (
 )
 from compensator.report.story import figures_of, in_words, story_section
 
-TIME = "time, UTC"
 #: Order of the states on the page.
 STATES = (State.OK, State.DEGRADED, State.STARTING, State.HOLD, State.FAULT, NO_RECORDING)
 #: States in which the offset follows the machine.
@@ -133,9 +134,9 @@ def figures(history: History) -> dict[str, object]:
 
 def span(history: History) -> str:
     """Return the interval that the recordings cover."""
-    first, last = (datetime.fromtimestamp(t, UTC) for t in (history.first_s, history.last_s))
+    first, last = (here(round(t * NS)) for t in (history.first_s, history.last_s))
     same_day = first.date() == last.date()
-    return f"{first:%Y-%m-%d %H:%M} to {last:{'%H:%M' if same_day else '%Y-%m-%d %H:%M'}} UTC"
+    return f"{first:%Y-%m-%d %H:%M} to {last:{'%H:%M' if same_day else '%Y-%m-%d %H:%M'}} {zone(last)}"
 
 
 def verdict(history: History) -> str:
@@ -212,10 +213,11 @@ def _curves(
         note = f"{note} Lines are means; the band spans the lowest and highest values.".strip()
     return Figure(
         title=title,
-        x_label=TIME,
+        x_label=_in_zone("time", history),
         y_label=y_label,
         lines=lines,
         clock=True,
+        local=True,
         height=height,
         note=note,
         x_limits=(history.first_s, history.last_s),
@@ -268,10 +270,11 @@ def _band(history: History) -> Figure:
     shares = [f"{state} {_share(history, state)}" for state in STATES if state in history.states]
     return Figure(
         title="States and reasons",
-        x_label=TIME,
+        x_label=_in_zone("time", history),
         y_label="state, reason",
         strips=tuple(strips),
         clock=True,
+        local=True,
         x_limits=(history.first_s, history.last_s),
         height=1.1 + 0.27 * len(strips),
         note=f"{', '.join(shares)}.",
@@ -295,7 +298,7 @@ def _residual(history: History) -> list[Block]:
         if history.probes_count:
             return []
         return [Words(title="Residual", lines=["Y was not measured: there is no residual."])]
-    note = f"{residual.rms:.2f} µm rms; the largest is {signed(residual.peak, 1)} µm, {_utc(residual.at_s)}."
+    note = f"{residual.rms:.2f} µm rms; the largest is {signed(residual.peak, 1)} µm, {shown(residual.at_s)}."
     return [_curves(history, "Residual, measured − predicted", "residual, µm", {"residual": "residual"}, note)]
 
 
@@ -312,21 +315,22 @@ def _probes(history: History) -> list[Block]:
     if left.samples:
         note += (
             f" Remaining error at these, with the offset applied and the probe's own noise: {left.rms:.2f} µm rms, the "
-            f"largest {signed(left.peak, 1)} µm, {_utc(left.at_s)}."
+            f"largest {signed(left.peak, 1)} µm, {shown(left.at_s)}."
         )
     figure = Figure(
         title="Touch probes, measured against predicted deformation",
-        x_label=TIME,
+        x_label=_in_zone("time", history),
         y_label="Y, µm",
         lines=lines,
         marks=tuple(mark for mark in marks if mark.x.size),
         clock=True,
+        local=True,
         note=note,
         x_limits=(history.first_s, history.last_s),
     )
     rows: list[list[Cell]] = [
         [
-            _utc(probe.at_s),
+            shown(probe.at_s),
             probe.feature or "without a name",
             plain(probe.deformation_um, 2),
             plain(probe.predicted_um, 2),
@@ -336,7 +340,15 @@ def _probes(history: History) -> list[Block]:
         ]
         for probe in history.probes
     ]
-    head = ["time, UTC", "feature", "measured, µm", "predicted, µm", "left with the offset, µm", "", "code"]
+    head = [
+        _in_zone("time", history),
+        "feature",
+        "measured, µm",
+        "predicted, µm",
+        "left with the offset, µm",
+        "",
+        "code",
+    ]
     last = f"The last {PROBES} of {history.probes_count}. " if history.probes_count > PROBES else ""
     words = "Measured: the deformation, measured value less offset applied. Each feature has its own zero."
     return [figure, _folded("Probes", head, rows, f"{last}{words}")]
@@ -426,8 +438,12 @@ def _reasons(history: History) -> Table:
     for reason, stretch in sorted(history.reasons.items(), key=lambda item: -history.reason_seconds[item[0]]):
         meaning, action = explain(reason) or ("", "")
         seconds, last = history.reason_seconds[reason], stretch.pieces[-1][1]
-        rows.append([CodeLink(reason), _minutes(seconds), str(stretch.count), _utc(last), meaning, action])
-    return Table(title="Reasons", rows=rows, head=["reason", "min", "times", "last, UTC", "meaning", "action"])
+        rows.append([CodeLink(reason), _minutes(seconds), str(stretch.count), shown(last), meaning, action])
+    return Table(
+        title="Reasons",
+        rows=rows,
+        head=["reason", "min", "times", _in_zone("last", history), "meaning", "action"],
+    )
 
 
 def _episodes(history: History) -> Block:
@@ -436,11 +452,16 @@ def _episodes(history: History) -> Block:
         for reason in episode.reasons:
             reasons += [", ", CodeLink(reason)] if reasons else [CodeLink(reason)]
         state: Cell = CodeLink(episode.state) if episode.state else NO_RECORDING
-        return [_utc(episode.first_s), _minutes(episode.seconds), state, tuple(reasons)]
+        return [shown(episode.first_s), _minutes(episode.seconds), state, tuple(reasons)]
 
     note = f"The longest {EPISODES} of {history.episodes_count}." if history.episodes_count > EPISODES else ""
     rows = [row(episode) for episode in history.episodes]
-    return _folded("Alarms: every interval not in state ok", ["from, UTC", "min", "state", "reasons"], rows, note)
+    return _folded(
+        "Alarms: every interval not in state ok",
+        [_in_zone("from", history), "min", "state", "reasons"],
+        rows,
+        note,
+    )
 
 
 def _days(history: History) -> list[Block]:
@@ -517,9 +538,9 @@ def _codes(counts: Mapping[str, int]) -> Cell:
 
 
 def _events(history: History) -> Block:
-    rows: list[list[Cell]] = [[_utc(t), kind, text] for t, kind, text in history.events]
+    rows: list[list[Cell]] = [[shown(t), kind, text] for t, kind, text in history.events]
     note = f"The last {EVENTS} of {history.events_count}." if history.events_count > EVENTS else ""
-    return _folded("Events", ["time, UTC", "kind", "event"], rows, note)
+    return _folded("Events", [_in_zone("time", history), "kind", "event"], rows, note)
 
 
 def _files(history: History) -> Details:
@@ -527,23 +548,29 @@ def _files(history: History) -> Details:
         [
             file.name,
             str(file.samples),
-            _utc(file.first_s),
-            _utc(file.last_s),
+            shown(file.first_s),
+            shown(file.last_s),
             CodeLink(file.end) if isinstance(file.end, RecordingEnd) else file.end,
         ]
         for file in history.files
     ]
-    models: list[list[Cell]] = [[name, _utc(first), sha] for sha, (name, first) in history.models.items()]
+    models: list[list[Cell]] = [[name, shown(first), sha] for sha, (name, first) in history.models.items()]
     return Details(
         title=f"{len(files)} recording(s), {len(models)} model(s)",
         blocks=[
             Table(
                 title="Recordings",
-                head=["file", "samples", "first, UTC", "last, UTC", "end"],
+                head=[
+                    "file",
+                    "samples",
+                    _in_zone("first", history),
+                    _in_zone("last", history),
+                    "end",
+                ],
                 rows=files,
                 note="Integrity is not checked here; use compensator replay.",
             ),
-            Table(title="Models", head=["model", "from, UTC", "SHA-256"], rows=models),
+            Table(title="Models", head=["model", _in_zone("from", history), "SHA-256"], rows=models),
         ],
     )
 
@@ -559,12 +586,17 @@ def _folded(title: str, head: Sequence[str], rows: Sequence[Sequence[Cell]], not
 # ---------------------------------------------------------------------------- text
 
 
-def _utc(t_s: float) -> str:
-    return "–" if math.isnan(t_s) else f"{datetime.fromtimestamp(t_s, UTC):%Y-%m-%d %H:%M}"
+def _in_zone(words: str, history: History) -> str:
+    """Return the label of a time with its zone."""
+    return f"{words}, {zone_at(history.last_s)}"
+
+
+def _utc(t_s: float) -> str | None:
+    return None if math.isnan(t_s) else f"{datetime.fromtimestamp(t_s, UTC):%Y-%m-%d %H:%M}"
 
 
 def _at(spread: Spread) -> str:
-    return "" if math.isnan(spread.at_s) else _utc(spread.at_s)
+    return "" if math.isnan(spread.at_s) else shown(spread.at_s)
 
 
 def _minutes(seconds: float) -> str:

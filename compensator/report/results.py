@@ -67,7 +67,8 @@ def _calibration(page: Path) -> PageFile | None:
         with suppress(OSError, ValueError, KeyError, TypeError, IndexError):
             model = parse_toml(read_file(path, MODEL_BYTES))
             origin = model["provenance"]
-            errors = {"parts": origin["parts"], "folds_rms_um": origin[HELD_OUT_KEY]}
+            errors = {name: origin[name] for name in ("free_run", "parts") if name in origin}
+            errors["folds_rms_um"] = origin[HELD_OUT_KEY]
             title = f"Calibration: {model['name']}"
             return PageFile(path=page, title=title, verdict=calibration_verdict(errors), tone=tone_of(errors))
     return None

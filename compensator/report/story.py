@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from compensator.events import (
     data_of,
 )
 from compensator.messages import Event
+from compensator.report.local_time import shown, zone_at
 from compensator.report.notation import plain
 from compensator.report.page import Block, Cell, Details, Figure, Line, Marks, Section, Strip, Table, Words
 
@@ -244,12 +244,13 @@ def _picture(story: Story, left_by_day: Mapping[float, float], x_limits: tuple[f
             marks.append(Marks(WORDS[what], at, np.full(at.size, height * top), marker=marker))  # type: ignore[arg-type]
     return Figure(
         title="Error that is left, day by day, and changes of the model",
-        x_label="time, UTC",
+        x_label=f"time, {zone_at(x_limits[1])}",
         y_label="error in Y, µm rms",
         lines=(Line("left with the offset applied", x, y),),
         marks=tuple(marks),
         limits=(0.0,),
         clock=True,
+        local=True,
         x_limits=x_limits,
         note="Each step is a day. Measured + offset, or what touch probes found; a day without measured Y is a gap.",
     )
@@ -268,10 +269,11 @@ def _strips(
     ]
     return Figure(
         title="Which model was in force",
-        x_label="time, UTC",
+        x_label=f"time, {zone_at(x_limits[1])}",
         y_label="model",
         strips=tuple(strips),
         clock=True,
+        local=True,
         x_limits=x_limits,
         height=1.1 + 0.27 * len(strips),
         note=f"The last {_MODELS} of {len(in_force)} models." if len(in_force) > _MODELS else "",
@@ -285,7 +287,14 @@ def _model(sha: str, names: Mapping[str, str], effects: Mapping[str, Sequence[st
 
 def story_tables(story: Story) -> list[Block]:
     """Return every decision with its figures, and all steps in words."""
-    head = ["time, UTC", "what", "by", "model, effects", "error, µm rms", "on what"]
+    head = [
+        f"time, {zone_at(story.steps[-1].at_s if story.steps else math.nan)}",
+        "what",
+        "by",
+        "model, effects",
+        "error, µm rms",
+        "on what",
+    ]
     told = [step for step in story.steps if step.what != LoopAction.NOTHING]
     blocks: list[Block] = []
     if told:
@@ -294,7 +303,7 @@ def story_tables(story: Story) -> list[Block]:
             "that were compared; σ: by how many standard deviations of the difference the other one is better."
         )
         blocks.append(Table(head=head, rows=[_row(step) for step in told], note=note))
-    lines: list[Cell] = [f"{_utc(step.at_s)}: {step.text}" for step in story.steps]
+    lines: list[Cell] = [f"{shown(step.at_s)}: {step.text}" for step in story.steps]
     if lines:
         blocks.append(Details(title=f"All {len(lines)} steps in words", blocks=[Words(title="", lines=lines)]))
     return blocks
@@ -308,8 +317,4 @@ def _row(step: Step) -> list[Cell]:
         measured = f"{found.probes} probes" if found.measured_by == "probe" else f"{found.hours:.3g} h"
         deviations = "" if found.deviations is None else f", {plain(found.deviations, 1)} σ"
         figures = [f"{found.present_rms_um:.1f} → {found.candidate_rms_um:.1f}", f"{measured}{deviations}"]
-    return [_utc(step.at_s), WORDS.get(step.what, step.what), step.by, model, *figures]
-
-
-def _utc(t_s: float) -> str:
-    return "–" if math.isnan(t_s) else f"{datetime.fromtimestamp(t_s, UTC):%Y-%m-%d %H:%M}"
+    return [shown(step.at_s), WORDS.get(step.what, step.what), step.by, model, *figures]

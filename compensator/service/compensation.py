@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import msgspec
 
 from compensator.arrays import NAN
+from compensator.clock import NS
 from compensator.codes import Reason, SampleQuality, State
 from compensator.config import Config
 from compensator.errors import DataError, ServiceError
@@ -65,7 +66,11 @@ class Compensation:
         names = {channel.name for channel in config.channel}
         missing = [name for name in self._engine.channels if name not in names]
         if missing:
-            raise ServiceError(f"model {model.name}: an effect needs channel {missing[0]!r}, which is not configured")
+            names_missing = " and ".join(map(repr, missing))
+            raise ServiceError(
+                f"model {model.name}: an effect needs channel {names_missing}, which is not configured; `compensator "
+                "check` prints the lines to paste"
+            )
         self._guards = SensorGuards(config.channel, config.guards, self._period_min)
         self.plausibility = PlausibilityCheck(config, model)
         self._jumps = JumpWatch(config, model)
@@ -159,6 +164,15 @@ class Compensation:
     def wanted(self) -> Wanted | None:
         """Whether a probe is wanted after the last sample; None without `[probe]`."""
         return self.probing.wanted(self._prediction().std_um) if self.probing is not None else None
+
+    @property
+    def predicts_until_ns(self) -> int | None:
+        """Time of the sample that is held if the missing temperature does not return; None while none is missing."""
+        memory, predict_min = self._memory, self._config.loss.predict_for_min
+        if not 0.0 < memory.missing_min <= predict_min:
+            return None
+        samples = math.floor((predict_min - memory.missing_min) / self._period_min + 1e-9) + 1
+        return memory.time_utc_ns + round(samples * self._period_min * 60.0 * NS)
 
     @property
     def bridge_max_min(self) -> float:

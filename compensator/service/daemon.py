@@ -411,6 +411,9 @@ class Daemon:
         loop = self._loop.status() if self._loop is not None else None
         if loop is not None:
             status = replace_fields(status, loop=loop)
+        until_ns = self._compensation.predicts_until_ns
+        if until_ns is not None:
+            status = replace_fields(status, predicts_until_utc_ns=until_ns)
         wanted = self._compensation.wanted
         if wanted is None:
             return status

@@ -10,8 +10,9 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from compensator.clock import NS
+from compensator.report.local_time import here
 from compensator.report.notation import plain
-from compensator.watch.words import TONES, here
+from compensator.watch.words import TONES
 
 _BARS = "▁▂▃▄▅▆▇█"
 #: Bar of each severity: higher is worse, so that the strip is readable without colour.

@@ -26,7 +26,7 @@ const day = (t_s) => new Date(1000 * t_s).toLocaleDateString("en-CA");
 const stamp = (t_s) => `${day(t_s)} ${clock(t_s, true)}`;
 const age = (s) => !known(s) ? "–" : s < 120 ? `${Math.max(s, 0).toFixed(0)} s` : s < 3600 ? `${Math.floor(s / 60)} min`
   : s < 172800 ? `${Math.floor(s / 3600)} h ${Math.floor(s % 3600 / 60)} min` : `${(s / 86400).toFixed(1)} d`;
-const wordLink = (code) => make("a", {href: `#word=${code.split(":")[0]}`}, code);
+const wordLink = (code) => make("a", {href: `#word=${$(`word=${code}`) ? code : code.split(":")[0]}`}, code);
 const alive = (machine) => ({true: "alive", false: "gone", null: "unknown"})[String(machine.alive)];
 
 // ---------------------------------------------------------------- requests
@@ -45,7 +45,7 @@ async function ask(path) {
 
 async function update() {
   try {
-    const shop = await ask("/shop.json");
+    const shop = await ask("shop.json");
     const prefix = selected(shop.machines);
     lastAnswer = new Date();
     if (prefix === null || !shop.machines.some((one) => one.prefix === prefix)) showShop(shop, prefix);
@@ -82,7 +82,7 @@ function showShop(shop, missing) {
   if (missing !== null) verdict("bad", "Silent", `No messages from ${missing}.`);
   else verdict(tone, {good: "All ok", warn: "Caution", bad: "Attention"}[tone], shop.headline);
   const severe = shop.machines.filter((one) => one.tone !== "good");
-  const lines = severe.slice(0, MOST_ACTIONS).map((one) => [make("b", {}, `${SIGNS[one.tone]} ${one.prefix} ${one.shown}: `), one.to_do]);
+  const lines = severe.slice(0, MOST_ACTIONS).map((one) => [make("b", {}, `${SIGNS[one.tone]} ${one.prefix} ${one.shown}: ${one.headline.word}. `), one.headline.text]);
   if (severe.length > MOST_ACTIONS) lines.push([`… and ${severe.length - MOST_ACTIONS} more.`]);
   list("actions", lines, "warning");
   const body = $("machines").tBodies[0], focused = document.activeElement && document.activeElement.id;
@@ -119,14 +119,15 @@ async function showOne(prefix, count) {
   const times = past.history ? past.history.t_s : [];
   // The newest points are requested again: their values come in several messages.
   const since = times.length ? Math.max(times[times.length - 1] - 300, 0) : 0;
-  const found = await ask(`/machine.json?prefix=${encodeURIComponent(prefix)}&since_s=${since}`);
+  const found = await ask(`machine.json?prefix=${encodeURIComponent(prefix)}&since_s=${since}`);
   const machine = found.machine;
   effects = found.effects;
   past.history = joined(past.history, found.history, found.now_s);
   $("shop").hidden = true; $("machine").hidden = false; $("all").hidden = count < 2;
   setText($("title"), machine.machine === prefix ? prefix : `${machine.machine} (${prefix})`);
   document.title = `${SIGNS[machine.tone]} ${machine.machine} ${machine.shown}`;
-  verdict(machine.tone, machine.shown, sentence(machine));
+  verdict(machine.tone, machine.headline.word, machine.headline.text);
+  setText($("state"), `${machine.shown}: ${sentence(machine)}`);
   pictures(machine, past.history, found.now_s);
   list("reasons", machine.reasons.map((reason) => [wordLink(reason.code), `: ${reason.means} `, make("b", {}, "Action: "), reason.do]), "warning");
   list("warnings", machine.warnings.map((text, i) => [text, " ", wordLink(machine.warning_codes[i])]), "warning");
@@ -145,8 +146,7 @@ function sentence(machine) {
   const offset = `${signed(machine.y_offset_um)} µm`;
   if (machine.shown === "silent") return `for ${age(machine.age_s)}; the last offset was ${offset}. ${machine.means} ${machine.do}`;
   if (machine.shown === "unknown") return `${machine.means} ${machine.do}`;
-  const rest = machine.tone === "good" ? "" : machine.shown === "ok" ? " See the warnings below." : ` ${machine.do}`;
-  return `${known(machine.y_offset_um) ? `offset ${offset}` : "no offset"}. ${machine.means}${rest}`;
+  return `${known(machine.y_offset_um) ? `offset ${offset}` : "no offset"}. ${machine.means}`;
 }
 
 function list(id, lines, kind) {

@@ -7,12 +7,13 @@ from collections import deque
 from typing import Any
 
 import msgspec
-from msgspec import UnsetType
+from msgspec import UNSET, UnsetType
 
 from compensator.clock import NS
 from compensator.codes import Reason, Remark, State, WatchWarning
 from compensator.events import EventKind
 from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offset, Sample, Status
+from compensator.watch.cutting import Headline, headline
 from compensator.watch.history import MachineHistory, usable
 from compensator.watch.sequence import Sequence
 from compensator.watch.words import LOOP_COMMANDS, TONES, ExplainedCode, Tone, age, explained, loop_text, to_do
@@ -266,6 +267,7 @@ class WatchedMachine:
             "alive": self.alive,
             "reasons": [words._asdict() for words in reasons],
             "to_do": _to_do(shown, reasons, warnings),
+            "headline": self._headline(shown, _tone(shown, warnings), now_ns)._asdict(),
             "warnings": list(warnings),
             "warning_codes": [warning.code for warning in warnings],
             "age_s": round(old_s, 3) if old_s is not None else None,
@@ -287,6 +289,20 @@ class WatchedMachine:
             found["loop"] = loop
         found["probe"] = self._probe(status) if self._fresh(status, now_ns) else None
         return found | {name: getattr(status, name, None) for name in _STATUS}
+
+    def _headline(self, shown: str, tone: str, now_ns: int) -> Headline:
+        """Return whether one may cut, and until when."""
+        status = self._status if self._fresh(self._status, now_ns) else None
+        until = status.predicts_until_utc_ns if status is not None else UNSET
+        return headline(
+            shown=shown,
+            tone=tone,
+            reasons=self._offset.reasons if self._offset is not None else (),
+            channels=self._measured(now_ns)["channels"],
+            until_ns=None if isinstance(until, UnsetType) else until,
+            now_ns=now_ns,
+            std_um=self._offset.y_offset_std_um if self._offset is not None else None,
+        )
 
     @staticmethod
     def _probe(status: Status | None) -> dict[str, Any] | None:

@@ -1,16 +1,19 @@
-"""Server of the live page: one HTML file and JSON, on loopback only.
+"""Server of the live page: one HTML file and JSON, on loopback, or on purpose on the shop's network.
 
-Only users of this computer can read it. Requests with another host name (DNS rebinding) are refused, nothing can be
-changed, and the page loads nothing from other servers.
+On loopback only users of this computer can read it, and requests with another host name (DNS rebinding) are refused.
+Bound to another address the page is below a token: whoever does not have the whole address gets nothing. Nothing can
+be changed through it, and the page loads nothing from other servers.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import hmac
 import html
 import json
 import re
+import socket
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -22,13 +25,15 @@ from urllib.parse import parse_qs, urlsplit
 
 from compensator import __version__
 from compensator.clock import NS
-from compensator.codes import WORDS
-from compensator.errors import ServiceError
+from compensator.codes import SUFFIX_WORDS, WORDS
+from compensator.errors import ServiceError, UsageError
 from compensator.watch.history import state_intervals
 from compensator.watch.shop import Shop, headline
 
-#: The only address to which the server is bound.
+#: The address to which the server is bound without a token.
 HOST = "127.0.0.1"
+#: Shortest token: as many characters of a URL-safe alphabet cannot be guessed.
+TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}", re.ASCII)
 #: A time in a request, s since 1970: no more digits than any has.
 _SECONDS = re.compile(r"[0-9]{1,12}(\.[0-9]{0,9})?", re.ASCII)
 #: Largest number of intervals in one state on the page.
@@ -48,24 +53,42 @@ class PageServer:
         Returns the status of the watch: `connected`, `where`, `prefix`, `ignored`.
     port : int
         0 selects a free port.
+    host : str
+        Address of this computer to which it is bound.
+    token : str
+        First part of every path; empty on loopback only.
+
+    Raises
+    ------
+    UsageError
+        If another address than loopback has no token, or the token can be guessed.
     """
 
-    def __init__(self, shop: Shop, status: Callable[[], dict[str, Any]], port: int) -> None:
-        self._shop, self._status, self._port = shop, status, port
+    def __init__(
+        self, shop: Shop, status: Callable[[], dict[str, Any]], port: int, *, host: str = HOST, token: str = ""
+    ) -> None:
+        if (host != HOST or token) and not TOKEN.fullmatch(token):
+            raise UsageError("token: expected 16 to 128 letters, digits, - or _")
+        self._shop, self._status, self._port, self._host, self._token = shop, status, port, host, token
         self._server: ThreadingHTTPServer | None = None
         self._thread: threading.Thread | None = None
 
     @property
     def address(self) -> str:
         """Address of the page."""
-        return f"http://{HOST}:{self._server.server_port if self._server else self._port}/"
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"http://{host}:{self._server.server_port if self._server else self._port}/" + (
+            f"{self._token}/" if self._token else ""
+        )
 
     def __enter__(self) -> PageServer:
         try:
-            self._server = _Server((HOST, self._port), _Handler)
+            server = _Server6 if ":" in self._host else _Server
+            self._server = server((self._host, self._port), _Handler)
         except (OSError, OverflowError) as error:
-            raise ServiceError(f"--port {self._port}: {error}; 0 selects a free port") from error
-        self._server.answer = self._answer
+            where = f"--port {self._port}" if self._host == HOST else f"--bind {self._host} --port {self._port}"
+            raise ServiceError(f"{where}: {error}; 0 selects a free port") from error
+        self._server.answer, self._server.token = self._answer, self._token
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="live page")
         self._thread.start()
         return self
@@ -114,7 +137,7 @@ def page() -> tuple[bytes, str]:
     words = "".join(
         f'<dt id="word={code}"><code>{code}</code></dt>'
         f"<dd>{html.escape(meaning)} <b>Action:</b> {html.escape(action)}</dd>"
-        for code, (meaning, action) in WORDS.items()
+        for code, (meaning, action) in {**WORDS, **SUFFIX_WORDS}.items()
     )
     text = part("compensator.watch", "live.html")
     for name, filled in (("style", style), ("words", words), ("version", __version__), ("script", script)):
@@ -132,6 +155,11 @@ class _Server(ThreadingHTTPServer):
     # Otherwise another program could use the same port.
     allow_reuse_port = False
     answer: Callable[[str, dict[str, list[str]]], tuple[str, bytes] | None]
+    token: str = ""
+
+
+class _Server6(_Server):
+    address_family = socket.AF_INET6
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -148,7 +176,8 @@ class _Handler(BaseHTTPRequestHandler):
             # 421: the host name in the request is not that of this server.
             return self._send(HTTPStatus.MISDIRECTED_REQUEST, "text/plain", b"expected this page by its own address\n")
         parts = urlsplit(self.path)
-        found = self.server.answer(parts.path, parse_qs(parts.query))
+        path = self._below_token(parts.path)
+        found = self.server.answer(path, parse_qs(parts.query)) if path is not None else None
         if found is None:
             return self._send(HTTPStatus.NOT_FOUND, "text/plain", b"not found\n")
         return self._send(HTTPStatus.OK, *found)
@@ -161,7 +190,19 @@ class _Handler(BaseHTTPRequestHandler):
             return lambda: self._send(HTTPStatus.METHOD_NOT_ALLOWED, "text/plain", b"expected GET\n")
         raise AttributeError(name)
 
+    def _below_token(self, path: str) -> str | None:
+        """Return the path without its token; None if it has not the right one."""
+        if not self.server.token:
+            return path
+        _, given, rest = [*path.split("/", 2), "", ""][:3]
+        right = hmac.compare_digest(given.encode("utf-8", "replace"), self.server.token.encode())
+        # Without the last slash the page's own requests would miss the token.
+        return f"/{rest}" if right and path.count("/") > 1 else None
+
     def _has_own_host(self) -> bool:
+        if self.server.token:
+            # The token protects as well as the name: a foreign page does not know it.
+            return True
         port = self.server.server_port
         return self.headers.get("Host", "") in (f"{HOST}:{port}", f"localhost:{port}")
 

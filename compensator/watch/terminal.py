@@ -12,12 +12,13 @@ from rich.table import Table
 from rich.text import Text
 
 from compensator.clock import NS
-from compensator.codes import SampleQuality, State, WatchWarning
+from compensator.codes import SampleQuality, WatchWarning
+from compensator.report.local_time import here, zone
 from compensator.report.notation import plain, signed
 from compensator.watch.day import STYLES, drawn, evenly, sparkline
 from compensator.watch.history import StateInterval, state_intervals
 from compensator.watch.shop import Shop, headline
-from compensator.watch.words import SIGNS, age, here, probe_text, zone
+from compensator.watch.words import SIGNS, age, probe_text
 
 #: Columns of the table of a shop: heading, minimum width of the terminal.
 _COLUMNS = (
@@ -36,8 +37,6 @@ _COLUMNS = (
 )
 #: Numbers of events and of intervals in one state shown for one machine.
 EVENTS, INTERVALS = 6, 4
-#: Action for a machine in state ok that has warnings.
-BELOW = "See the warnings below."
 #: Minimum height of a terminal for the complete view.
 TALL = 44
 #: Lists above the numbers; the other lists follow the last day.
@@ -89,7 +88,10 @@ def _to_do(machines: Sequence[dict[str, Any]], width: int, rows: int) -> list[Re
     """Return the actions by machine, as far as they fit below the table."""
     lines: list[RenderableType] = []
     for machine in machines:
-        text = Text(f"{SIGNS[machine['tone']]} {machine['prefix']} {machine['shown']}: {machine['to_do']}")
+        found = machine["headline"]
+        text = Text(
+            f"{SIGNS[machine['tone']]} {machine['prefix']} {machine['shown']}: {found['word']}. {found['text']}"
+        )
         rows -= -(-text.cell_len // max(width - 2, 1))
         if machine["tone"] == "good" or rows < 1:
             break
@@ -228,17 +230,19 @@ def _loop_lines(machine: dict[str, Any]) -> list[str]:
 
 
 def _verdict(machine: dict[str, Any]) -> Text:
-    text = state(machine)
+    """Return whether one may cut, why, and the state with the offset."""
+    found, style = machine["headline"], STYLES[machine["tone"]]
+    text = Text(f"{SIGNS[machine['tone']]} {found['word']}", style=f"bold {style}")
+    text.append(f"  {found['text']}\n", style="")
     old = age(machine["age_s"]) if machine["age_s"] is not None else ""
+    text.append(machine["shown"], style=style)
     if machine["shown"] == WatchWarning.SILENT:
         text.append(f" for {old}; the last offset was {signed(machine['y_offset_um'])} µm", style="bold red")
     elif machine["y_offset_um"] is None and machine["shown"] != WatchWarning.UNKNOWN:
         text.append(f"  no offset, {old} old", style="bold")
     elif machine["shown"] != WatchWarning.UNKNOWN:
         text.append(f"  offset {signed(machine['y_offset_um'])} µm, {old} old", style="bold")
-    text.append(f"\n{machine['means']}", style="")
-    if machine["tone"] != "good":
-        text.append(f" {machine['do'] if machine['shown'] != State.OK else BELOW}")
+    text.append(f"\n{machine['means']}", style="dim")
     return text
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from typing import Any, Literal, NamedTuple
 
-from compensator.clock import NS
 from compensator.codes import State, WatchWarning, explain
 from compensator.events import EventKind, LoopAction, RecordingCode, RecordingData, data_of
 from compensator.messages import Event
+from compensator.report.local_time import here
 from compensator.report.notation import plain
 
 Tone = Literal["good", "warn", "bad"]
@@ -132,30 +131,6 @@ def loop_text(loop: Mapping[str, Any]) -> str:
     }
     text = words[loop["phase"]]
     return f"{text} A diagnosis is in progress." if loop["diagnosing"] else text
-
-
-def here(time_ns: int) -> datetime:
-    """Return a time in this computer's zone; recordings and messages stay in UTC.
-
-    Parameters
-    ----------
-    time_ns : int
-        ns since 1970 UTC.
-    """
-    return datetime.fromtimestamp(time_ns / NS, UTC).astimezone()
-
-
-def zone(time: datetime) -> str:
-    """Return the time zone of a local time with its offset from UTC.
-
-    Examples
-    --------
-    >>> from datetime import timedelta, timezone
-    >>> zone(datetime(2026, 1, 5, tzinfo=timezone(timedelta(hours=1), "CET"))), zone(datetime(2026, 1, 5, tzinfo=UTC))
-    ('CET (UTC+01:00)', 'UTC')
-    """
-    name, ahead = f"{time:%Z}", f"{time:%z}"
-    return "UTC" if name == "UTC" else f"{name} (UTC{ahead[:3]}:{ahead[3:5]})"
 
 
 def age(seconds: float) -> str:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 import compensator as tc
 from compensator.api.simulation_result import SimulationResult
 from compensator.display import with_std
+from compensator.model.free_run import TITLE
 from tests.api.tables import arrays, frame, write_run
 from tests.identify.quill_runs import CALIBRATION_W, VALIDATION_W
 
@@ -61,7 +62,11 @@ def test_an_identification_shows_draws_and_writes_itself(tmp_path: Path, found: 
 def test_terminal_notebook_and_page_show_the_same_tables(tmp_path: Path, found: object) -> None:
     page = found.page(tmp_path / "page.html").read_text(encoding="utf-8")
     tables = found.tables()
-    assert [table.title for table in tables] == ["Gains and time constants", "Errors in free run"]
+    assert [table.title for table in tables] == [
+        "Gains and time constants",
+        TITLE,
+        "Errors of the fit: zero from the data",
+    ]
     for shown in (page, found._repr_html_(), found.summary()):
         for table in tables:
             assert all(html.escape(cell) in shown for row in table.rows for cell in row)
@@ -112,7 +117,7 @@ def test_a_diagnosis_shows_draws_and_writes_itself(tmp_path: Path, run: Path) ->
 def test_a_free_run_shows_and_draws_itself(run: Path) -> None:
     out = tc.simulate("quill", arrays(run))
     assert isinstance(out, SimulationResult)
-    assert "720 samples" in repr(out) and "rms µm" in out._repr_html_()
+    assert "720 samples" in repr(out) and "about zero" in out._repr_html_()
     assert len(shown(out)) > 5_000
     without = {name: values for name, values in arrays(run).items() if name != "y_um"}
     alone = tc.simulate("quill", without)

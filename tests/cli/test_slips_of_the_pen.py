@@ -40,8 +40,14 @@ def refused(capsys: pytest.CaptureFixture[str], words: list[str], *expected: str
         (b"\x1f\x8brest", "gzip"),
         (b"\x7fELF\xff", "expected a table"),
         (b"", "empty"),
-        (b"t_s;t_q_degc;at_degc\n0;20,1;20,1\n", "semicolons"),
-        (b"t_s\tt_q_degc\n0\t20\n", "tabs"),
+        (
+            b"t_s;t_q_degc;at_degc\n0;20,1;20,1\n60;20.1;20,2\n",
+            "row 3: t_q_degc = '20.1' in a table with decimal commas",
+        ),
+        (
+            b"t_s,t_q_degc,at_degc,oil\n" + b"".join(b"%d,2,2,3\n" % i for i in range(0, 900, 60)) + b"960,2,2,#NV\n",
+            "row 17: oil = '#NV'",
+        ),
         (b"t_s,at_degc,at_degc\n0,1,2\n", "'at_degc' twice"),
         (b"t_s,t_q_degc,at_degc\n0,20,20\n60000,21,20\n120000,21,20\n", "in seconds?"),
     ],

@@ -21,7 +21,8 @@ import pytest
 
 from compensator.cli import main
 from compensator.clock import NS
-from compensator.demo.live import apply_fault, run_live
+from compensator.config import load_config
+from compensator.demo.live import STUCK_AFTER_MIN, _noticing, apply_fault, run_live
 from compensator.demo.machine import CapaNcdt, configuration, hardware
 from compensator.messages import Offset
 from compensator.recording.reading import read_messages, recordings
@@ -85,6 +86,19 @@ def test_typing_breaks_a_sensor_and_mends_it(tmp_path: Path) -> None:
             assert readings(config) == sound, line
 
 
+def test_what_is_promised_of_a_frozen_value_is_what_is_configured(tmp_path: Path) -> None:
+    faults = {name: (Faults(), 0) for name in STUCK_AFTER_MIN}
+    duty = Duty.working_day(1, hours=1.0)
+    with hardware(World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 1)) as devices:
+        config = tmp_path / "machine.toml"
+        config.write_text(_noticing(configuration("vmc-07", devices.lines, 7447)), encoding="utf-8")
+    for channel, (name, minutes) in zip(("t_q_degc", "at_degc", "y_um"), STUCK_AFTER_MIN.items(), strict=True):
+        (one,) = [c for c in load_config(config).config.channel if c.name == channel]
+        assert one.stuck_after_min == minutes
+        promised = float(apply_fault(f"freeze {name}", faults).split("within ")[1].split()[0])
+        assert minutes < promised <= minutes + 2.0
+
+
 def test_a_value_can_be_made_to_stand_still() -> None:
     faults = {"t_q": (Faults(), 0)}
     apply_fault("freeze t_q", faults)
@@ -141,7 +155,7 @@ def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest
         assert any("Ctrl-C ends the demo" in line for line in process.stderr)
         process.stdin.write("break t_q\n")
         process.stdin.flush()
-        assert any(line == "break t_q: done; visible within two minutes\n" for line in process.stderr)
+        assert any(line == "break t_q: done; visible within 2 minutes\n" for line in process.stderr)
         assert main(command) == 1, "a second one in the same folder is refused, and leaves alone what is there"
         assert "locked by another service of vmc-07" in capfd.readouterr().err
         process.send_signal(signal.SIGINT)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -438,6 +439,8 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
         remainder: Remainder | None = None
         ceiling: Ceiling | None = None
         advice = could_hide = None
+        model = SimpleNamespace(channels=())
+        evidence = SimpleNamespace(model=model)
 
     found: Any = Bare()
     assert figures(found)["remainder"] is None and figures(found)["ceiling"] is None

@@ -21,8 +21,17 @@ SCHEMES = [
     dict(re.findall(r"(--[\w-]+): (#[0-9a-f]{6})", scheme)) for scheme in re.findall(r":root \{(.*?)\}", STYLE, re.S)
 ]
 #: Axes that have no unit.
-NO_UNIT = {"correlation", "day of the run, 1 to 10", "model", "real part", "imaginary part", "state, reason", "outcome"}
-UNIT = re.compile(r", (h|UTC|µm|W|K|°C|samples|1/min|1/h|%)$|^(µm|K)/(W|K)( per sample)?$|^degrees$")
+NO_UNIT = {
+    "correlation",
+    "day of the run, 1 to 10",
+    "mode",
+    "model",
+    "real part",
+    "imaginary part",
+    "state, reason",
+    "outcome",
+}
+UNIT = re.compile(r", (h|min|UTC|µm|W|K|°C|samples|1/min|1/h|%)$|^(µm|K)/(W|K)( per sample)?$|^degrees$")
 
 
 @dataclass

@@ -134,7 +134,7 @@ def test_malformed_messages_are_counted_and_change_nothing(heard: Heard, payload
     after = heard.machine
     assert after["malformed"] == 1 and after["last_malformed"].startswith("offset:") and after["tone"] == "warn"
     changed = {name for name in before if before[name] != after[name]}
-    assert changed == {"malformed", "last_malformed", "warnings", "warning_codes", "to_do", "tone"}
+    assert changed == {"malformed", "last_malformed", "warnings", "warning_codes", "to_do", "tone", "headline"}
     assert after["to_do"].startswith("1 malformed") and after["to_do"].endswith(
         "which programs publish below the prefix."
     )

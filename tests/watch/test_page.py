@@ -16,7 +16,8 @@ import pytest
 
 from compensator.clock import NS
 from compensator.codes import WORDS
-from compensator.errors import ServiceError
+from compensator.commands.watch import _token
+from compensator.errors import ServiceError, UsageError
 from compensator.watch.server import PageServer
 from compensator.watch.shop import Shop
 from tests.watch.heard import START_NS, Clock, estimate, event, offset, sample, status
@@ -95,6 +96,44 @@ def test_a_name_that_is_not_its_own_is_refused(server: PageServer, host: str) ->
         assert code == 421 and b"vmc" not in body
 
 
+def test_bound_to_another_address_it_answers_below_its_token_only(tmp_path: Path) -> None:
+    token = "Zm9vYmFyYmF6cXV4MDEyMw"
+    with PageServer(filled(), lambda: STATUS, 0, host="127.0.0.2", token=token) as served:
+        port = int(served.address.split(":")[2].split("/")[0])
+        assert served.address == f"http://127.0.0.2:{port}/{token}/"
+
+        def code_of(path: str, method: str = "GET") -> int:
+            connection = http.client.HTTPConnection("127.0.0.2", port, timeout=30)
+            connection.request(method, path)
+            answer = connection.getresponse()
+            body = answer.read()
+            assert answer.status == 200 or b"vmc" not in body
+            connection.close()
+            return answer.status
+
+        for path in ("", "shop.json", "machine.json?prefix=shop%2Fvmc-07"):
+            assert code_of(f"/{token}/{path}") == 200
+            for wrong in ("", f"{token[:-1]}/", f"{token}x/", "%5A/"):
+                assert code_of(f"/{wrong}{path}") == 404, wrong
+        assert code_of(f"/{token}") == 404
+        assert code_of(f"/{token}/shop.json", "POST") == 405
+        text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 390)
+        assert console == "" and "✓ May cut</b>" in text
+
+
+@pytest.mark.parametrize("token", ["", "short", "with space in it 1234", "../../etc/passwd-x"])
+def test_another_address_without_a_good_token_is_refused(token: str) -> None:
+    with pytest.raises(UsageError, match="token: expected 16 to 128"):
+        PageServer(Shop(Clock()), lambda: STATUS, 0, host="127.0.0.2", token=token)
+
+
+def test_a_token_is_made_once_and_kept_for_its_owner_only(tmp_path: Path) -> None:
+    path = tmp_path / "token"
+    made = _token(path)
+    assert _token(path) == made and path.stat().st_mode & 0o077 == 0
+    assert _token(None) != _token(None)
+
+
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE"])
 def test_nothing_but_looking_is_answered(server: PageServer, method: str) -> None:
     assert ask(server, "/shop.json", method)[0] == 405
@@ -151,7 +190,7 @@ def drawn(address: str, folder: Path, width: int, zone: str = "UTC", scheme: int
 def test_a_browser_draws_one_machine_and_takes_nothing_for_code(server: PageServer, tmp_path: Path) -> None:
     text, console = drawn(f"{server.address}#m=shop%2Fvmc-07", tmp_path, 1400)
     assert console == ""
-    assert text.count("<figure>") == 4 and "✓ ok</b>offset −59.67 µm" in text
+    assert text.count("<figure>") == 4 and "✓ May cut</b>" in text and "ok: offset −59.67 µm" in text
     # T_Q is missing for half an hour: its curve has two parts, the offset's has one.
     curves = re.findall(r'<path d="([^"]*)" class="curve c0">', text)
     parts = [curve.count("M") for curve in curves if curve != "M0 6H32"]
@@ -173,7 +212,7 @@ def test_the_shop_says_what_to_do_and_times_are_of_the_viewers_zone(tmp_path: Pa
     with PageServer(shop, lambda: STATUS, 0) as served:
         text, console = drawn(served.address, tmp_path, 400)
         assert console == ""
-        assert "<li><b>✗ shop/vmc-07 hold: </b>Send the command resume.</li>" in text
+        assert "<li><b>✗ shop/vmc-07 hold: Do not cut to size. </b>An operator has frozen the offset. Send" in text
         text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 1400, zone="Asia/Tokyo")
     assert console == ""
     assert "Asia/Tokyo, UTC+09:00" in text and text.count("time of day, UTC+09:00") == 4

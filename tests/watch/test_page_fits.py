@@ -84,10 +84,10 @@ def shop_in_trouble() -> Shop:
     [
         ("", "Attention6 machines", 0),
         ("", "Attention6 machines", 1),
-        ("hold", "hold", 0),
-        ("hold", "hold", 1),
-        ("starting", "startingno offset", 1),
-        ("silent", "silentfor 30 min", 0),
+        ("hold", "Do not cut to sizeAn operator has frozen", 0),
+        ("hold", "Do not cut to sizeAn operator has frozen", 1),
+        ("starting", "Do not cut to sizeNo zero", 1),
+        ("silent", "Do not cut to sizeThe last offset", 0),
     ],
 )
 def test_nothing_sticks_out(

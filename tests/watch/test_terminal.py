@@ -85,7 +85,11 @@ def test_silence_and_a_lost_connection_are_said() -> None:
     shop, clock = filled("vmc-01")
     clock.advance(600)
     text = " ".join(shown(shop, 120, connected=False).split())
-    assert "✗ silent for 11 min; the last offset was −12.34 µm" in text and "1 machine: 1 silent" in text
+    assert (
+        "✗ Do not cut to size" in text
+        and "silent for 11 min; the last offset was −12.34 µm" in text
+        and "1 machine: 1 silent" in text
+    )
     assert "No connection to tcp/127.0.0.1:7447" in text
     one = shop.one("shop/vmc-01")
     assert one is not None and "silent" in line(one) and "11 min old" in line(one)
@@ -132,7 +136,8 @@ def test_the_day_has_every_path_and_the_worst_state_of_each_part() -> None:
 def test_a_shop_says_what_to_do_as_far_as_there_is_room() -> None:
     shop, _ = filled("vmc-01", "vmc-02", "vmc-03")
     text = shown(shop, 100, height=30)
-    assert "✗ shop/vmc-02 hold: Send the command resume." in text and "⚠ shop/vmc-03 degraded: See the quality" in text
+    assert "✗ shop/vmc-02 hold: Do not cut to size. An operator has frozen the offset. Send the command resume." in text
+    assert "⚠ shop/vmc-03 degraded: Cut with care" in text
     assert "vmc-01 ok:" not in text
     for height in range(8, 24):
         assert len(shown(shop, 100, height=height).splitlines()) <= height
@@ -162,7 +167,7 @@ def test_what_is_no_offset_is_no_number() -> None:
             y_offset_std_um=None,
         ),
     )
-    assert "⚠ starting  no offset, 0 s old" in shown(shop, 80)
+    assert "starting  no offset, 0 s old" in shown(shop, 80) and "⚠ Do not cut to size" in shown(shop, 80)
 
 
 def test_a_proposal_is_a_line_with_two_commands() -> None:

@@ -1,0 +1,29 @@
+"""The verdict of an audit in one sentence, for terminal and page."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from compensator.audit.series import Audit
+
+
+def verdict(found: Audit) -> str:
+    """Return the verdict in one sentence, with the number of samples and files."""
+    files = f"{len(found.files)} recording(s)"
+    if not found.clean:
+        wrong = []
+        if found.findings_count:
+            wrong.append(f"{found.findings_count} finding(s)")
+        if found.differing:
+            wrong.append(f"{found.differing} sample(s) that differ in the replay")
+        return f"Not proven: {' and '.join(wrong)} in {files} with {found.samples} samples."
+    if partly(found):
+        return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
+    words = f"Proven: {found.samples} samples in {files} are unchanged, and the replay reproduces every offset"
+    return words + (", signed with the given key." if found.signed else "; no signature was checked.")
+
+
+def partly(found: Audit) -> bool:
+    """Return whether a part could not be checked."""
+    return not found.samples or any(not file.last or file.not_replayed for file in found.files)

@@ -1,0 +1,52 @@
+"""`compensator compare`: models over the same measured data, in free run."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from compensator.api.comparison import compare
+from compensator.commands import Answer
+from compensator.commands.outputs import checked_file, checked_page, pages_text
+from compensator.data.table import roles_of
+from compensator.errors import UsageError
+from compensator.model.model_file import load_model
+from compensator.model.thermal_model import ThermalModel
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command."""
+    given = arguments
+    page = checked_page(given.page)
+    if given.out is not None:
+        checked_file(given.out, "--out", read=(*given.data, *map(Path, given.model)), ending=".csv")
+    models = _by_name(given.model)
+    found = compare(models, given.data, columns=roles_of(given.column), from_h=given.from_h)
+    result, text = found.to_dict(), found.summary()
+    if given.out is not None:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        found.save(given.out)
+        result, text = result | {"out": str(given.out)}, f"{text}\n\ntable: {given.out}"
+    if page is not None:
+        found.write_page(page)
+        result, text = result | {"report": str(page)}, f"{text}\n{pages_text(page, None)}"
+    return Answer(result, text)
+
+
+def _by_name(files: Sequence[str]) -> dict[str, ThermalModel]:
+    """Return models by their names, or by their files where names are the same.
+
+    Raises
+    ------
+    UsageError
+        If a file is given twice.
+    """
+    for file in files:
+        if files.count(file) > 1:
+            raise UsageError(f"--model {file}: given {files.count(file)} times, expected each model once")
+    models = [load_model(file) for file in files]
+    names = [model.name for model in models]
+    return {
+        name if names.count(name) == 1 else file: model for file, name, model in zip(files, names, models, strict=True)
+    }

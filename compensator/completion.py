@@ -1,0 +1,49 @@
+"""`compensator completion`: a script by which a shell completes commands, options and files."""
+
+from __future__ import annotations
+
+import argparse
+
+from compensator.commands import Answer
+
+_BASH = """# compensator: completion of commands, options and files. To use it now and in every new shell:
+#   compensator completion bash > ~/.local/share/bash-completion/completions/compensator
+_compensator() {{
+  local word="${{COMP_WORDS[COMP_CWORD]}}" command="${{COMP_WORDS[1]}}" options=""
+  COMPREPLY=()
+  if [ "$COMP_CWORD" -eq 1 ]; then
+    COMPREPLY=($(compgen -W "{commands} --help --version" -- "$word"))
+    return
+  fi
+  case "$command" in
+{cases}
+  esac
+  if [ "${{word#-}}" != "$word" ]; then COMPREPLY=($(compgen -W "$options" -- "$word")); fi
+}}
+complete -o default -o bashdefault -F _compensator compensator
+"""
+_ZSH = "#compdef compensator\n# zsh reads the script for bash.\nautoload -U +X bashcompinit && bashcompinit\n"
+_FISH = "# ~/.config/fish/completions/compensator.fish\n"
+
+
+def run(arguments: argparse.Namespace) -> Answer:
+    """Run the command."""
+    from compensator.cli import COMMANDS, options_of
+
+    options = {command.name: options_of(command) for command in COMMANDS}
+    if arguments.shell == "fish":
+        lines = [
+            f'complete -c compensator -n __fish_use_subcommand -f -a {command.name} -d "{command.text}"'
+            for command in COMMANDS
+        ]
+        lines += [
+            f'complete -c compensator -n "__fish_seen_subcommand_from {name}" -l {option.removeprefix("--")}'
+            for name, found in options.items()
+            for option in found
+            if option.startswith("--")
+        ]
+        text = _FISH + "\n".join(lines)
+    else:
+        cases = "\n".join(f'    {name}) options="{" ".join(found)}" ;;' for name, found in options.items())
+        text = (_ZSH if arguments.shell == "zsh" else "") + _BASH.format(commands=" ".join(options), cases=cases)
+    return Answer({"shell": arguments.shell, "script": text}, text.rstrip("\n"))

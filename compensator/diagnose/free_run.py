@@ -1,0 +1,49 @@
+"""The errors of the base and the extended model in free run, in words: from the content of `diagnosis.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from compensator.model.free_run import in_words
+
+#: Names of the models, and what the data were to them.
+BASE, EXTENDED = "base model", "extended model"
+SEARCHED, HELD_OUT = "searched", "held out"
+
+
+def free_run_sentence(found: Mapping[str, Any]) -> str:
+    """Return the errors in free run in a sentence: on held-out data where there are some; empty for an old file.
+
+    Parameters
+    ----------
+    found : mapping
+        Content of `diagnosis.json`.
+
+    Examples
+    --------
+    >>> own = {"rms_um": 6.3, "rms_about_mean_um": 6.2}
+    >>> scores = {"base model": own, "no compensation": {"rms_um": 41.3, "rms_about_mean_um": 20.0}}
+    >>> free_run_sentence({"free_run": [{"name": "run.csv", "role": "searched", "scores": scores}]})
+    'Base model in free run 6.30 µm rms about the zero, 6.20 about the mean (without compensation 41.3 and 20.0).'
+    """
+    runs = found.get("free_run", [])
+    if not runs:
+        return ""
+    held_out = [one for one in runs if one["role"] == HELD_OUT]
+    worst = max(held_out or runs, key=lambda one: float(one["scores"].get(EXTENDED, one["scores"][BASE])["rms_um"]))
+    scores = worst["scores"]
+    words = f"{BASE} {in_words(scores, BASE)}"
+    if EXTENDED in scores:
+        own = scores[EXTENDED]
+        worse = ", so it is worse there" if own["rms_um"] > scores[BASE]["rms_um"] else ""
+        words += f"; {EXTENDED} {own['rms_um']:.2f} and {own['rms_about_mean_um']:.2f}{worse}"
+    where = f"On {worst['name']}, which took no part in the search: " if held_out else ""
+    text = f"{where}{words}."
+    return f"{text[0].upper()}{text[1:]}"
+
+
+def is_contradicted(found: Mapping[str, Any]) -> bool:
+    """Whether the extended model is worse than the base model on data that took no part in the search."""
+    held_out = [one["scores"] for one in found.get("free_run", []) if one["role"] == HELD_OUT]
+    return any(EXTENDED in one and one[EXTENDED]["rms_um"] > one[BASE]["rms_um"] for one in held_out)

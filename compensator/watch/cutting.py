@@ -1,0 +1,131 @@
+"""Whether one may cut, and until when: the headline of a machine, for the person who stands at it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from compensator.codes import Reason, SampleQuality, State, WatchWarning, explain
+from compensator.report.local_time import here
+
+#: Names of channels at the machine.
+NAMES: Mapping[str, str] = {"t_q_degc": "T_Q", "at_degc": "AT", "y_um": "Y", "heat_w": "Heat"}
+#: What a channel has, in two or three words.
+_HAS: Mapping[str, str] = {
+    SampleQuality.OPEN_CIRCUIT: "wire open",
+    SampleQuality.OVER_RANGE: "above its range",
+    SampleQuality.UNDER_RANGE: "below its range",
+    SampleQuality.STALE: "no new values",
+    SampleQuality.OUT_OF_RANGE: "out of range",
+    SampleQuality.TOO_FAST: "changes too fast",
+    SampleQuality.SUSPECT: "has jumped",
+    SampleQuality.STUCK: "value frozen",
+    SampleQuality.T_Q_BELOW_AT: "below AT",
+    SampleQuality.DEVICE_TIMEOUT: "device does not answer",
+    SampleQuality.DEVICE_DISCONNECTED: "device disconnected",
+}
+#: Reasons that name a doubt in the offset itself; others in state degraded are restrictions that pass by themselves.
+_DOUBTS = (Reason.IMPLAUSIBLE, Reason.T_Q_AT_APART, Reason.CORRECTION_LIMITED, Reason.OFFSET_LIMITED)
+
+
+class Headline(NamedTuple):
+    """Whether one may cut (`yes`, `until`, `care`, `no`), in words, and why with what to do."""
+
+    cut: str
+    word: str
+    text: str
+
+
+def headline(
+    *,
+    shown: str,
+    tone: str,
+    reasons: Sequence[str],
+    channels: Mapping[str, Mapping[str, Any]],
+    until_ns: int | None,
+    now_ns: int,
+    std_um: float | None = None,
+) -> Headline:
+    """Return the headline of a machine.
+
+    Parameters
+    ----------
+    shown, tone : str
+        State that is shown, and its severity with the warnings.
+    reasons : sequence of str
+        Codes of the last offset.
+    channels : mapping of str to mapping
+        Channels of the last sample with `quality` and `do`.
+    until_ns : int, optional
+        When the offset will be held, ns since 1970 UTC; None if nothing is missing or it is unknown.
+    now_ns : int
+        Now, ns since 1970 UTC.
+    std_um : float, optional
+        Standard deviation of the offset, µm.
+    """
+    found = _headline(shown, tone, reasons, channels, until_ns, now_ns)
+    if found.cut == "no" or std_um is None:
+        return found
+    return found._replace(text=f"{found.text} Offset ±{std_um:.1f} µm (one standard deviation).")
+
+
+def _headline(
+    shown: str,
+    tone: str,
+    reasons: Sequence[str],
+    channels: Mapping[str, Mapping[str, Any]],
+    until_ns: int | None,
+    now_ns: int,
+) -> Headline:
+    if shown in (WatchWarning.SILENT, WatchWarning.UNKNOWN, State.FAULT, State.STARTING):
+        return Headline("no", "Do not cut to size", " ".join(_words([*reasons[:1], shown])))
+    lost = _lost(channels, reasons)
+    if shown == State.HOLD:
+        why = lost or _words([reason for reason in reasons if reason != Reason.PREDICTING][-1:])
+        frozen = [] if Reason.OPERATOR_HOLD in reasons else ["The offset is frozen."]
+        return Headline("no", "Do not cut to size", " ".join([*frozen, *why]))
+    if Reason.PREDICTING in reasons:
+        if until_ns is None:
+            return Headline("care", "Cut with care", " ".join([*lost, "Predicted for a limited time, then held."]))
+        minutes = max(until_ns - now_ns, 0) / 60e9
+        held = f"Predicted for another {minutes:.0f} min, then held."
+        parts = [*lost[:1], held, *lost[1:]]
+        may = "Cut with care" if any(reason.partition(":")[0] in _DOUBTS for reason in reasons) else "May cut"
+        return Headline("until", f"{may} until {here(until_ns):%H:%M}", " ".join(parts))
+    suspects = [reason.partition(":")[2] for reason in reasons if reason.startswith(f"{Reason.IMPLAUSIBLE}:")]
+    if len(suspects) > 1:
+        others = " or ".join(f"{NAMES.get(name, name)} is wrong" for name in suspects if name != "model")
+        lacks = "the model lacks an effect" if "model" in suspects else ""
+        causes = " or ".join(filter(None, (lacks, others)))
+        text = f"Measured and predicted Y diverge; not known yet whether {causes}."
+        return Headline("care", "Cut with care", f"{text} Measure the part; check a sensor when it is named alone.")
+    doubts = [reason for reason in reasons if reason.partition(":")[0] in _DOUBTS]
+    if doubts:
+        return Headline("care", "Cut with care", " ".join(_words(doubts[:1])))
+    if reasons:
+        return Headline("care", "Cut with care", " ".join([*lost, *([] if lost else _words(reasons[:1]))]))
+    if tone != "good":
+        return Headline("care", "Cut with care", "See the warnings below.")
+    return Headline("yes", "May cut", "The offset follows the model.")
+
+
+def _lost(channels: Mapping[str, Mapping[str, Any]], reasons: Sequence[str]) -> list[str]:
+    """Return which temperature is missing, why, and what to do; the cause first."""
+    missing = [
+        name for name, reason in (("t_q_degc", Reason.T_Q_MISSING), ("at_degc", Reason.AT_MISSING)) if reason in reasons
+    ]
+    if not missing:
+        return []
+    causes, to_do = [], []
+    for name in missing:
+        channel = channels.get(name, {})
+        quality = str(channel.get("quality", ""))
+        causes.append(f"{NAMES[name]}: {_HAS.get(quality, quality.replace('_', ' ') or 'missing')}.")
+        to_do.append(str(channel.get("do", "")))
+    return [" ".join(causes), *dict.fromkeys(filter(None, to_do))]
+
+
+def _words(codes: Sequence[str]) -> list[str]:
+    """Return meaning and action of codes, each sentence once."""
+    found = [part for code in codes for part in (explain(code) or (code, ""))]
+    return list(dict.fromkeys(part for part in found if part not in ("", "See the reasons.")))

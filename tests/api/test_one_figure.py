@@ -1,0 +1,115 @@
+"""How good a model is has one figure, in every command and on every page: its free run about the service's zero."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from compensator.cli import main
+from compensator.demo.calibration import write_table
+from tests.api.tables import write_run
+from tests.diagnose.scenarios import draw, record
+from tests.identify.quill_runs import CALIBRATION_W
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the published machine, and one with an effect that its model lacks, whose Y has an offset."""
+    folder = tmp_path_factory.mktemp("runs")
+    write_run(folder / "run.csv", CALIBRATION_W, 1)
+    columns, _, _ = record([draw("input", 4)], 79, 10.0)
+    y = columns.pop("y_um") + 250.0
+    write_table(folder / "effect.csv", {"t_s": np.arange(y.size) * 60.0, "y_um": y, **columns})
+    return folder
+
+
+def run(capfd: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
+    assert main([*map(str, words), "--json"]) == 0
+    found: dict[str, Any] = json.loads(capfd.readouterr().out)
+    return found
+
+
+def test_the_same_figure_and_words_everywhere(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    data, model = folder / "effect.csv", tmp_path / "model.toml"
+    identified = run(capfd, "identify", folder / "run.csv", "--validate", data, "--order", 2, 2, 2, "--out", model)
+    simulated = run(capfd, "simulate", data, "--model", model, "--out", tmp_path / "out.csv")
+    compared = run(capfd, "compare", data, "--model", model, "--model", "quill", "--page", tmp_path / "compared.html")
+    diagnosed = run(capfd, "diagnose", data, "--model", model, "--out", tmp_path / "d")
+
+    held_out = next(one for one in identified["free_run"] if one["role"] == "held out")
+    (searched,) = diagnosed["free_run"]
+    keys = ("rms_um", "rms_about_mean_um", "mean_abs_um", "peak_to_peak_um", "fit_pct")
+    wanted = {key: simulated[key] for key in keys}
+    assert wanted["rms_um"] > wanted["rms_about_mean_um"] > 0.0
+    assert held_out["scores"]["model"] == wanted
+    assert searched["scores"]["base model"] == wanted
+    assert compared["scores"]["model"] == wanted
+    for scores in (held_out["scores"], searched["scores"], compared["scores"]):
+        assert scores["no compensation"] == simulated["no_compensation"]
+
+    # Independent of the code above: the first row is the zero.
+    with (tmp_path / "out.csv").open(encoding="utf-8") as file:
+        residual = np.array([float(row["residual_um"]) for row in csv.DictReader(file)])
+    assert residual[0] == 0.0
+    assert wanted["rms_um"] == pytest.approx(np.sqrt(np.mean(residual**2)), rel=1e-6)
+    assert wanted["rms_about_mean_um"] == pytest.approx(np.std(residual), rel=1e-6)
+
+    words = re.compile(r"n free run ([\d.]+) µm rms about the zero, ([\d.]+) about the mean")
+    shown = (f"{wanted['rms_um']:.2f}", f"{wanted['rms_about_mean_um']:.2f}")
+    for page in ("model-calibration.html", "d/report.html"):
+        text = (tmp_path / page).read_text(encoding="utf-8")
+        assert (found := words.search(text)) is not None and found.groups() == shown, page
+    assert main(["simulate", str(data), "--model", str(model), "--out", str(tmp_path / "out.csv")]) == 0
+    assert (found := words.search(capfd.readouterr().out)) is not None and found.groups() == shown
+    assert all(figure in (tmp_path / "compared.html").read_text(encoding="utf-8") for figure in shown)
+
+
+def test_both_models_are_validated_on_what_took_no_part(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    data, other = folder / "effect.csv", folder / "run.csv"
+    found = run(
+        capfd, "diagnose", data, "--model", "quill", "--fit-until", 7, "--validate", other, "--out", tmp_path / "d"
+    )
+    roles = [(one["name"], one["role"], one["samples"]) for one in found["free_run"]]
+    assert roles == [("effect.csv", "searched", 420), ("effect.csv", "held out", 180), ("run.csv", "held out", 720)]
+    assert [list(one["scores"]) for one in found["free_run"]] == [
+        ["base model", "extended model", "no compensation", "persistence"],
+        ["base model", "extended model", "no compensation", "persistence"],
+        ["base model", "no compensation", "persistence"],
+    ]
+    late = run(capfd, "compare", data, "--model", "quill", "--model", tmp_path / "d" / "model.toml", "--from", 7)
+    assert found["free_run"][1]["scores"]["base model"] in late["scores"].values()
+    assert found["free_run"][1]["scores"]["extended model"] in late["scores"].values()
+    assert main(["diagnose", str(data), "--model", "quill", "--validate", str(data), "--out", str(tmp_path / "d")]) == 2
+    assert "is used for the fit" in capfd.readouterr().err
+    assert main(["diagnose", str(data), "--model", "quill", "--fit-until", "0", "--out", str(tmp_path / "d")]) == 2
+    assert "no rows before 0 h" in capfd.readouterr().err
+
+
+def test_compare_names_models_and_writes_curves(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    same = tmp_path / "same.toml"
+    main(["identify", str(folder / "run.csv"), "--order", "2", "2", "2", "--out", str(same), "--name", "quill"])
+    capfd.readouterr()
+    out = tmp_path / "curves.csv"
+    found = run(capfd, "compare", folder / "run.csv", "--model", "quill", "--model", same, "--out", out)
+    assert list(found["scores"])[:2] == ["quill", str(same)]
+    with out.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 720
+    for row in rows[::100]:
+        y = float(row["y_um"])
+        predictions = [float(value) for name, value in row.items() if name.startswith("y_pred_um")]
+        residuals = [float(value) for name, value in row.items() if name.startswith("residual_um")]
+        assert len(predictions) == 2
+        assert [y - one for one in predictions] == pytest.approx(residuals, abs=1e-6)
+    assert main(["compare", str(folder / "run.csv"), "--model", "quill", "--model", "quill"]) == 2
+    assert "given 2 times" in capfd.readouterr().err

@@ -1,0 +1,61 @@
+"""The channels that a model needs: named by `check`, with the lines to paste, and by the diagnosis that finds them."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensator.cli import main
+from compensator.config import load_config
+from compensator.demo.calibration import write_table
+from tests.diagnose.scenarios import draw, record
+from tests.reference.kept import KEPT
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "deploy/machine.example.toml"
+MODEL = KEPT / "models/effects.toml"
+
+
+def test_check_prints_the_lines_that_are_missing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["check", "--config", str(EXAMPLE), "--model", str(MODEL)]
+    assert main([*words, "--json"]) == 2
+    told = capfd.readouterr()
+    found = json.loads(told.out)
+    missing = found["missing_channels"]
+    assert missing and found["ok"] is False
+    assert len(told.err.splitlines()) == 1 and all(name in told.err for name in missing)
+    assert main(words) == 2
+    pasted = capfd.readouterr().out
+    assert [one["name"] for one in tomllib.loads(pasted)["channel"]] == missing
+
+    # With the lines in the configuration, and a device for them, the model can run.
+    config = tmp_path / "machine.toml"
+    lines = pasted.replace('"DEVICE"', '"thermocouples"')
+    config.write_text(EXAMPLE.read_text(encoding="utf-8") + lines, encoding="utf-8")
+    assert {channel.name for channel in load_config(config).config.channel} >= set(missing)
+    assert main(["check", "--config", str(config), "--model", str(MODEL)]) == 0
+
+
+def test_a_configured_model_without_its_channel_is_named_too(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    config = tmp_path / "machine.toml"
+    text = EXAMPLE.read_text(encoding="utf-8").replace('file = "quill"', f'file = "{MODEL}"')
+    config.write_text(text, encoding="utf-8")
+    assert main(["check", "--config", str(config)]) == 2
+    assert "[[channel]]" in capfd.readouterr().out
+
+
+def test_a_diagnosis_prints_the_lines_of_the_channels_it_adds(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    columns, _, _ = record([draw("input", 4)], 79, 10.0)
+    write_table(tmp_path / "run.csv", {"t_s": np.arange(columns["y_um"].size) * 60.0, **columns})
+    assert main(["diagnose", str(tmp_path / "run.csv"), "--model", "quill", "--out", str(tmp_path / "d")]) == 0
+    out = capfd.readouterr().out
+    listed = out[out.index("[[channel]]") :].split("\n\nmodel:")[0].split("\n\n")[0]
+    (channel,) = tomllib.loads(listed)["channel"]
+    seen = columns[channel["name"]]
+    assert channel["range"][0] <= seen.min() and channel["range"][1] >= seen.max()
+    assert channel["name"] in (tmp_path / "d" / "report.html").read_text(encoding="utf-8").split("[[channel]]")[1]

@@ -1,0 +1,77 @@
+"""The command line as one types and reads it: completion, slips, and text that wraps at words."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+
+import pytest
+
+from compensator.cli import COMMANDS, main
+from compensator.commands.wrapping import wrapped
+
+
+def usage(capfd: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as ended:
+        main([*words])
+    assert ended.value.code == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1
+    return error
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("simulat", "run.csv"), "did you mean simulate?"),
+        (("diagnose", "a", "--model", "quill", "--out", "d", "--fit-untl", "3"), "did you mean --fit-until?"),
+        (("compare", "a", "--modle", "quill"), "did you mean --model?"),
+        (("adopt", "--polcy"), "lists all options"),
+        (("loop", "a", "--policy", "adpt"), "did you mean adopt?"),
+    ],
+)
+def test_a_slip_is_answered_with_what_was_meant(
+    capfd: pytest.CaptureFixture[str], words: tuple[str, ...], meant: str
+) -> None:
+    assert meant in usage(capfd, *words)
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_sentences_wrap_at_words_and_tables_stay(width: int) -> None:
+    sentence = "- " + "The offset follows the model of the machine. " * 6
+    table = "model            " + "  12.34" * 20
+    channel = "range = [0.0, 16000.0]  # seen: 0 to 8000 and this is a long remark behind it that nobody wraps at all"
+    lines = wrapped(f"{sentence}\n{table}\n{channel}", width).split("\n")
+    assert table in lines and channel in lines
+    prose = [line for line in lines if line not in (table, channel)]
+    assert max(map(len, prose)) <= width and all(line.startswith("  ") for line in prose[1:])
+    assert " ".join(" ".join(prose).split()) == sentence.strip()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["dia"], {"diagnose"}),
+        (["diagnose", "--fit"], {"--fit-until"}),
+        (["watch", "--b"], {"--bind"}),
+        (
+            ["compare", "run.csv", "--"],
+            {"--model", "--page", "--from", "--out", "--column", "--json", "--debug", "--help"},
+        ),
+    ],
+)
+def test_bash_completes(capfd: pytest.CaptureFixture[str], words: list[str], found: set[str]) -> None:
+    assert main(["completion", "bash"]) == 0
+    script = capfd.readouterr().out
+    line = " ".join(f"'{word}'" for word in ["compensator", *words])
+    asked = f'COMP_WORDS=({line}); COMP_CWORD={len(words)}; _compensator; echo "${{COMPREPLY[@]}}"'
+    done = subprocess.run(["bash", "-c", f"{script}\n{asked}"], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == found and done.stderr == ""
+
+
+def test_every_shell_knows_every_command(capfd: pytest.CaptureFixture[str]) -> None:
+    for shell in ("bash", "zsh", "fish"):
+        assert main(["completion", shell]) == 0
+        script = capfd.readouterr().out
+        assert all(command.name in script for command in COMMANDS), shell

@@ -1,0 +1,78 @@
+"""The headline says whether one may cut, and until when; each code with its own words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from compensator.codes import SUFFIX_WORDS, SUFFIXES, Reason, SampleQuality, State, WatchWarning, explain
+from compensator.watch.cutting import Headline, headline
+
+NOW_NS = 1_767_600_000_000_000_000
+
+
+def of(shown: str, *reasons: str, tone: str = "warn", until_min: float | None = None, **channels: str) -> Headline:
+    qualities: dict[str, dict[str, Any]] = {
+        name: {"quality": quality, "do": SampleQuality(quality).action} for name, quality in channels.items()
+    }
+    until_ns = None if until_min is None else NOW_NS + round(until_min * 60e9)
+    return headline(shown=shown, tone=tone, reasons=reasons, channels=qualities, until_ns=until_ns, now_ns=NOW_NS)
+
+
+def test_a_broken_couple_is_named_with_the_time_that_is_left() -> None:
+    found = of("degraded", "t_q_missing", "predicting", until_min=58.2, t_q_degc="open_circuit")
+    assert found.cut == "until" and found.word.startswith("May cut until ")
+    assert found.text == ("T_Q: wire open. Predicted for another 58 min, then held. Check thermocouple and terminals.")
+    held = of("hold", "t_q_missing", "prediction_expired", tone="bad", t_q_degc="open_circuit")
+    assert (held.cut, held.word) == ("no", "Do not cut to size")
+    assert held.text == "The offset is frozen. T_Q: wire open. Check thermocouple and terminals."
+
+
+@pytest.mark.parametrize(
+    ("shown", "reasons", "cut", "words"),
+    [
+        ("ok", (), "yes", "The offset follows the model."),
+        ("starting", ("no_zero",), "no", "No zero has been set yet."),
+        ("fault", ("t_q_at_exchanged",), "no", "the two sensors are exchanged"),
+        (WatchWarning.SILENT, ("predicting",), "no", ""),
+        ("hold", ("operator_hold",), "no", "Send the command resume."),
+        ("hold", ("outside_validity:at_degc",), "no", "AT is outside the range in which the machine was calibrated."),
+        ("degraded", ("implausible:y_um",), "care", "Check the displacement sensor"),
+        ("degraded", ("implausible:model",), "care", "Run `compensator diagnose`"),
+        ("degraded", ("rate_limited",), "care", "Wait;"),
+    ],
+)
+def test_each_state_says_whether_one_may_cut(shown: str, reasons: tuple[str, ...], cut: str, words: str) -> None:
+    found = of(shown, *reasons, tone="good" if shown == State.OK else "warn")
+    assert found.cut == cut and words in found.text
+
+
+def test_a_doubt_in_the_model_beside_a_lost_couple_asks_for_care() -> None:
+    found = of("degraded", "t_q_missing", "implausible:model", "predicting", until_min=29.0, t_q_degc="open_circuit")
+    assert found.cut == "until" and found.word.startswith("Cut with care until ")
+
+
+def test_the_standard_deviation_stands_beside_what_may_be_cut() -> None:
+    options: dict[str, Any] = {"tone": "good", "reasons": (), "channels": {}, "until_ns": None, "now_ns": NOW_NS}
+    assert "±0.4 µm" in headline(shown="ok", std_um=0.42, **options).text
+    assert "±" not in headline(shown="fault", std_um=0.42, **options).text
+
+
+def test_warnings_of_a_machine_that_is_ok_ask_for_care() -> None:
+    assert of("ok", tone="warn").cut == "care"
+
+
+def test_several_suspects_send_nobody_to_a_healthy_sensor() -> None:
+    found = of("degraded", "implausible:at_degc", "implausible:model", "implausible:t_q_degc")
+    assert found.cut == "care"
+    assert "whether the model lacks an effect or AT is wrong or T_Q is wrong" in found.text
+    assert "terminals" not in found.text and "Measure the part" in found.text
+
+
+def test_codes_with_a_listed_suffix_have_words_of_their_own() -> None:
+    for code in (Reason.IMPLAUSIBLE, Reason.SUSPECT_CHANNEL, Reason.OUTSIDE_VALIDITY):
+        found = [explain(f"{code}:{suffix}") for suffix in SUFFIXES[code]]
+        assert None not in found and len(set(found)) == len(SUFFIXES[code]), code
+    assert explain("implausible:oil") == (Reason.IMPLAUSIBLE.meaning, Reason.IMPLAUSIBLE.action)
+    assert all(code.partition(":")[2] in SUFFIXES[code.partition(":")[0]] for code in SUFFIX_WORDS)
