@@ -47,8 +47,8 @@ def _diagnose(job: Job, folder: Path) -> Result:
     from compensator.service.loop.job import read_record
     from compensator.service.loop.record import table_of_rows
 
-    rows, probes = read_record(job)
-    table = table_of_rows(rows, probes, job.machine)
+    record = read_record(job)
+    table = table_of_rows(record.rows, record.probes, job.machine, zeros_ns=record.zeros_ns)
     model = read_file(folder / CALIBRATED, MODEL_BYTES)
     found, whole = diagnoses_of_table(table, model, probe_std_um=job.probe_std_um)
     found.save_all(folder)
