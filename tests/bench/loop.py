@@ -2,9 +2,9 @@
 
 Each machine-week of `sim_hardware.drawn_machines.weeks` is calibrated by `identify` on a run without effects (the
 published ones have the published model); the range of validity is then widened to what the shop may have, because the
-run lasts a day and the service holds its offset outside. Then a week of samples goes through the service's loop with policy `adopt` and
-the real diagnosis in this process. The service is killed in the middle of its second diagnosis and right after its
-first adoption, and continues from its last state, six hours old at most, as from a recording.
+run lasts a day and the service holds its offset outside. Then a week of samples goes through the service's loop with
+policy `adopt` and the real diagnosis in this process. The service is killed in the middle of its second diagnosis and
+right after its first adoption, and continues from its last state, six hours old at most, as from a recording.
 
 error           true displacement since the first sample, plus the published offset.
 base, best      error of the calibrated model alone over the week; the same where no effect acts.

@@ -9,8 +9,8 @@ import msgspec
 
 from compensator.atomic_write import replace_file
 from compensator.errors import DataError
-from compensator.input_file import RESULT_BYTES, read_file
 from compensator.events import EventKind
+from compensator.input_file import RESULT_BYTES, read_file
 from compensator.messages import Event, Offset, Probe, Sample
 from compensator.recording.reading import messages, recordings
 

@@ -33,11 +33,12 @@ DIFFERS = 4.0
 BETTER_PART = 0.95
 #: Least time between two adoptions, and between two diagnoses for a misfit, h.
 ADOPTION_H, MISFIT_AGAIN_H = 24.0, 12.0
-#: What is compared counts for so long, in `shadow_h`, and the least of it, h.
+#: What is compared counts for so long, in `shadow_h`, and the least of it, h; a candidate that is better so far has as
+#: long before the next diagnosis.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
-_HOUR_NS, _DAY_NS = 3600 * NS, 86400 * NS
+_HOUR_NS = 3600 * NS
 _LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
@@ -96,6 +97,10 @@ class Loop:
         """Time of the usable blocks of measured Y, h."""
         return self._comparison.judged_h
 
+    @property
+    def _remembered_h(self) -> float:
+        return max(_REMEMBERED * self._settings.shadow_h, _REMEMBERED_H)
+
     # ------------------------------------------------------------------ one sample
 
     def step(self, present: Outcome, other: Outcome | None) -> list[Note]:
@@ -143,11 +148,9 @@ class Loop:
             return False
         if not found.add(present, other, suspected=False):
             return False
-        settings = self._settings
-        remembered_h = max(_REMEMBERED * settings.shadow_h, _REMEMBERED_H)
-        oldest_ns = present.sample.time_utc_ns - round(remembered_h * _HOUR_NS)
-        found.forget_before(oldest_ns, 2 * settings.probes)
-        state.verdict = found.verdict(deviations=settings.deviations)
+        oldest_ns = present.sample.time_utc_ns - round(self._remembered_h * _HOUR_NS)
+        found.forget_before(oldest_ns, 2 * self._settings.probes)
+        state.verdict = found.verdict(deviations=self._settings.deviations)
         return True
 
     def _begin_comparison(self) -> None:
@@ -235,27 +238,30 @@ class Loop:
     def _schedule(self, now_ns: int) -> list[Note]:
         """Begin a diagnosis if it is time."""
         state, settings = self.state, self._settings
-        at_ns = 60 * settings.at_min * NS
-        night_ns = (now_ns - at_ns) // _DAY_NS * _DAY_NS + at_ns
-        state.night_utc_ns = state.night_utc_ns or night_ns
-        if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN:
+        at_ns, every_ns = 60 * settings.at_min * NS, settings.every_h * _HOUR_NS
+        planned_ns = (now_ns - at_ns) // every_ns * every_ns + at_ns
+        state.planned_utc_ns = state.planned_utc_ns or planned_ns
+        if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN or self._is_leading(now_ns):
             return []
         since_last_h = (now_ns - state.diagnosed_utc_ns) / _HOUR_NS
-        if night_ns > state.night_utc_ns:
-            why = "night"
-        elif (
-            state.misfit_min >= 60.0 * settings.misfit_h
-            and since_last_h >= MISFIT_AGAIN_H
-            # A candidate that is better so far may be what is missing.
-            and not (state.phase != "watching" and state.verdict.verdict == ComparisonVerdict.BETTER)
-        ):
+        if planned_ns > state.planned_utc_ns:
+            why = "planned"
+        elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_h >= MISFIT_AGAIN_H:
             why = "misfit"
         else:
             return []
-        state.night_utc_ns, state.diagnosed_utc_ns = night_ns, now_ns
+        state.planned_utc_ns, state.diagnosed_utc_ns = planned_ns, now_ns
         from_ns = now_ns - round(settings.record_h * _HOUR_NS)
         state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
         return [self._diagnosis_begins()]
+
+    def _is_leading(self, now_ns: int) -> bool:
+        """Return whether a candidate is better so far: it may be what is missing, and gets time to show it."""
+        shadow, found = self.state.shadow, self.state.verdict
+        if shadow is None or shadow.role != "candidate" or found.deviations is None or found.ratio is None:
+            return False
+        is_new = now_ns - shadow.since_utc_ns < self._remembered_h * _HOUR_NS
+        return is_new and found.deviations > 0.0 and found.ratio <= BETTER_PART
 
     def _diagnosis_begins(self) -> Note:
         running = self.state.diagnosis
@@ -286,7 +292,10 @@ class Loop:
         text = f"a candidate is compared with the present model: {', '.join(found.effects) or 'no added effect'}"
         role = role_of(found)
         if role == "before":
-            text = "nothing is found that the calibrated model lacks: it is compared with the present one"
+            found_again = "nothing is found that the calibrated model lacks"
+            if found.verdict != "adequate":
+                found_again = f"the effects of the present model are not found again ({found.verdict})"
+            text = f"{found_again}: the calibrated model is compared with the present one"
         data = LoopData(step=LoopAction.SHADOW, role=role, model_sha256=found.candidate_sha256, effects=found.effects)
         return [Note(EventKind.LOOP, text, data.table())]
 
@@ -375,7 +384,11 @@ class Loop:
             state.diagnosis = None
             data = LoopData(step=LoopAction.END, why="interrupted")
             return [
-                Note(EventKind.LOOP, "a diagnosis was interrupted twice: the next one is made at night", data.table())
+                Note(
+                    EventKind.LOOP,
+                    "a diagnosis was interrupted twice: the next one is made when it is planned",
+                    data.table(),
+                )
             ]
         again = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="", why="again")
         state.diagnosis = again

@@ -4,8 +4,8 @@ Y is left out where a sample shows a fault by itself (`trust`), and for an hour 
 in which the fault was there already. Temperatures and other channels stay as they were measured: they drive the model
 throughout.
 
-Where Y is probed, the values of one feature about one zero are used, those of which there are most: at a zero the feature
-counts anew, and against the values before it that is a step which the machine did not make.
+Where Y is probed, the values of one feature about one zero are used, those of which there are most: at a zero the
+feature counts anew, and against the values before it that is a step which the machine did not make.
 """
 
 from __future__ import annotations
