@@ -78,7 +78,7 @@ def diagnoses_of_table(
         raise DataError(f"{table.name}: no measured Y that may be used")
     base = parse_model(model, source="calibrated model")
     whole = _diagnosed(table, base, probe_std_um)
-    changed_s = _changed_at(whole) if _left(whole, base) > WELL_EXPLAINED else None
+    changed_s = _changed_at(whole, table) if _left(whole, base) > WELL_EXPLAINED else None
     end = _end_of(table, changed_s) if changed_s is not None else None
     if changed_s is None or end is None:
         return whole, whole
@@ -88,28 +88,27 @@ def diagnoses_of_table(
         return whole, whole
     if found.verdict == "adequate":
         # An end in which little moves shows no effect either: it has ended only if the model is better without it.
-        return (whole, whole) if _holds_after(whole, base, changed_s) else (found, whole)
+        return (whole, whole) if _holds_after(whole, table, base, changed_s) else (found, whole)
     return (found if _left(found, base) < END_IS_BETTER * _left(whole, base) else whole), whole
 
 
-def _changed_at(found: DiagnosisResult) -> float | None:
+def _changed_at(found: DiagnosisResult, table: Table) -> float | None:
     """Return when the base model's residual in a diagnosis has changed, s; None if it has not."""
-    times, before, _ = _residuals(found)
-    return changed_at(times, before, found.diagnosis.noise_floor_um)
+    return changed_at(_times(found, table), found.diagnosis.residual_before, found.diagnosis.noise_floor_um)
 
 
-def _holds_after(found: DiagnosisResult, base: ThermalModel, from_s: float) -> bool:
+def _holds_after(found: DiagnosisResult, table: Table, base: ThermalModel, from_s: float) -> bool:
     """Return whether what can be deployed makes the residual after a time smaller."""
     if len(found.model.effects) == len(base.effects):
         return False
-    times, before, after = _residuals(found)
-    return bool(np.nanstd(after[times >= from_s]) < np.nanstd(before[times >= from_s]))
+    after = _times(found, table) >= from_s
+    before_um, left_um = found.diagnosis.residual_before[after], found.diagnosis.residual_after[after]
+    return bool(np.nanstd(left_um) < np.nanstd(before_um))
 
 
-def _residuals(found: DiagnosisResult) -> tuple[Vector, Vector, Vector]:
-    """Return the times of a diagnosis, s, and the residuals before and after, µm."""
-    times = np.concatenate([run.t_s for run in found.diagnosis.evidence.runs])
-    return times, found.diagnosis.residual_before, found.diagnosis.residual_after
+def _times(found: DiagnosisResult, table: Table) -> Vector:
+    """Return the times of the residuals of a diagnosis, s, as in its table."""
+    return np.asarray(table.t_s.min() + np.concatenate([run.t_s for run in found.diagnosis.evidence.runs]))
 
 
 def _left(found: DiagnosisResult, base: ThermalModel) -> float:
@@ -123,13 +122,12 @@ def _left(found: DiagnosisResult, base: ThermalModel) -> float:
 
 
 def _end_of(table: Table, from_s: float) -> Table | None:
-    """Return the end of a table; None if it is too short."""
-    kept = table.t_s >= min(from_s, table.t_s[-1] - 3600.0 * SHORTEST_H)
+    """Return the end of a table; None if it is too short, or is all of it."""
+    kept = table.t_s >= min(from_s, table.t_s.max() - 3600.0 * SHORTEST_H)
     columns = {name: values[kept] for name, values in table.columns.items()}
-    end = Table(name=table.name, t_s=table.t_s[kept], columns=columns, rows=range(2, int(kept.sum()) + 2))
-    if np.ptp(table.t_s) < 3600.0 * (SHORTEST_H + 1.0):
+    if kept.all() or (is_probed(table) and np.sum(np.isfinite(columns["y_um"])) < FEWEST_PROBES):
         return None
-    return None if is_probed(table) and np.sum(np.isfinite(columns["y_um"])) < FEWEST_PROBES else end
+    return Table(name=table.name, t_s=table.t_s[kept], columns=columns, rows=range(2, int(kept.sum()) + 2))
 
 
 def _diagnosed(table: Table, base: ThermalModel, probe_std_um: float | None) -> DiagnosisResult:

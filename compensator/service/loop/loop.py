@@ -20,7 +20,7 @@ from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import Avoided, Compared, LoopState, Running, fresh
+from compensator.service.loop.state import Avoided, Compared, Exchange, LoopState, Running, fresh
 from compensator.service.loop.trust import both_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
 from compensator.service.loop.words import ended, nothing_follows
 from compensator.service.outcome import Outcome
@@ -82,15 +82,6 @@ class Loop:
         if running is None or running.candidate_sha256:
             return None
         return StartDiagnosis(from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why=running.why)
-
-    @property
-    def level_um(self) -> float:
-        """By how much the shadow's prediction must rise to stand at the level of the present one, µm; 0 if it need not.
-
-        A model is judged by changes of Y. If its level contradicts measured Y, it counts from a zero that was set
-        before its effect acted, or measured Y has moved: then the level stays as it is and only its changes are new.
-        """
-        return self._comparison.level_um if self.state.verdict.y_moved else 0.0
 
     @property
     def judged_h(self) -> float:
@@ -199,13 +190,22 @@ class Loop:
             return [self._note(LoopAction.PROPOSE, text)]
         if state.adopted_utc_ns and now_ns - state.adopted_utc_ns < ADOPTION_H * _HOUR_NS:
             return []
-        state.exchange = "adopt"
+        self._exchange("adopt")
         return [self._note(LoopAction.ADOPT, f"a better model is adopted: {self._named()}; {described(state.verdict)}")]
 
     def _go_back(self) -> list[Note]:
-        self.state.exchange = "back"
+        self._exchange("back")
         text = f"back to the model before, which is better: {self._named()}; {described(self.state.verdict)}"
         return [self._note(LoopAction.BACK, text)]
+
+    def _exchange(self, action: Exchange) -> None:
+        """Decide an exchange, and the level of the other model.
+
+        A model is judged by changes of Y. If its level contradicts measured Y, it counts from a zero that was set
+        before its effect acted, or measured Y has moved: then the level stays as it is and only its changes are new.
+        """
+        state = self.state
+        state.exchange, state.level_um = action, self._comparison.level_um if state.verdict.y_moved else 0.0
 
     def _end(self, why: str, text: str = "") -> list[Note]:
         """End the shadow."""
@@ -230,6 +230,7 @@ class Loop:
             effects=shadow.effects if shadow is not None else [],
             since_utc_ns=shadow.since_utc_ns if shadow is not None else 0,
             comparison=state.verdict if shadow is not None else None,
+            level_um=state.level_um if state.exchange else None,
         )
         return Note(EventKind.LOOP, text, data.table())
 
@@ -351,7 +352,8 @@ class Loop:
         shadow = self.state.shadow
         if shadow is None or shadow.role != "candidate":
             raise ServiceError("adopt --candidate: there is no candidate now; see `compensator watch`")
-        self.state.exchange = self.state.exchange or "adopt"
+        if not self.state.exchange:
+            self._exchange("adopt")
 
     def dismiss(self, now_ns: int) -> list[Note]:
         """End a candidate: an operator has refused it. Its effects are avoided for some time."""

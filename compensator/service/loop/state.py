@@ -56,6 +56,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         What the shadow is for.
     exchange : {"", "adopt", "back"}
         An exchange that was decided and happens before the next sample.
+    level_um : float
+        By how much the level of the other model is raised at it, µm.
     diagnosis : Running, optional
         A diagnosis that was begun.
     planned_utc_ns, diagnosed_utc_ns : int
@@ -79,6 +81,7 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     schema: int = STATE_SCHEMA
     phase: Phase = "idle"
     exchange: Exchange = ""
+    level_um: float = 0.0
     diagnosis: Running | None = None
     planned_utc_ns: int = 0
     diagnosed_utc_ns: int = 0
