@@ -31,7 +31,8 @@ from compensator.service.transfer.second_opinion import described, is_unusable
 DIFFERS = 4.0
 #: A candidate must be wrong by less than this part of the present model's changes.
 BETTER_PART = 0.95
-#: Least time between two adoptions, and between two diagnoses for a misfit, h.
+#: Least time between two adoptions, which is that after going back from a model, too; and between two diagnoses for a
+#: misfit, h.
 ADOPTION_H, MISFIT_AGAIN_H = 24.0, 12.0
 #: What is compared counts for so long, in `shadow_h`, and the least of it, h; a candidate that is better so far has as
 #: long before the next diagnosis.
@@ -310,8 +311,7 @@ class Loop:
             return "unchanged"
         if found.in_shadow and self.state.shadow is not None and self.state.shadow.role == role_of(found):
             return "in_shadow"
-        self.state.avoided = [one for one in self.state.avoided if one.until_utc_ns > now_ns]
-        if not found.calibrated and any(sorted(one.effects) == sorted(found.effects) for one in self.state.avoided):
+        if not found.calibrated and any(one.until_utc_ns > now_ns for one in self._avoided(found.effects)):
             return "avoided"
         return ""
 
@@ -332,7 +332,7 @@ class Loop:
         assert state.shadow is not None
         before, state.effects = state.effects, state.shadow.effects
         if back:
-            self._avoid(before, now_ns)
+            self._avoid_after_back(before, now_ns)
             state.phase, state.shadow, state.exchange = "idle", None, ""
             self._begin_comparison()
             return
@@ -360,14 +360,14 @@ class Loop:
         shadow = self.state.shadow
         if shadow is None or shadow.role != "candidate" or self.state.exchange:
             return []
-        self._avoid(shadow.effects, now_ns)
+        self._avoid(shadow.effects, now_ns, self._settings.watch_h)
         return self._end("dismissed")
 
     def model_changed(self, effects: Sequence[str], now_ns: int, *, back: bool = False) -> list[Note]:
         """Begin anew: an operator has changed the model; a diagnosis under way is of no use."""
         state = self.state
         if back:
-            self._avoid(state.effects, now_ns)
+            self._avoid(state.effects, now_ns, self._settings.watch_h)
         state.effects, state.diagnosis = list(effects), None
         words = "a person has changed the model or the configuration"
         return self.give_up("by_hand", words) if state.shadow is not None else []
@@ -396,9 +396,19 @@ class Loop:
         state.diagnosis = again
         return [self._diagnosis_begins()]
 
-    def _avoid(self, effects: Sequence[str], now_ns: int) -> None:
-        until_ns = now_ns + round(self._settings.watch_h * _HOUR_NS)
-        self.state.avoided = [*self.state.avoided, Avoided(effects=list(effects), until_utc_ns=until_ns)]
+    def _avoided(self, effects: Sequence[str]) -> list[Avoided]:
+        return [one for one in self.state.avoided if sorted(one.effects) == sorted(effects)]
+
+    def _avoid(self, effects: Sequence[str], now_ns: int, hours: float) -> None:
+        """Avoid effects for some time."""
+        oldest_ns = now_ns - round(self._settings.watch_h * _HOUR_NS)
+        kept = [one for one in self.state.avoided if max(one.since_utc_ns, one.until_utc_ns) > oldest_ns]
+        until_ns = now_ns + round(min(hours, self._settings.watch_h) * _HOUR_NS)
+        self.state.avoided = [*kept, Avoided(effects=list(effects), since_utc_ns=now_ns, until_utc_ns=until_ns)]
+
+    def _avoid_after_back(self, effects: Sequence[str], now_ns: int) -> None:
+        """Avoid effects that were gone back from: an effect may come again, so twice as long each time."""
+        self._avoid(effects, now_ns, ADOPTION_H * 2 ** len(self._avoided(effects)))
 
 
 def role_of(found: DiagnosisData) -> Role:

@@ -39,9 +39,10 @@ class Compared(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Avoided(msgspec.Struct, frozen=True, kw_only=True):
-    """Effects that are not adopted again before a time."""
+    """Effects that are not adopted again before a time, and since when."""
 
     effects: list[str]
+    since_utc_ns: int
     until_utc_ns: int
 
 
