@@ -1,4 +1,4 @@
-"""A candidate that is right about every change of Y and wrong in its level is adopted for its changes alone."""
+"""A candidate that is right about every change of Y and wrong in its level: proposed, and adopted after a zero."""
 
 import asyncio
 import dataclasses
@@ -16,7 +16,7 @@ from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE
 from tests.service.looping import DAY, Night, decisions, errors, extended, machine, run, settings, shown
-from tests.service.test_loop_service import Looping, changed, checked, replayed
+from tests.service.test_loop_service import Asked, Looping, changed, checked, in_phase, replayed
 from tests.service.test_restart import QUILL as QUILL_FILE
 
 
@@ -25,17 +25,34 @@ def warm_at_first(i: int, values: dict[str, float]) -> None:
     values["coolant_degc"] += 4.0 if i < DAY // 2 else 0.0
 
 
-@pytest.mark.parametrize("change", [warm_at_first, lambda i, values: None], ids=["another level", "the same level"])
-def test_the_level_of_the_present_model_stays_where_that_of_the_candidate_contradicts_measured_y(change):
+def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it_is():
     loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
-    samples = machine(3 * DAY, lambda i: 1.0 if i >= DAY // 2 else 0.0, change=change)
-    steps = run(loop, samples)
-    (adopted,) = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
+    samples = machine(3 * DAY, lambda i: 1.0 if i >= DAY // 2 else 0.0, change=warm_at_first)
+    steps = run(loop, samples, 2 * DAY)
+    assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
+    loop.accept()
+    agreed = len(steps)
+    steps += run(loop, samples)
+    assert [(step, why) for seq, step, why in decisions(steps) if seq == agreed] == [("adopt", "by_hand")]
     error = errors(steps)
-    before, after = error[adopted - 720 : adopted], error[adopted + 30 :]
+    before, after = error[agreed - 720 : agreed], error[agreed + 30 :]
     # 3 µm/K times 4 K would be 12 µm.
     assert abs(np.mean(after)) < abs(np.mean(before)) + 1.0
     assert np.std(after) < 0.5 * np.std(before)
+
+
+def test_such_a_candidate_is_adopted_after_a_zero():
+    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    samples = machine(4 * DAY, lambda i: 1.0 if i >= DAY // 2 else 0.0, change=warm_at_first)
+    steps = run(loop, samples, 2 * DAY)
+    assert loop.phase == "proposed"
+    loop.compensation.zero("warm")
+    zero = len(steps)
+    steps += run(loop, samples)
+    (adopted,) = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
+    assert adopted - zero < DAY
+    # The error about the zero is what remains of the effect.
+    assert np.sqrt(np.mean((errors(steps)[adopted + 60 :] - np.mean(errors(steps)[zero + 1 : zero + 30])) ** 2)) < 3.0
 
 
 class WarmAtFirst(Looping):
@@ -49,13 +66,15 @@ class WarmAtFirst(Looping):
 
 @pytest.fixture(scope="module")
 def adopted(tmp_path_factory):
-    """A service that has adopted a candidate whose level contradicted measured Y."""
+    """A service in which a person has adopted a candidate whose level contradicts measured Y."""
     service = WarmAtFirst(
         tmp_path_factory.mktemp("level"), shown(extended()), acts=lambda i: 1.0 if i >= DAY // 2 else 0.0
     )
 
     async def adopts():
-        await service.run(2400, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+        await service.run(2400, until=in_phase(service, "proposed"))
+        service.at_sample[len(service.outcomes) + 30] = Asked(service, "adopt", candidate=True)
+        await service.run(120, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
         await service.run(30)
 
     asyncio.run(adopts())

@@ -186,7 +186,7 @@ class LiveLoop:
         """Adopt the candidate: an operator's command that acts with the next sample."""
         if self._core is not None:
             try:
-                self._core.loop.accept()
+                self._note(self._core.loop.accept())
             except ServiceError as error:  # it has ended since the command was received
                 log.info("%s", error)
 

@@ -169,7 +169,7 @@ class Loop:
         if state.phase == "proposed" and verdict != ComparisonVerdict.BETTER:
             state.phase = "shadow"
             return [self._note(LoopAction.WITHDRAW, f"the proposal is withdrawn: {described(state.verdict)}")]
-        if state.phase == "shadow" and is_better:
+        if is_better and (state.phase == "shadow" or self._may_adopt(now_ns)):
             return self._accept(now_ns)
         return []
 
@@ -182,17 +182,31 @@ class Loop:
             return found.probes >= settings.probes and found.hours >= settings.shadow_h
         return self.judged_h >= settings.shadow_h
 
+    def _may_adopt(self, now_ns: int) -> bool:
+        """Return whether a candidate that is better is adopted without a person.
+
+        It must be better about the zero, too. Where its level contradicts measured Y, it counts from a zero that was
+        set before its effect acted, or measured Y has moved: which of them is seen at the next zero.
+        """
+        state = self.state
+        if self._settings.policy != "adopt" or not _is_better_about_zero(state.verdict):
+            return False
+        return not state.adopted_utc_ns or now_ns - state.adopted_utc_ns >= ADOPTION_H * _HOUR_NS
+
     def _accept(self, now_ns: int) -> list[Note]:
         """Adopt or propose a candidate."""
-        state = self.state
-        if self._settings.policy == "propose":
-            state.phase = "proposed"
-            text = f"a better model is proposed: {self._named()}; {described(state.verdict)}"
-            return [self._note(LoopAction.PROPOSE, text)]
-        if state.adopted_utc_ns and now_ns - state.adopted_utc_ns < ADOPTION_H * _HOUR_NS:
-            return []
-        self._exchange("adopt")
-        return [self._note(LoopAction.ADOPT, f"a better model is adopted: {self._named()}; {described(state.verdict)}")]
+        state, by_hand = self.state, self._settings.policy == "propose"
+        if self._may_adopt(now_ns):
+            self._exchange("adopt")
+            text = f"a better model is adopted: {self._named()}; {described(state.verdict)}"
+            return [self._note(LoopAction.ADOPT, text)]
+        if not by_hand and _is_better_about_zero(state.verdict):
+            return []  # the last adoption is too short a time ago
+        state.phase = "proposed"
+        text = f"a better model is proposed: {self._named()}; {described(state.verdict)}"
+        if not _is_better_about_zero(state.verdict):
+            text += "; its level is not confirmed: set a zero, and adopt it then"
+        return [self._note(LoopAction.PROPOSE, text)]
 
     def _go_back(self) -> list[Note]:
         self._exchange("back")
@@ -341,7 +355,7 @@ class Loop:
         self.shadow_begins(sha256_before, before, now_ns, "before")
         state.diagnosis = diagnosis
 
-    def accept(self) -> None:
+    def accept(self) -> list[Note]:
         """Adopt the candidate before the next sample: an operator has agreed.
 
         Raises
@@ -352,8 +366,11 @@ class Loop:
         shadow = self.state.shadow
         if shadow is None or shadow.role != "candidate":
             raise ServiceError("adopt --candidate: there is no candidate now; see `compensator watch`")
-        if not self.state.exchange:
-            self._exchange("adopt")
+        if self.state.exchange:
+            return []
+        self._exchange("adopt")
+        text = f"an operator adopts the candidate: {self._named()}; {described(self.state.verdict)}"
+        return [self._note(LoopAction.ADOPT, text, why="by_hand")]
 
     def dismiss(self, now_ns: int) -> list[Note]:
         """End a candidate: an operator has refused it. Its effects are avoided for some time."""
@@ -418,6 +435,12 @@ def role_of(found: DiagnosisData) -> Role:
 
 def _is_limited(outcome: Outcome) -> bool:
     return any(reason.startswith(_LIMITS) for reason in outcome.offset.reasons)
+
+
+def _is_better_about_zero(found: ComparisonData) -> bool:
+    if found.present_rms_um is None or found.candidate_rms_um is None:
+        return False
+    return found.candidate_rms_um <= BETTER_PART * found.present_rms_um
 
 
 def _is_clearly_better(found: ComparisonData) -> bool:

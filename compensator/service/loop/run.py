@@ -139,14 +139,14 @@ class LoopRun:
         self._core.resume()
 
     def accept(self) -> None:
-        """Adopt the candidate in shadow before the next sample, as an operator can.
+        """Adopt the candidate in shadow before the next sample, as an operator can; the event comes with that sample.
 
         Raises
         ------
         ServiceError
             If there is none.
         """
-        self._core.loop.accept()
+        self._notes += self._core.loop.accept()
 
     def dismiss(self) -> None:
         """End the candidate, as an operator can; the event comes with the next sample."""
