@@ -377,14 +377,14 @@ class Loop:
         shadow = self.state.shadow
         if shadow is None or shadow.role != "candidate" or self.state.exchange:
             return []
-        self._avoid(shadow.effects, now_ns, self._settings.watch_h)
+        self._avoid(shadow.effects, now_ns)
         return self._end("dismissed")
 
     def model_changed(self, effects: Sequence[str], now_ns: int, *, back: bool = False) -> list[Note]:
         """Begin anew: an operator has changed the model; a diagnosis under way is of no use."""
         state = self.state
         if back:
-            self._avoid(state.effects, now_ns, self._settings.watch_h)
+            self._avoid(state.effects, now_ns)
         state.effects, state.diagnosis = list(effects), None
         words = "a person has changed the model or the configuration"
         return self.give_up("by_hand", words) if state.shadow is not None else []
@@ -416,16 +416,20 @@ class Loop:
     def _avoided(self, effects: Sequence[str]) -> list[Avoided]:
         return [one for one in self.state.avoided if sorted(one.effects) == sorted(effects)]
 
-    def _avoid(self, effects: Sequence[str], now_ns: int, hours: float) -> None:
-        """Avoid effects for some time."""
-        oldest_ns = now_ns - round(self._settings.watch_h * _HOUR_NS)
-        kept = [one for one in self.state.avoided if max(one.since_utc_ns, one.until_utc_ns) > oldest_ns]
-        until_ns = now_ns + round(min(hours, self._settings.watch_h) * _HOUR_NS)
-        self.state.avoided = [*kept, Avoided(effects=list(effects), since_utc_ns=now_ns, until_utc_ns=until_ns)]
+    def _avoid(self, effects: Sequence[str], now_ns: int) -> None:
+        """Avoid effects that a person did not want."""
+        self._avoid_for(self._settings.watch_h, effects, now_ns)
 
     def _avoid_after_back(self, effects: Sequence[str], now_ns: int) -> None:
         """Avoid effects that were gone back from: an effect may come again, so twice as long each time."""
-        self._avoid(effects, now_ns, ADOPTION_H * 2 ** len(self._avoided(effects)))
+        oldest_ns = now_ns - round(self._settings.watch_h * _HOUR_NS)
+        self.state.avoided = [one for one in self.state.avoided if one.until_utc_ns > oldest_ns]
+        hours = ADOPTION_H * 2 ** len(self._avoided(effects))
+        self._avoid_for(min(hours, self._settings.watch_h), effects, now_ns)
+
+    def _avoid_for(self, hours: float, effects: Sequence[str], now_ns: int) -> None:
+        until_ns = now_ns + round(hours * _HOUR_NS)
+        self.state.avoided = [*self.state.avoided, Avoided(effects=list(effects), until_utc_ns=until_ns)]
 
 
 def role_of(found: DiagnosisData) -> Role:

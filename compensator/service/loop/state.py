@@ -39,10 +39,9 @@ class Compared(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Avoided(msgspec.Struct, frozen=True, kw_only=True):
-    """Effects that are not adopted again before a time, and since when."""
+    """Effects that are not adopted again before a time."""
 
     effects: list[str]
-    since_utc_ns: int
     until_utc_ns: int
 
 
