@@ -58,11 +58,24 @@ def _diagnose(job: Job, folder: Path) -> Result:
     return Result(verdict=short.verdict, effects=list(short.effects), text=short.text, needs=short.needs)
 
 
+def take_priority() -> None:
+    """Take a low priority.
+
+    `SCHED_BATCH` takes no core from a process that wakes up, such as the service. Of cores that others use it still
+    gets some per cent; with `SCHED_IDLE`, or a niceness of 19, it would not end within its time.
+
+    Raises
+    ------
+    OSError
+        If it is not permitted.
+    """
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
+
+
 def _limit(job: Job) -> str:
     """Take a low priority and the limits of the job, and end with the parent.
-
-    `SCHED_BATCH` never takes a core from a process that wakes up, such as the service. Of two cores that others use it
-    still gets some per cent; with `SCHED_IDLE`, or a niceness of 19, it would not end within its time.
 
     Returns
     -------
@@ -75,8 +88,6 @@ def _limit(job: Job) -> str:
         raise SystemExit(1)
     with suppress(OSError):  # if memory runs out, this process is ended and not the service
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
-    with suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     limits = (
         (resource.RLIMIT_AS, round(job.memory_mb * 1e6)),
         (resource.RLIMIT_CPU, round(job.time_limit_min * 60.0)),
@@ -84,7 +95,7 @@ def _limit(job: Job) -> str:
         (resource.RLIMIT_CORE, 0),
     )
     try:
-        os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
+        take_priority()
         for limit, value in limits:
             resource.setrlimit(limit, (value, value))
     except (OSError, ValueError) as error:
