@@ -299,6 +299,8 @@ class LoopData(_Data, frozen=True, kw_only=True):
         When the comparison began.
     comparison : ComparisonData, optional
         The comparison at that time.
+    level_um : float, optional
+        By how much the level of the other model is raised at the exchange, µm (`Compensation.raise_level`).
     """
 
     step: LoopAction
@@ -310,6 +312,7 @@ class LoopData(_Data, frozen=True, kw_only=True):
     to_utc_ns: int = 0
     since_utc_ns: int = 0
     comparison: ComparisonData | None = None
+    level_um: float | None = None
 
 
 class RecordingCode(StrEnum):

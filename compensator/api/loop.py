@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from compensator.api.diagnosis import DiagnosisResult, diagnose
+from compensator.arrays import Vector
 from compensator.config import Config
 from compensator.data.frames import hash_of
 from compensator.data.measurement import Measurement, Origin
@@ -17,18 +18,17 @@ from compensator.errors import CompensatorError, DataError
 from compensator.model.model_file import parse_model
 from compensator.model.model_writer import dump_model
 from compensator.model.thermal_model import ThermalModel
+from compensator.service.loop.change import changed_at
 from compensator.service.loop.record import is_probed, usable_table
 from compensator.service.loop.weighing import Diagnosed, name_of
 from compensator.service.outcome import Outcome
 
-#: Ends of a record that are diagnosed if the whole is not explained, h.
-ENDS_H = (24.0, 16.0, 10.0, 7.0)
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
-#: An end with fewer probes is not diagnosed: they name nothing, and a search takes as long as one of the whole.
-FEWEST_PROBES = 20
-#: A shorter end must leave less than this part of what a longer one does.
-SHORTER_IS_BETTER = 0.7
+#: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing.
+SHORTEST_H, FEWEST_PROBES = 7.0, 20
+#: The end must leave less than this part of what the whole does.
+END_IS_BETTER = 0.7
 
 
 def diagnosis_in_process(config: Config) -> Callable[[Sequence[Outcome], bytes], Diagnosed]:
@@ -61,8 +61,8 @@ def diagnoses_of_table(
 ) -> tuple[DiagnosisResult, DiagnosisResult]:
     """Diagnose a table of `service.loop.record`: all of it, and the end of it if that explains itself better.
 
-    An effect that began or ended within the record explains no whole of it: where the whole is not explained, shorter
-    ends are, the longest first.
+    An effect that began or ended within the record explains no whole of it: where the whole is not explained, what is
+    after the change of its residual is diagnosed, too.
 
     Returns
     -------
@@ -78,20 +78,37 @@ def diagnoses_of_table(
         raise DataError(f"{table.name}: no measured Y that may be used")
     base = parse_model(model, source="calibrated model")
     whole = _diagnosed(table, base, probe_std_um)
-    best, least = whole, _left(whole, base)
-    for hours in ENDS_H:
-        if least <= WELL_EXPLAINED or np.ptp(table.t_s) < 3600.0 * (hours + 1.0):
-            continue
-        end = _end_of(table, hours)
-        if is_probed(table) and np.sum(np.isfinite(end.columns["y_um"])) < FEWEST_PROBES:
-            break
-        try:
-            found = _diagnosed(end, base, probe_std_um)
-        except CompensatorError:  # too little data in so short an end
-            break
-        if _left(found, base) < SHORTER_IS_BETTER * least:
-            best, least = found, _left(found, base)
-    return best, whole
+    changed_s = _changed_at(whole, table) if _left(whole, base) > WELL_EXPLAINED else None
+    end = _end_of(table, changed_s) if changed_s is not None else None
+    if changed_s is None or end is None:
+        return whole, whole
+    try:
+        found = _diagnosed(end, base, probe_std_um)
+    except CompensatorError:  # too little data in so short an end
+        return whole, whole
+    if found.verdict == "adequate":
+        # An end in which little moves shows no effect either: it has ended only if the model is better without it.
+        return (whole, whole) if _holds_after(whole, table, base, changed_s) else (found, whole)
+    return (found if _left(found, base) < END_IS_BETTER * _left(whole, base) else whole), whole
+
+
+def _changed_at(found: DiagnosisResult, table: Table) -> float | None:
+    """Return when the base model's residual in a diagnosis has changed, s; None if it has not."""
+    return changed_at(_times(found, table), found.diagnosis.residual_before, found.diagnosis.noise_floor_um)
+
+
+def _holds_after(found: DiagnosisResult, table: Table, base: ThermalModel, from_s: float) -> bool:
+    """Return whether what can be deployed makes the residual after a time smaller."""
+    if len(found.model.effects) == len(base.effects):
+        return False
+    after = _times(found, table) >= from_s
+    before_um, left_um = found.diagnosis.residual_before[after], found.diagnosis.residual_after[after]
+    return bool(np.nanstd(left_um) < np.nanstd(before_um))
+
+
+def _times(found: DiagnosisResult, table: Table) -> Vector:
+    """Return the times of the residuals of a diagnosis, s, as in its table."""
+    return np.asarray(table.t_s.min() + np.concatenate([run.t_s for run in found.diagnosis.evidence.runs]))
 
 
 def _left(found: DiagnosisResult, base: ThermalModel) -> float:
@@ -104,9 +121,12 @@ def _left(found: DiagnosisResult, base: ThermalModel) -> float:
     return math.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
 
 
-def _end_of(table: Table, hours: float) -> Table:
-    kept = table.t_s > table.t_s[-1] - 3600.0 * hours
+def _end_of(table: Table, from_s: float) -> Table | None:
+    """Return the end of a table; None if it is too short, or is all of it."""
+    kept = table.t_s >= min(from_s, table.t_s.max() - 3600.0 * SHORTEST_H)
     columns = {name: values[kept] for name, values in table.columns.items()}
+    if kept.all() or (is_probed(table) and np.sum(np.isfinite(columns["y_um"])) < FEWEST_PROBES):
+        return None
     return Table(name=table.name, t_s=table.t_s[kept], columns=columns, rows=range(2, int(kept.sum()) + 2))
 
 

@@ -20,6 +20,8 @@ one_thread_from_start()
 
 from compensator.service.loop.job import CALIBRATED, JOB, RESULT, Job, Result, read_job  # noqa: E402
 
+#: Priority of the process.
+NICENESS = 10
 #: Largest file that it may write, bytes.
 _LARGEST_FILE = 100_000_000
 #: `prctl` option of Linux: the signal that a process gets when its parent ends.
@@ -47,8 +49,8 @@ def _diagnose(job: Job, folder: Path) -> Result:
     from compensator.service.loop.job import read_record
     from compensator.service.loop.record import table_of_rows
 
-    rows, probes = read_record(job)
-    table = table_of_rows(rows, probes, job.machine)
+    record = read_record(job)
+    table = table_of_rows(record.rows, record.probes, job.machine, zeros_ns=record.zeros_ns)
     model = read_file(folder / CALIBRATED, MODEL_BYTES)
     found, whole = diagnoses_of_table(table, model, probe_std_um=job.probe_std_um)
     found.save_all(folder)
@@ -56,8 +58,24 @@ def _diagnose(job: Job, folder: Path) -> Result:
     return Result(verdict=short.verdict, effects=list(short.effects), text=short.text, needs=short.needs)
 
 
+def take_priority() -> None:
+    """Take a low priority.
+
+    `SCHED_BATCH` takes no core from a process that wakes up, such as the service. Of cores that others use it still
+    gets some per cent; with `SCHED_IDLE`, or a niceness of 19, it would not end within its time.
+
+    Raises
+    ------
+    OSError
+        If it is not permitted.
+    """
+    with suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
+
+
 def _limit(job: Job) -> str:
-    """Take the lowest priority and the limits of the job, and end with the parent.
+    """Take a low priority and the limits of the job, and end with the parent.
 
     Returns
     -------
@@ -70,8 +88,6 @@ def _limit(job: Job) -> str:
         raise SystemExit(1)
     with suppress(OSError):  # if memory runs out, this process is ended and not the service
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
-    with suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     limits = (
         (resource.RLIMIT_AS, round(job.memory_mb * 1e6)),
         (resource.RLIMIT_CPU, round(job.time_limit_min * 60.0)),
@@ -79,7 +95,7 @@ def _limit(job: Job) -> str:
         (resource.RLIMIT_CORE, 0),
     )
     try:
-        os.setpriority(os.PRIO_PROCESS, 0, 19)
+        take_priority()
         for limit, value in limits:
             resource.setrlimit(limit, (value, value))
     except (OSError, ValueError) as error:

@@ -46,7 +46,9 @@ FIRST = BearingFriction(full_speed_w=6.0)
 SECOND = FanMotor(full_speed_w=30.0, place="rear")
 #: A probe in minutes, and the seed of its noise beside that of the demo.
 PROBE_EVERY_MIN, PROBE_SEED = 60, 16
-LOOP = Loop(policy="adopt", misfit_h=3.0, record_h=24.0, shadow_h=6.0)
+LOOP = Loop(policy="adopt", every_h=24, misfit_h=3.0, record_h=24.0, shadow_h=6.0)
+#: The same with a probe each hour: a day of them names nothing.
+PROBED_LOOP = msgspec.structs.replace(LOOP, every_h=12, record_h=48.0)
 _KINDS = (EventKind.LOOP, EventKind.DIAGNOSIS, EventKind.ADOPT)
 #: Lines of the simulated devices, which are not opened here.
 _LINES = {"rtu": "/dev/null", "tcp": 502, "plc": 503, "dcon": "/dev/null", "data": 10001, "command": 23}
@@ -140,7 +142,7 @@ def _config(name: str, *, is_probed: bool) -> Config:
     text = configuration(f"sim-{name}", _LINES, 7447, is_probed=is_probed)
     config = parse_config(text.encode(), source="demo")
     fan = Channel(name="fan_rpm", device="control", input=0)
-    return msgspec.structs.replace(config, loop=LOOP, channel=[*config.channel, fan])
+    return msgspec.structs.replace(config, loop=PROBED_LOOP if is_probed else LOOP, channel=[*config.channel, fan])
 
 
 def _samples(

@@ -106,6 +106,37 @@ def simulated_days() -> Iterator[Figure]:
     yield spread("the same, 99th percentile", highest, "ms", wanted="under 10 ms")
 
 
+#: Works as a diagnosis does, with its priority.
+DIAGNOSIS = """
+import os, numpy as np
+from compensator.commands.loop_diagnosis import take_priority
+take_priority()
+values = np.random.default_rng(1).normal(size=(400, 400))
+while True:
+    np.linalg.svd(values)
+"""
+
+
+def beside_diagnoses() -> Iterator[Figure]:
+    """The latency of a sample, alone and with as many processes of diagnoses as there are cores, by turns."""
+    found: dict[bool, list[float]] = {False: [], True: []}
+    for is_beside in (False, True) * 2:
+        count = os.cpu_count() or 1 if is_beside else 0
+        others = [subprocess.Popen([sys.executable, "-c", DIAGNOSIS]) for _ in range(count)]
+        try:
+            with machine(4.0) as (config, clock, _world):
+                daemon = asyncio.run(run_service(load(str(config)), clock=clock, samples=240))
+        finally:
+            for other in others:
+                other.kill()
+                other.wait()
+        found[is_beside] += [1e3 * seconds for seconds in daemon.latency.seconds]
+    for is_beside, name in ((False, "alone"), (True, "beside a diagnosis on each core")):
+        middle, high = np.percentile(found[is_beside], [50, 99])
+        what = f"end of the last poll to offset published, {name}: median, 99th percentile"
+        yield told(Figure(what=what, found=f"{middle:.1f}, {high:.1f} ms", wanted="under 10 ms"))
+
+
 def service_process() -> Iterator[Figure]:
     """The service as a process of its own at one poll a second: processor time and memory."""
     duty = Duty.working_day(1, hours=1.0)
@@ -134,6 +165,7 @@ def report() -> Iterator[Figure]:
     """Measure everything here."""
     yield from engine_steps()
     yield from simulated_days()
+    yield from beside_diagnoses()
     yield from service_process()
 
 

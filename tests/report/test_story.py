@@ -28,7 +28,7 @@ FIGURES = ComparisonData(
 )
 #: Minute of each event, kind, text, data.
 TOLD: tuple[tuple[int, str, str, dict[str, Any]], ...] = (
-    (100, "loop", "a diagnosis of the last 36 h begins", LoopData(step=LoopAction.DIAGNOSE, why="night").table()),
+    (100, "loop", "a diagnosis of the last 36 h begins", LoopData(step=LoopAction.DIAGNOSE, why="planned").table()),
     (101, "diagnosis", "found", DiagnosisData(verdict="explained", effects=["input:coolant_degc"]).table()),
     (
         101,

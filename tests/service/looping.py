@@ -31,8 +31,9 @@ LIMITS = {
 
 
 def settings(**changes: Any) -> Config:
-    """The usual configuration, with a loop that adopts."""
-    return config(**{"loop": {"policy": "adopt"}, "limits": LIMITS, **changes})
+    """The usual configuration, with a loop that adopts, and looks for a model once a day."""
+    loop = {"policy": "adopt", "every_h": 24} | changes.pop("loop", {})
+    return config(**{"loop": loop, "limits": LIMITS, **changes})
 
 
 def extended(gain: float = 3.0, std: float = 0.05, *, tau_min: float = 60.0) -> bytes:

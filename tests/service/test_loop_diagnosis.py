@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from compensator.api.loop import diagnosis_of_record
+import numpy as np
+import pytest
+
+import compensator.api.loop as api
+from compensator.api.diagnosis import DiagnosisResult
+from compensator.api.loop import _diagnosed, diagnoses_of_table, diagnosis_of_record
+from compensator.data.table import Table
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.loop.record import usable_table
 from compensator.service.loop.run import LoopRun
 from tests.service.looping import Night, machine, run, settings, shown
 from tests.service.test_restart import QUILL
@@ -21,3 +29,19 @@ def test_a_mount_that_was_knocked_is_named_to_a_person_and_gives_no_candidate() 
     steps = run(loop, machine(1200, acts=lambda i: 0.0, more=lambda i: 8.0 * (i > 800)))
     found = diagnosis_of_record([step.outcome for step in steps], QUILL)
     assert found.model is None and found.effects == () and "step" in found.needs
+
+
+def test_only_what_is_after_the_change_of_the_residual_is_diagnosed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
+    begins, spans = 1200, list[float]()
+    table = usable_table([step.outcome for step in run(loop, machine(2160, acts=lambda i: float(i > begins)))])
+
+    def counted(table: Table, base: ThermalModel, probe_std_um: float | None) -> DiagnosisResult:
+        spans.append(float(np.ptp(table.t_s)) / 60.0)
+        return _diagnosed(table, base, probe_std_um)
+
+    monkeypatch.setattr(api, "_diagnosed", counted)
+    monkeypatch.setattr(api, "WELL_EXPLAINED", 0.0)
+    diagnoses_of_table(table, QUILL)
+    assert len(spans) == 2
+    assert spans[1] == pytest.approx(2160 - begins, abs=120)

@@ -1,10 +1,22 @@
-"""A candidate that is right about every change of Y and wrong in its level is adopted for its changes alone."""
+"""A candidate that is right about every change of Y and wrong in its level: proposed, and adopted after a zero."""
+
+import asyncio
+import dataclasses
+import json
 
 import numpy as np
 import pytest
 
+from compensator.audit.replay_check import ReplayCheck
+from compensator.audit.result import RecordingAudit
+from compensator.recording.container import Container
+from compensator.recording.reading import groups_of, recordings
 from compensator.service.loop.run import LoopRun
+from compensator.service.replay import opening_of
+from compensator.service.transfer.model_store import sha256_of
+from tests.service.living import MACHINE
 from tests.service.looping import DAY, Night, decisions, errors, extended, machine, run, settings, shown
+from tests.service.test_loop_service import Asked, Looping, changed, checked, in_phase, replayed
 from tests.service.test_restart import QUILL as QUILL_FILE
 
 
@@ -13,14 +25,91 @@ def warm_at_first(i: int, values: dict[str, float]) -> None:
     values["coolant_degc"] += 4.0 if i < DAY // 2 else 0.0
 
 
-@pytest.mark.parametrize("change", [warm_at_first, lambda i, values: None], ids=["another level", "the same level"])
-def test_the_level_of_the_present_model_stays_where_that_of_the_candidate_contradicts_measured_y(change):
+def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it_is():
     loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
-    samples = machine(3 * DAY, lambda i: 1.0 if i >= DAY // 2 else 0.0, change=change)
-    steps = run(loop, samples)
-    (adopted,) = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
+    samples = machine(3 * DAY, lambda i: 1.0 if i >= DAY // 2 else 0.0, change=warm_at_first)
+    steps = run(loop, samples, 2 * DAY)
+    assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
+    loop.accept()
+    agreed = len(steps)
+    steps += run(loop, samples)
+    assert [(step, why) for seq, step, why in decisions(steps) if seq == agreed] == [("adopt", "by_hand")]
     error = errors(steps)
-    before, after = error[adopted - 720 : adopted], error[adopted + 30 :]
+    before, after = error[agreed - 720 : agreed], error[agreed + 30 :]
     # 3 µm/K times 4 K would be 12 µm.
     assert abs(np.mean(after)) < abs(np.mean(before)) + 1.0
     assert np.std(after) < 0.5 * np.std(before)
+
+
+def test_such_a_candidate_is_adopted_after_a_zero():
+    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    samples = machine(4 * DAY, lambda i: 1.0 if i >= DAY // 2 else 0.0, change=warm_at_first)
+    steps = run(loop, samples, 2 * DAY)
+    assert loop.phase == "proposed"
+    loop.compensation.zero("warm")
+    zero = len(steps)
+    steps += run(loop, samples)
+    (adopted,) = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
+    assert adopted - zero < DAY
+    # The error about the zero is what remains of the effect.
+    assert np.sqrt(np.mean((errors(steps)[adopted + 60 :] - np.mean(errors(steps)[zero + 1 : zero + 30])) ** 2)) < 3.0
+
+
+class WarmAtFirst(Looping):
+    """A machine whose coolant is 4 K warmer at the zero, while it does not act yet, than later."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        acted_from = self.device.sources[3]
+        self.device.sources[3] = lambda: acted_from() + (4.0 if self.minute() < DAY else 0.0)
+
+
+@pytest.fixture(scope="module")
+def adopted(tmp_path_factory):
+    """A service in which a person has adopted a candidate whose level contradicts measured Y."""
+    service = WarmAtFirst(
+        tmp_path_factory.mktemp("level"), shown(extended()), acts=lambda i: 1.0 if i >= DAY // 2 else 0.0
+    )
+
+    async def adopts():
+        await service.run(2400, until=in_phase(service, "proposed"))
+        service.at_sample[len(service.outcomes) + 30] = Asked(service, "adopt", candidate=True)
+        await service.run(120, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
+        await service.run(30)
+
+    asyncio.run(adopts())
+    return service
+
+
+def decision_of(service):
+    return next(event for event in service.events("loop") if event.data["step"] == "adopt")
+
+
+def test_a_replay_comes_to_the_same_level(adopted):
+    level_um = decision_of(adopted).data["level_um"]
+    assert level_um == pytest.approx(-12.0, abs=3.0) or level_um == pytest.approx(12.0, abs=3.0)  # 3 µm/K times 4 K
+    assert adopted.events("adopt")[-1].data["level_um"] == level_um
+    assert abs(adopted.events("adopt")[-1].data["difference_um"]) < 7.0  # what the effect itself makes
+    checked(adopted)
+
+
+def test_a_replay_sees_a_level_that_was_changed(adopted):
+    files = recordings(adopted.recordings, MACHINE)
+    written = b'"level_um":%s' % json.dumps(decision_of(adopted).data["level_um"]).encode()
+    deciding = [path for path in files if opening_of(path).get("candidate.toml") == extended()][-1]
+    assert replayed(deciding, lambda group: group) is None
+    assert replayed(deciding, changed("event", written, b'"level_um":0.0')).topic == "event"
+    # In the state with which the recording of the adopted model begins.
+    result = RecordingAudit(file=files[-1].name, size=0)
+    with Container(files[-1]) as container:
+        contents = container.survey(whole=False)
+        state = json.loads(contents.attachments["state.json"].data)
+        state["zero"]["y_base"] += 0.5
+        part = dataclasses.replace(contents.attachments["state.json"], data=json.dumps(state).encode())
+        check = ReplayCheck(
+            dataclasses.replace(contents, attachments=contents.attachments | {"state.json": part}), result
+        )
+        for records, _, whole in groups_of(container):
+            if whole and records:
+                check.check(records)
+    assert result.difference is not None and result.difference.topic == "estimate"

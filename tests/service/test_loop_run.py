@@ -97,7 +97,7 @@ def test_a_diagnosis_that_finds_nothing_brings_the_calibrated_model_into_shadow(
 def test_nothing_follows_from_a_diagnosis_that_explains_nothing(verdict: str) -> None:
     loop = LoopRun(settings(), QUILL, Night(Diagnosed(verdict, (), None, "text", "look at the sensor")))
     steps = run(loop, machine(DAY + 1))
-    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "night"), ("nothing", verdict)]
+    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", verdict)]
     assert not any(step.candidate for step in steps)
 
 
@@ -115,14 +115,14 @@ def test_rubbish_is_refused(model: bytes, why: str) -> None:
     found = Diagnosed("explained", ("input:coolant_degc",), model, "text")
     loop = LoopRun(settings(), QUILL, Night(found))
     steps = run(loop, machine(DAY + 1))
-    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "night"), ("nothing", why)]
+    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", why)]
 
 
 def test_an_effect_of_the_measurement_is_never_part_of_a_candidate() -> None:
     drift = b'\n[[effect]]\nkind = "drift"\nrate_um_per_h = 0.2\n'
     loop = LoopRun(settings(), QUILL, Night(Diagnosed("explained", ("drift",), QUILL + drift, "text")))
     steps = run(loop, machine(DAY + 1))
-    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "night"), ("nothing", "refused")]
+    assert [decision[1:] for decision in decisions(steps)] == [("diagnose", "planned"), ("nothing", "refused")]
 
 
 CHECKED = {"plausibility": {"false_alarm_days": 30.0, "residual_std_um": 0.6, "residual_correlation_min": 30.0}}
@@ -262,7 +262,7 @@ def test_a_proposal_is_withdrawn_when_it_is_no_longer_better() -> None:
     ends = NIGHT + 480
     steps = run(loop, machine(NIGHT + 2 * DAY, acts=lambda i: float(i < ends)))
     found = [decision[1:] for decision in decisions(steps)]
-    assert found[:3] == [("diagnose", "night"), ("shadow", ""), ("propose", "")]
+    assert found[:3] == [("diagnose", "planned"), ("shadow", ""), ("propose", "")]
     assert ("withdraw", "") in found or ("end", "worse") in found
     assert loop.effects == () and {step.model_sha256 for step in steps} == {sha256_of(QUILL)}
 

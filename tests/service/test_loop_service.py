@@ -36,6 +36,7 @@ from tests.service.test_restart import QUILL
 LOOP = b"""
 [loop]
 policy = "POLICY"
+every_h = 24
 shadow_h = 6.0
 """
 
@@ -106,7 +107,7 @@ async def test_the_service_adopts_what_shows_itself_better_and_every_decision_is
     await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     await machine.run(60)
     steps = machine.steps()
-    assert steps == [("diagnose", "night"), ("shadow", ""), ("adopt", "")]
+    assert steps == [("diagnose", "planned"), ("shadow", ""), ("adopt", "")]
     assert machine.store.in_use() == extended() and machine.store.calibrated() == QUILL
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
     checked(machine)
@@ -197,7 +198,7 @@ async def test_a_dismissed_candidate_does_not_come_again(tmp_path: Path) -> None
     assert no.answer["ok"], no.answer
     again = machine.at_sample[len(machine.outcomes) + 1] = Asked(machine, "dismiss")
     await machine.run(20)
-    assert machine.steps()[2:5] in ([("end", "dismissed"), ("diagnose", "night"), ("nothing", "avoided")],), (
+    assert machine.steps()[2:5] in ([("end", "dismissed"), ("diagnose", "planned"), ("nothing", "avoided")],), (
         machine.steps()
     )
     assert not again.answer["ok"] and "no candidate" in again.answer["text"]
@@ -215,7 +216,7 @@ async def test_a_model_that_a_person_adopts_ends_the_shadow_and_is_the_calibrate
     await machine.run(1800, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(other))
     assert adopt.answer["ok"], adopt.answer
     await machine.run(30)
-    assert machine.steps() == [("diagnose", "night"), ("shadow", ""), ("end", "by_hand")]
+    assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("end", "by_hand")]
     assert machine.store.calibrated() == other
     assert "candidate.toml" not in opening_of(recordings(machine.recordings, MACHINE)[-1])
     checked(machine)
@@ -228,7 +229,7 @@ async def test_a_kill_in_a_shadow_loses_nothing_of_the_comparison(tmp_path: Path
     await machine.run(600, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
     always = Looping(tmp_path / "always", shown(extended()))
     await always.run(1950, until=lambda outcome: outcome.offset.model_sha256 == sha256_of(extended()))
-    assert machine.steps() == always.steps() == [("diagnose", "night"), ("shadow", ""), ("adopt", "")]
+    assert machine.steps() == always.steps() == [("diagnose", "planned"), ("shadow", ""), ("adopt", "")]
     ends = [one.outcomes[-1].sample.time_utc_ns for one in (machine, always)]
     # The pauses cost samples, and the comparison the block that they are in.
     assert abs(ends[0] - ends[1]) <= 3600e9
@@ -247,10 +248,10 @@ async def test_a_kill_in_the_middle_of_a_diagnosis_leaves_nothing_and_it_is_made
 
     answers, machine.diagnose = machine.diagnose, hanging  # type: ignore[method-assign]
     await machine.run_and_kill(1250)
-    assert len(machine.asked) == 1 and machine.steps() == [("diagnose", "night")]
+    assert len(machine.asked) == 1 and machine.steps() == [("diagnose", "planned")]
     machine.diagnose, machine.waits_for_diagnoses = answers, True  # type: ignore[method-assign]
     await machine.run(100)
-    assert machine.steps() == [("diagnose", "night"), ("diagnose", "again"), ("shadow", "")]
+    assert machine.steps() == [("diagnose", "planned"), ("diagnose", "again"), ("shadow", "")]
     assert machine.asked[1].to_utc_ns == machine.asked[0].to_utc_ns
     checked(machine)
 
@@ -269,7 +270,7 @@ async def test_a_diagnosis_that_is_interrupted_twice_waits_for_the_next_night(tm
     for _ in range(3):
         await machine.run(10)
     assert len(machine.asked) == 2
-    assert machine.steps() == [("diagnose", "night"), ("diagnose", "again"), ("end", "interrupted")]
+    assert machine.steps() == [("diagnose", "planned"), ("diagnose", "again"), ("end", "interrupted")]
     checked(machine)
 
 
@@ -316,7 +317,7 @@ async def test_a_defect_of_the_shadow_ends_the_shadow_and_never_a_sample(
     monkeypatch.setattr(Shadow, "process", breaks)
     await machine.run(1320)
     monkeypatch.setattr(Shadow, "process", works)
-    assert machine.steps() == [("diagnose", "night"), ("shadow", ""), ("end", "failed")]
+    assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("end", "failed")]
     states = {outcome.offset.state for outcome in machine.outcomes[1290:]}
     assert states == {"ok"} and len(machine.outcomes) == 1320
     assert "a defect" in machine.events("loop")[-1].text
@@ -329,7 +330,7 @@ async def test_the_process_of_the_service_finds_the_effect_in_its_recordings(tmp
         machine.config, machine.recordings, machine.store.folder / "diagnoses"
     )
     await machine.run(1250, until=in_phase(machine, "shadow"))
-    assert machine.steps() == [("diagnose", "night"), ("shadow", "")]
+    assert machine.steps() == [("diagnose", "planned"), ("shadow", "")]
     found = machine.events("diagnosis")[-1].data
     assert found["verdict"] == "explained" and found["effects"] == ["input:coolant_degc"]
     folder = next((machine.store.folder / "diagnoses").iterdir())

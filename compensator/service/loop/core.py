@@ -151,7 +151,7 @@ class ModelLoop:
         assert self.shadow is not None
         new = self.shadow
         handover = present.status.handover
-        new.compensation.raise_level(self.loop.level_um)
+        new.compensation.raise_level(self.state.level_um)
         new.compensation.continue_from(replace(handover, model_changed=present.status.zero is not None))
         self.loop.exchanged(now_ns, present.model.sha256)
         self.present = new.compensation.model
@@ -168,7 +168,7 @@ class ModelLoop:
         return True
 
 
-def exchange_note(action: str, old: Compensation, new: Compensation, verdict: ComparisonData) -> Note:
+def exchange_note(action: str, old: Compensation, new: Compensation, verdict: ComparisonData, level_um: float) -> Note:
     """Return the event of an exchange that the loop has made, after it."""
     before, after = old.status, new.status
     difference = after.target_um - before.target_um
@@ -183,6 +183,7 @@ def exchange_note(action: str, old: Compensation, new: Compensation, verdict: Co
         "effects": effect_names(new.model),
         "state_known": after.is_known,
         "difference_um": difference,
+        "level_um": level_um,
         "y_std_um": after.std_um,
         "comparison": verdict.table(),
     }

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 
 from compensator.atomic_write import replace_file
 from compensator.errors import DataError
+from compensator.events import EventKind
 from compensator.input_file import RESULT_BYTES, read_file
-from compensator.messages import Offset, Probe, Sample
+from compensator.messages import Event, Offset, Probe, Sample
 from compensator.recording.reading import messages, recordings
 
 #: Files in the folder of a diagnosis: the job with the calibrated model; and the result, written last.
@@ -70,22 +72,48 @@ def read_job(path: Path) -> Job:
         raise DataError(f"{path}: {error}") from error
 
 
-def read_record(job: Job) -> tuple[list[tuple[Sample, Offset | None]], list[Probe]]:
-    """Return the samples of a job with their offsets, and its probes."""
+@dataclass(frozen=True, slots=True)
+class JobRecord:
+    """What a job is made on.
+
+    Parameters
+    ----------
+    rows : list of (Sample, Offset or None)
+        Samples with their offsets.
+    probes : list of Probe
+        Probes.
+    zeros_ns : list of int
+        Times of the samples with which a zero was set, ns since 1970 UTC.
+    """
+
+    rows: list[tuple[Sample, Offset | None]]
+    probes: list[Probe]
+    zeros_ns: list[int]
+
+
+def read_record(job: Job) -> JobRecord:
+    """Return the record of a job."""
     samples: dict[int, Sample] = {}
     offsets: dict[int, Offset] = {}
-    probes: list[Probe] = []
+    probes, zeros = list[Probe](), set[int]()
     for path in _files(job):
-        for message in messages(path, ("sample", "offset", "probe")):
-            if not job.from_utc_ns < message.time_utc_ns <= job.to_utc_ns:
+        for message in messages(path, ("sample", "offset", "probe", "event")):
+            if isinstance(message, Event):
+                if message.kind == EventKind.ZERO and message.seq is not None:
+                    zeros.add(message.seq)
+            elif not job.from_utc_ns < message.time_utc_ns <= job.to_utc_ns:
                 continue
-            if isinstance(message, Sample):
+            elif isinstance(message, Sample):
                 samples[message.seq] = message
             elif isinstance(message, Offset):
                 offsets[message.seq] = message
             else:
                 probes.append(message)
-    return [(samples[seq], offsets.get(seq)) for seq in sorted(samples)], probes
+    return JobRecord(
+        rows=[(samples[seq], offsets.get(seq)) for seq in sorted(samples)],
+        probes=probes,
+        zeros_ns=sorted(samples[seq].time_utc_ns for seq in zeros & samples.keys()),
+    )
 
 
 def _files(job: Job) -> list[Path]:

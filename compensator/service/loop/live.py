@@ -137,7 +137,7 @@ class LiveLoop:
         verdict, action, self._stored = core.state.verdict, core.state.exchange, False
         new, self._model = core.exchange(present, self._model, present.status.time_utc_ns)
         self._journal.start_new_file(self._model)
-        self._events.note(*exchange_note(action, present, new, verdict))
+        self._events.note(*exchange_note(action, present, new, verdict, core.state.level_um))
         return new
 
     def _begin_shadow(self, core: ModelLoop, warmed: _Found, compensation: Compensation) -> None:
@@ -186,7 +186,7 @@ class LiveLoop:
         """Adopt the candidate: an operator's command that acts with the next sample."""
         if self._core is not None:
             try:
-                self._core.loop.accept()
+                self._note(self._core.loop.accept())
             except ServiceError as error:  # it has ended since the command was received
                 log.info("%s", error)
 

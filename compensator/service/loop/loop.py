@@ -20,7 +20,7 @@ from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import Avoided, Compared, LoopState, Running, fresh
+from compensator.service.loop.state import Avoided, Compared, Exchange, LoopState, Running, fresh
 from compensator.service.loop.trust import both_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
 from compensator.service.loop.words import ended, nothing_follows
 from compensator.service.outcome import Outcome
@@ -31,13 +31,15 @@ from compensator.service.transfer.second_opinion import described, is_unusable
 DIFFERS = 4.0
 #: A candidate must be wrong by less than this part of the present model's changes.
 BETTER_PART = 0.95
-#: Least time between two adoptions, and between two diagnoses for a misfit, h.
+#: Least time between two adoptions, which is that after going back from a model, too; and between two diagnoses for a
+#: misfit, h.
 ADOPTION_H, MISFIT_AGAIN_H = 24.0, 12.0
-#: What is compared counts for so long, in `shadow_h`, and the least of it, h.
+#: What is compared counts for so long, in `shadow_h`, and the least of it, h; a candidate that is better so far has as
+#: long before the next diagnosis.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
-_HOUR_NS, _DAY_NS = 3600 * NS, 86400 * NS
+_HOUR_NS = 3600 * NS
 _LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
@@ -83,18 +85,13 @@ class Loop:
         return StartDiagnosis(from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns, why=running.why)
 
     @property
-    def level_um(self) -> float:
-        """By how much the shadow's prediction must rise to stand at the level of the present one, µm; 0 if it need not.
-
-        A model is judged by changes of Y. If its level contradicts measured Y, it counts from a zero that was set
-        before its effect acted, or measured Y has moved: then the level stays as it is and only its changes are new.
-        """
-        return self._comparison.level_um if self.state.verdict.y_moved else 0.0
-
-    @property
     def judged_h(self) -> float:
         """Time of the usable blocks of measured Y, h."""
         return self._comparison.judged_h
+
+    @property
+    def _remembered_h(self) -> float:
+        return max(_REMEMBERED * self._settings.shadow_h, _REMEMBERED_H)
 
     # ------------------------------------------------------------------ one sample
 
@@ -143,11 +140,9 @@ class Loop:
             return False
         if not found.add(present, other, suspected=False):
             return False
-        settings = self._settings
-        remembered_h = max(_REMEMBERED * settings.shadow_h, _REMEMBERED_H)
-        oldest_ns = present.sample.time_utc_ns - round(remembered_h * _HOUR_NS)
-        found.forget_before(oldest_ns, 2 * settings.probes)
-        state.verdict = found.verdict(deviations=settings.deviations)
+        oldest_ns = present.sample.time_utc_ns - round(self._remembered_h * _HOUR_NS)
+        found.forget_before(oldest_ns, 2 * self._settings.probes)
+        state.verdict = found.verdict(deviations=self._settings.deviations)
         return True
 
     def _begin_comparison(self) -> None:
@@ -174,7 +169,7 @@ class Loop:
         if state.phase == "proposed" and verdict != ComparisonVerdict.BETTER:
             state.phase = "shadow"
             return [self._note(LoopAction.WITHDRAW, f"the proposal is withdrawn: {described(state.verdict)}")]
-        if state.phase == "shadow" and is_better:
+        if is_better and (state.phase == "shadow" or self._may_adopt(now_ns)):
             return self._accept(now_ns)
         return []
 
@@ -187,22 +182,45 @@ class Loop:
             return found.probes >= settings.probes and found.hours >= settings.shadow_h
         return self.judged_h >= settings.shadow_h
 
+    def _may_adopt(self, now_ns: int) -> bool:
+        """Return whether a candidate that is better is adopted without a person.
+
+        It must be better about the zero, too. Where its level contradicts measured Y, it counts from a zero that was
+        set before its effect acted, or measured Y has moved: which of them is seen at the next zero.
+        """
+        state = self.state
+        if self._settings.policy != "adopt" or not _is_better_about_zero(state.verdict):
+            return False
+        return not state.adopted_utc_ns or now_ns - state.adopted_utc_ns >= ADOPTION_H * _HOUR_NS
+
     def _accept(self, now_ns: int) -> list[Note]:
         """Adopt or propose a candidate."""
-        state = self.state
-        if self._settings.policy == "propose":
-            state.phase = "proposed"
-            text = f"a better model is proposed: {self._named()}; {described(state.verdict)}"
-            return [self._note(LoopAction.PROPOSE, text)]
-        if state.adopted_utc_ns and now_ns - state.adopted_utc_ns < ADOPTION_H * _HOUR_NS:
-            return []
-        state.exchange = "adopt"
-        return [self._note(LoopAction.ADOPT, f"a better model is adopted: {self._named()}; {described(state.verdict)}")]
+        state, by_hand = self.state, self._settings.policy == "propose"
+        if self._may_adopt(now_ns):
+            self._exchange("adopt")
+            text = f"a better model is adopted: {self._named()}; {described(state.verdict)}"
+            return [self._note(LoopAction.ADOPT, text)]
+        if not by_hand and _is_better_about_zero(state.verdict):
+            return []  # the last adoption is too short a time ago
+        state.phase = "proposed"
+        text = f"a better model is proposed: {self._named()}; {described(state.verdict)}"
+        if not _is_better_about_zero(state.verdict):
+            text += "; its level is not confirmed: set a zero, and adopt it then"
+        return [self._note(LoopAction.PROPOSE, text)]
 
     def _go_back(self) -> list[Note]:
-        self.state.exchange = "back"
+        self._exchange("back")
         text = f"back to the model before, which is better: {self._named()}; {described(self.state.verdict)}"
         return [self._note(LoopAction.BACK, text)]
+
+    def _exchange(self, action: Exchange) -> None:
+        """Decide an exchange, and the level of the other model.
+
+        A model is judged by changes of Y. If its level contradicts measured Y, it counts from a zero that was set
+        before its effect acted, or measured Y has moved: then the level stays as it is and only its changes are new.
+        """
+        state = self.state
+        state.exchange, state.level_um = action, self._comparison.level_um if state.verdict.y_moved else 0.0
 
     def _end(self, why: str, text: str = "") -> list[Note]:
         """End the shadow."""
@@ -227,6 +245,7 @@ class Loop:
             effects=shadow.effects if shadow is not None else [],
             since_utc_ns=shadow.since_utc_ns if shadow is not None else 0,
             comparison=state.verdict if shadow is not None else None,
+            level_um=state.level_um if state.exchange else None,
         )
         return Note(EventKind.LOOP, text, data.table())
 
@@ -235,27 +254,30 @@ class Loop:
     def _schedule(self, now_ns: int) -> list[Note]:
         """Begin a diagnosis if it is time."""
         state, settings = self.state, self._settings
-        at_ns = 60 * settings.at_min * NS
-        night_ns = (now_ns - at_ns) // _DAY_NS * _DAY_NS + at_ns
-        state.night_utc_ns = state.night_utc_ns or night_ns
-        if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN:
+        at_ns, every_ns = 60 * settings.at_min * NS, settings.every_h * _HOUR_NS
+        planned_ns = (now_ns - at_ns) // every_ns * every_ns + at_ns
+        state.planned_utc_ns = state.planned_utc_ns or planned_ns
+        if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN or self._is_leading(now_ns):
             return []
         since_last_h = (now_ns - state.diagnosed_utc_ns) / _HOUR_NS
-        if night_ns > state.night_utc_ns:
-            why = "night"
-        elif (
-            state.misfit_min >= 60.0 * settings.misfit_h
-            and since_last_h >= MISFIT_AGAIN_H
-            # A candidate that is better so far may be what is missing.
-            and not (state.phase != "watching" and state.verdict.verdict == ComparisonVerdict.BETTER)
-        ):
+        if planned_ns > state.planned_utc_ns:
+            why = "planned"
+        elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_h >= MISFIT_AGAIN_H:
             why = "misfit"
         else:
             return []
-        state.night_utc_ns, state.diagnosed_utc_ns = night_ns, now_ns
+        state.planned_utc_ns, state.diagnosed_utc_ns = planned_ns, now_ns
         from_ns = now_ns - round(settings.record_h * _HOUR_NS)
         state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
         return [self._diagnosis_begins()]
+
+    def _is_leading(self, now_ns: int) -> bool:
+        """Return whether a candidate is better so far: it may be what is missing, and gets time to show it."""
+        shadow, found = self.state.shadow, self.state.verdict
+        if shadow is None or shadow.role != "candidate" or found.deviations is None or found.ratio is None:
+            return False
+        is_new = now_ns - shadow.since_utc_ns < self._remembered_h * _HOUR_NS
+        return is_new and found.deviations > 0.0 and found.ratio <= BETTER_PART
 
     def _diagnosis_begins(self) -> Note:
         running = self.state.diagnosis
@@ -286,7 +308,10 @@ class Loop:
         text = f"a candidate is compared with the present model: {', '.join(found.effects) or 'no added effect'}"
         role = role_of(found)
         if role == "before":
-            text = "nothing is found that the calibrated model lacks: it is compared with the present one"
+            found_again = "nothing is found that the calibrated model lacks"
+            if found.verdict != "adequate":
+                found_again = f"the effects of the present model are not found again ({found.verdict})"
+            text = f"{found_again}: the calibrated model is compared with the present one"
         data = LoopData(step=LoopAction.SHADOW, role=role, model_sha256=found.candidate_sha256, effects=found.effects)
         return [Note(EventKind.LOOP, text, data.table())]
 
@@ -300,8 +325,7 @@ class Loop:
             return "unchanged"
         if found.in_shadow and self.state.shadow is not None and self.state.shadow.role == role_of(found):
             return "in_shadow"
-        self.state.avoided = [one for one in self.state.avoided if one.until_utc_ns > now_ns]
-        if not found.calibrated and any(sorted(one.effects) == sorted(found.effects) for one in self.state.avoided):
+        if not found.calibrated and any(one.until_utc_ns > now_ns for one in self._avoided(found.effects)):
             return "avoided"
         return ""
 
@@ -322,7 +346,7 @@ class Loop:
         assert state.shadow is not None
         before, state.effects = state.effects, state.shadow.effects
         if back:
-            self._avoid(before, now_ns)
+            self._avoid_after_back(before, now_ns)
             state.phase, state.shadow, state.exchange = "idle", None, ""
             self._begin_comparison()
             return
@@ -331,7 +355,7 @@ class Loop:
         self.shadow_begins(sha256_before, before, now_ns, "before")
         state.diagnosis = diagnosis
 
-    def accept(self) -> None:
+    def accept(self) -> list[Note]:
         """Adopt the candidate before the next sample: an operator has agreed.
 
         Raises
@@ -342,7 +366,11 @@ class Loop:
         shadow = self.state.shadow
         if shadow is None or shadow.role != "candidate":
             raise ServiceError("adopt --candidate: there is no candidate now; see `compensator watch`")
-        self.state.exchange = self.state.exchange or "adopt"
+        if self.state.exchange:
+            return []
+        self._exchange("adopt")
+        text = f"an operator adopts the candidate: {self._named()}; {described(self.state.verdict)}"
+        return [self._note(LoopAction.ADOPT, text, why="by_hand")]
 
     def dismiss(self, now_ns: int) -> list[Note]:
         """End a candidate: an operator has refused it. Its effects are avoided for some time."""
@@ -375,14 +403,32 @@ class Loop:
             state.diagnosis = None
             data = LoopData(step=LoopAction.END, why="interrupted")
             return [
-                Note(EventKind.LOOP, "a diagnosis was interrupted twice: the next one is made at night", data.table())
+                Note(
+                    EventKind.LOOP,
+                    "a diagnosis was interrupted twice: the next one is made when it is planned",
+                    data.table(),
+                )
             ]
         again = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="", why="again")
         state.diagnosis = again
         return [self._diagnosis_begins()]
 
+    def _avoided(self, effects: Sequence[str]) -> list[Avoided]:
+        return [one for one in self.state.avoided if sorted(one.effects) == sorted(effects)]
+
     def _avoid(self, effects: Sequence[str], now_ns: int) -> None:
-        until_ns = now_ns + round(self._settings.watch_h * _HOUR_NS)
+        """Avoid effects that a person did not want."""
+        self._avoid_for(self._settings.watch_h, effects, now_ns)
+
+    def _avoid_after_back(self, effects: Sequence[str], now_ns: int) -> None:
+        """Avoid effects that were gone back from: an effect may come again, so twice as long each time."""
+        oldest_ns = now_ns - round(self._settings.watch_h * _HOUR_NS)
+        self.state.avoided = [one for one in self.state.avoided if one.until_utc_ns > oldest_ns]
+        hours = ADOPTION_H * 2 ** len(self._avoided(effects))
+        self._avoid_for(min(hours, self._settings.watch_h), effects, now_ns)
+
+    def _avoid_for(self, hours: float, effects: Sequence[str], now_ns: int) -> None:
+        until_ns = now_ns + round(hours * _HOUR_NS)
         self.state.avoided = [*self.state.avoided, Avoided(effects=list(effects), until_utc_ns=until_ns)]
 
 
@@ -393,6 +439,12 @@ def role_of(found: DiagnosisData) -> Role:
 
 def _is_limited(outcome: Outcome) -> bool:
     return any(reason.startswith(_LIMITS) for reason in outcome.offset.reasons)
+
+
+def _is_better_about_zero(found: ComparisonData) -> bool:
+    if found.present_rms_um is None or found.candidate_rms_um is None:
+        return False
+    return found.candidate_rms_um <= BETTER_PART * found.present_rms_um
 
 
 def _is_clearly_better(found: ComparisonData) -> bool:

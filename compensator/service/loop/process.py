@@ -1,6 +1,6 @@
 """Runs a diagnosis as a process of its own, which the sampling loop never feels.
 
-The service only waits for it: the process has the lowest priority and limits of memory, computing time and wall time.
+The service only waits for it: the process has a low priority and limits of memory, computing time and wall time.
 Whatever it does (it hangs, is killed, writes rubbish) is a diagnosis that failed, with a reason. It ends with the
 service.
 """

@@ -3,12 +3,15 @@
 Y is left out where a sample shows a fault by itself (`trust`), and for an hour before T_Q and AT contradict each other,
 in which the fault was there already. Temperatures and other channels stay as they were measured: they drive the model
 throughout.
+
+Where Y is probed, the values of one feature about one zero are used, those of which there are most: at a zero the
+feature counts anew, and against the values before it that is a step which the machine did not make.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter
+from bisect import bisect_right
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +20,7 @@ from compensator.arrays import Vector
 from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.data.table import Table
+from compensator.events import EventKind
 from compensator.messages import Offset, Probe, Sample, number
 from compensator.service.loop.trust import is_contradicted, is_disturbed
 from compensator.service.outcome import Outcome
@@ -34,6 +38,11 @@ def usable_table(record: Sequence[Outcome], name: str = "record") -> Table:
         [(outcome.sample, outcome.offset) for outcome in record],
         [probe for outcome in record for probe in outcome.probes],
         name,
+        zeros_ns=[
+            outcome.sample.time_utc_ns
+            for outcome in record
+            if any(note.kind == EventKind.ZERO for note in outcome.notes)
+        ],
     )
 
 
@@ -43,8 +52,22 @@ def is_probed(table: Table) -> bool:
     return bool(measured.any()) and not bool(np.isfinite(table.columns["t_q_degc"][measured]).any())
 
 
-def table_of_rows(rows: Sequence[tuple[Sample, Offset | None]], probes: Sequence[Probe], name: str) -> Table:
-    """Return samples with their offsets, and decided probes, as the table of a diagnosis; see `usable_table`."""
+def table_of_rows(
+    rows: Sequence[tuple[Sample, Offset | None]], probes: Sequence[Probe], name: str, *, zeros_ns: Sequence[int] = ()
+) -> Table:
+    """Return samples with their offsets, and decided probes, as the table of a diagnosis; see `usable_table`.
+
+    Parameters
+    ----------
+    rows : sequence of (Sample, Offset or None)
+        In order.
+    probes : sequence of Probe
+        In order.
+    name : str
+        Name in messages.
+    zeros_ns : sequence of int
+        Times of the samples with which a zero was set, ns since 1970 UTC, in order.
+    """
     names = dict.fromkeys(channel for sample, _ in rows for channel in sample.channels)
     t_s = np.array([sample.time_utc_ns / NS for sample, _ in rows])
     columns = {channel: np.array([_mean(sample, channel) for sample, _ in rows], dtype=np.float64) for channel in names}
@@ -54,7 +77,7 @@ def table_of_rows(rows: Sequence[tuple[Sample, Offset | None]], probes: Sequence
         y = np.where(np.isin(t_s, left_out), np.nan, y)
     columns["y_um"] = y
     if not np.isfinite(y).any():
-        t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows))
+        t_s, columns = _with_probes(t_s, columns, _usable(probes, left_out, rows, zeros_ns))
     return Table(name=name, t_s=t_s, columns=columns, rows=range(2, t_s.size + 2))
 
 
@@ -74,17 +97,18 @@ def _left_out_s(rows: Sequence[tuple[Sample, Offset | None]]) -> Vector:
     return times[left_out]
 
 
-def _usable(probes: Sequence[Probe], left_out: Vector, rows: Sequence[tuple[Sample, Offset | None]]) -> list[Probe]:
-    """Return the taken probes of the feature that has most, outside of what is left out."""
+def _usable(
+    probes: Sequence[Probe], left_out: Vector, rows: Sequence[tuple[Sample, Offset | None]], zeros_ns: Sequence[int]
+) -> list[Probe]:
+    """Return the taken probes outside of what is left out, of the feature and about the zero that have most."""
     period_s = rows[0][0].period_s if rows else 0.0
-    found = []
+    groups: dict[tuple[str, int], list[Probe]] = {}
     for probe in probes:
         at_s = probe.time_utc_ns / NS
         if probe.taken and not np.any((left_out - period_s <= at_s) & (at_s <= left_out)):
-            found.append(probe)
-    counts = Counter(probe.feature for probe in found)
-    feature = counts.most_common(1)[0][0] if counts else ""
-    return [probe for probe in found if probe.feature == feature]
+            groups.setdefault((probe.feature, bisect_right(zeros_ns, probe.time_utc_ns)), []).append(probe)
+    # Of groups of the same size the last one.
+    return max(reversed(groups.values()), key=len, default=[])
 
 
 def _with_probes(t_s: Vector, columns: dict[str, Vector], probes: Sequence[Probe]) -> tuple[Vector, dict[str, Vector]]:

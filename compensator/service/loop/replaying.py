@@ -66,7 +66,7 @@ def hand_over(core: ModelLoop, event: Event, now_ns: int) -> list[Note]:
             core.resume()
         elif name == CommandName.ADOPT and event.data.get("candidate") is True:
             with suppress(ServiceError):
-                core.loop.accept()
+                return core.loop.accept()
     elif event.kind == EventKind.DIAGNOSIS:
         found = data_of(event, DiagnosisData)
         return core.receive(found, now_ns) if found is not None else []

@@ -72,7 +72,7 @@ def _complete(resumed: Resumed, last: _Replayed) -> Note:
     verdict, action = core.state.verdict, core.state.exchange
     new, _ = core.exchange(old, last.model, old.status.time_utc_ns)
     resumed.compensation = new
-    return exchange_note(action, old, new, verdict)
+    return exchange_note(action, old, new, verdict, core.state.level_um)
 
 
 def _sha256(core: ModelLoop) -> str:

@@ -139,14 +139,14 @@ class LoopRun:
         self._core.resume()
 
     def accept(self) -> None:
-        """Adopt the candidate in shadow before the next sample, as an operator can.
+        """Adopt the candidate in shadow before the next sample, as an operator can; the event comes with that sample.
 
         Raises
         ------
         ServiceError
             If there is none.
         """
-        self._core.loop.accept()
+        self._notes += self._core.loop.accept()
 
     def dismiss(self) -> None:
         """End the candidate, as an operator can; the event comes with the next sample."""
@@ -211,7 +211,7 @@ class LoopRun:
     def _exchange(self, now_ns: int) -> Note:
         old, action, verdict = self._compensation, self._core.state.exchange, self._core.state.verdict
         self._compensation, self._data = self._core.exchange(old, self._data, now_ns)
-        return exchange_note(action, old, self._compensation, verdict)
+        return exchange_note(action, old, self._compensation, verdict, self._core.state.level_um)
 
     def _diagnosed(self, record: Sequence[Outcome]) -> Diagnosed:
         try:

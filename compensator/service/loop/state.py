@@ -56,10 +56,12 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         What the shadow is for.
     exchange : {"", "adopt", "back"}
         An exchange that was decided and happens before the next sample.
+    level_um : float
+        By how much the level of the other model is raised at it, µm.
     diagnosis : Running, optional
         A diagnosis that was begun.
-    night_utc_ns, diagnosed_utc_ns : int
-        The last night that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
+    planned_utc_ns, diagnosed_utc_ns : int
+        The last planned time that is done, and begin of the last diagnosis, ns since 1970 UTC; 0 before.
     misfit_min, clean_min : float
         For how long the model, and for how long no sensor, has been suspected, min.
     shadow : Compared, optional
@@ -79,8 +81,9 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     schema: int = STATE_SCHEMA
     phase: Phase = "idle"
     exchange: Exchange = ""
+    level_um: float = 0.0
     diagnosis: Running | None = None
-    night_utc_ns: int = 0
+    planned_utc_ns: int = 0
     diagnosed_utc_ns: int = 0
     misfit_min: float = 0.0
     clean_min: float = 0.0

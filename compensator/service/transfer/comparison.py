@@ -220,7 +220,7 @@ class Comparison:
         samples = sum(block.samples for block in blocks)
         if not samples:
             return not_judged(NotJudged.SUSPECT if state.suspected else NotJudged.NO_Y)
-        own_rms, other_rms = (math.sqrt(sum(block.squares[i] for block in blocks) / samples) for i in (0, 1))
+        own_rms, other_rms = _about_zero(blocks, self._fewest)
         scores = ComparisonData(
             verdict=ComparisonVerdict.NOT_JUDGED,
             measured_by="sensor",
@@ -261,6 +261,15 @@ def not_judged(why: NotJudged, *, remark: str = "") -> ComparisonData:
 def changed(found: ComparisonData, **changes: object) -> ComparisonData:
     """Return a comparison with some of its data replaced."""
     return msgspec.structs.replace(found, **changes)
+
+
+def _about_zero(blocks: list[Block], fewest: float) -> tuple[float, float]:
+    """Return the root mean squares of both residuals, µm: about the last zero if enough was measured since, or all."""
+    last = [block for block in blocks if block.zeros == blocks[-1].zeros]
+    used = last if sum(block.samples for block in last) >= 2 * FEWEST * fewest else blocks
+    samples = sum(block.samples for block in used)
+    own, other = (math.sqrt(sum(block.squares[i] for block in used) / samples) for i in (0, 1))
+    return own, other
 
 
 def _changes(blocks: list[Block]) -> tuple[Vector, Vector, Vector]:

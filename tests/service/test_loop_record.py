@@ -1,0 +1,75 @@
+"""The table of a diagnosis: the same from outcomes as from recordings, and without steps that a zero makes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compensator.messages import number
+from compensator.service.loop.job import Job, read_record
+from compensator.service.loop.record import table_of_rows, usable_table
+from compensator.service.loop.run import LoopRun
+from tests.service.living import MACHINE
+from tests.service.looping import Night, machine, shown
+from tests.service.test_loop_run import probed, without_sensor
+from tests.service.test_loop_service import Asked, Looping
+from tests.service.test_restart import QUILL
+
+
+@pytest.mark.parametrize("zero_at", [400, 1000])
+def test_probes_about_one_zero_are_diagnosed_those_of_which_there_are_most(zero_at: int) -> None:
+    samples, every = 1441, 30
+    loop = LoopRun(without_sensor(), QUILL, Night(shown(None, "adequate")))
+    source = machine(samples, noise_um=0.0)
+    truth: list[float] = []
+
+    def counted():
+        """A person sets a zero on the warm machine: what is probed counts from there."""
+        for i, one in enumerate(source):
+            if i == zero_at:
+                loop.compensation.zero("warm")
+            truth.append(number(one.channels["y_um"].mean) - (truth[zero_at] if i > zero_at else 0.0))
+            channel = one.channels["y_um"]
+            one.channels["y_um"] = type(channel)(**{**_fields(channel), "mean": truth[-1]})
+            yield one
+
+    steps = probed(loop, counted(), every)
+    taken = [probe for step in steps for probe in step.outcome.probes if probe.taken]
+    assert len(taken) > 0.8 * samples / every
+    table = usable_table([step.outcome for step in steps])
+    at = table.t_s[np.isfinite(table.columns["y_um"])]
+    zero_s = steps[zero_at].outcome.sample.time_utc_ns / 1e9
+    assert np.all(at > zero_s) if zero_at < samples / 2 else np.all(at < zero_s)
+    assert at.size == sum((probe.time_utc_ns / 1e9 > zero_s) == (zero_at < samples / 2) for probe in taken)
+
+
+def _fields(channel):
+    return {name: getattr(channel, name) for name in channel.__struct_fields__}
+
+
+async def test_the_process_reads_from_the_recordings_what_the_service_has_seen(tmp_path: Path) -> None:
+    service = Looping(tmp_path, shown(None, "adequate"))
+    zero = service.at_sample[120] = Asked(service, "zero", mode="warm")
+    await service.run(300)
+    assert zero.answer["ok"], zero.answer
+    times = [outcome.sample.time_utc_ns for outcome in service.outcomes]
+    job = Job(
+        recordings=str(service.recordings),
+        machine=MACHINE,
+        from_utc_ns=times[49],
+        to_utc_ns=times[-1],
+        probe_std_um=None,
+        memory_mb=1000.0,
+        time_limit_min=1.0,
+        parent=os.getpid(),
+    )
+    found = read_record(job)
+    own, read = usable_table(service.outcomes[50:]), table_of_rows(found.rows, found.probes, "record")
+    assert own.t_s.size == 250 and np.array_equal(own.t_s, read.t_s)
+    for name, values in own.columns.items():
+        assert np.array_equal(values, read.columns[name], equal_nan=True), name
+    zeros = [o.sample.time_utc_ns for o in service.outcomes[50:] if any(note.kind == "zero" for note in o.notes)]
+    assert len(zeros) == 1 and found.zeros_ns == zeros
