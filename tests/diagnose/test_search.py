@@ -12,7 +12,7 @@ from compensator.diagnose.fit import fit_terms
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points
 from compensator.diagnose.search import Search
-from compensator.diagnose.standard_errors import standard_errors
+from compensator.diagnose.standard_errors import deviations, standard_errors
 from compensator.diagnose.summary import figures, verdict
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import proposals
@@ -143,3 +143,25 @@ def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):
     assert bad.verdict == "partly_explained" and not bad.model.effects
     assert "made_worse" in [warning.code for warning in bad.warnings]
     assert "increases the error on held-out data" in verdict(figures(bad)) and "were found" not in verdict(figures(bad))
+
+
+def test_two_effects_that_are_known_only_together_are_not_known_apart():
+    """Two channels that hardly differ share an effect in any way: together it is known, each by itself is not."""
+    columns, _, _ = record([draw("input", 3, 4.0)], 70, 24.0)
+    inputs = [name for name in columns if name not in ("t_q_degc", "at_degc", "y_um", "t_s")]
+    rng = np.random.default_rng(1)
+    columns["twin_degc"] = columns["coolant_degc"] + 0.02 * np.cumsum(rng.normal(size=columns["y_um"].size)) / 30.0
+    evidence = evidence_of(QUILL, runs_from(columns))
+    points = Points(evidence)
+    found = {
+        name: next(h for h in proposals(evidence.context) if h.place == ("input", "", name) and h.form == "lag")
+        for name in ("coolant_degc", "twin_degc")
+    }
+    assert "coolant_degc" in inputs
+    likelihood = Likelihood(points, points.typical_rest())
+    start = (30.0,)
+    one = fit_terms(likelihood, [(found["coolant_degc"], start)])
+    both = fit_terms(likelihood, [(found["coolant_degc"], start), (found["twin_degc"], start)])
+    [(size, std)] = deviations(one)
+    assert std < 0.2 * size
+    assert all(std > 3.0 * deviations(one)[0][1] for _, std in deviations(both))
