@@ -187,9 +187,10 @@ def diagnose(
     check_deformation_scale(name, np.concatenate([run.y_um for run in runs]))
 
     def executor_map(function: Callable[..., Any], *values: Iterable[Any]) -> Iterable[Any]:
-        return executor.map(partial(in_one_thread, function), *values) if executor else map(function, *values)
+        assert executor is not None
+        return executor.map(partial(in_one_thread, function), *values)
 
-    found = find_effects(base, runs, progress=progress, executor_map=executor_map)
+    found = find_effects(base, runs, progress=progress, executor_map=executor_map if executor else map)
     extended = as_in_file(found.model, _provenance(base, measured, found))
     models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}
     free_run = [FreeRunErrors.of(models, measured, SEARCHED)]

@@ -53,7 +53,9 @@ def held_out_of(found: Findings, places: Sequence[Place], progress: Progress, ex
     timed = [t.effect for t in found.terms if not t.effect.deployable]
     only_unobserved = bool(found.terms) and not any(term.hypothesis.effect.observed for term in found.terms)
     unobserved = any(not effect.observed for effect in timed) and not only_unobserved
-    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved, grid=found.search.grid), views)
+    # Another process computes the columns sooner than it gets them.
+    grid = found.search.grid if executor_map is map else None
+    predicted = executor_map(partial(_predictions, places=places, unobserved=unobserved, grid=grid), views)
     left = np.full((2, 4 + len(places), evidence.used.size), np.nan)
     searches = np.zeros(len(places), dtype=int)
     for done, (block, seen, several) in enumerate(zip(blocks, views, predicted, strict=True), start=2):
@@ -89,7 +91,7 @@ class _Predictions:
     has: Indices
 
 
-def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool, grid: Grid) -> _Predictions:
+def _predictions(seen: Evidence, *, places: Sequence[Place], unobserved: bool, grid: Grid | None) -> _Predictions:
     found = findings_of(seen, unobserved=unobserved, grid=grid)
     steps, total = [], found.own_paths
     for place in places:

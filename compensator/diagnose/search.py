@@ -236,7 +236,8 @@ class Search:
             fewer = [settled(fit_terms(fit.likelihood, fit.starts(i))) for i in range(len(fit.terms))]
             best = max(range(len(fewer)), key=lambda i: self.criterion.score(fewer[i]))
             small = [i for i, term in enumerate(fit.terms) if not self.criterion.is_worth_naming(term, fewer[i], fit)]
-            small = small or [i for i, (size, std) in enumerate(deviations(fit)) if std > size]
+            if not small and not self.evidence.free_paths:
+                small = [i for i, (size, std) in enumerate(deviations(fit)) if std > size]
             if self.criterion.score(fewer[best]) <= self.criterion.score(fit):
                 if not small:
                     return fit
