@@ -9,10 +9,8 @@ import zenoh
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, also in the background of a script
 given = dict(enumerate(sys.argv))
 endpoint, prefix = given.get(1, "tcp/127.0.0.1:7447"), given.get(2, "shop/vmc-07")
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-config.insert_json5("scouting/multicast/enabled", "false")
+connect = {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
+config = zenoh.Config.from_json5(json.dumps(connect))
 with zenoh.open(config) as session:
     subscriber = session.declare_subscriber(f"{prefix}/thermal/y/offset")  # without a name it would be gone at once
     for _ in range(int(given.get(3, sys.maxsize))):
