@@ -84,7 +84,7 @@ USERS = {
         ),
         Command(
             "loop",
-            "what diagnosis, comparison and adoption make of a shop's recordings",
+            "run diagnosis, comparison and adoption over a shop's recordings",
             "loop recordings/vmc-07 recordings/vmc-08 --page shop.html",
         ),
     ),
@@ -104,7 +104,7 @@ USERS = {
     "CNC integrator": (
         Command(
             "bridge",
-            "the offset to a control over OPC UA; touch probes to the service",
+            "send the offset to a control over OPC UA, or touch probes to the service",
             "bridge opcua --config bridge.toml",
         ),
         Command("router", "run a Zenoh router where no zenohd is installed", "router --config router.json5"),
@@ -123,7 +123,7 @@ USERS = {
         Command("run", "run the service", "run --config machine.toml"),
         Command(
             "completion",
-            "print a script by which a shell completes commands and options",
+            "print a completion script for a shell",
             "completion bash",
             "completion:run",
         ),

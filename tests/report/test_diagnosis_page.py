@@ -245,13 +245,13 @@ def test_the_share_of_the_ceiling_is_said_everywhere(found: Diagnosis, tmp_path:
     sentence = "The named effects explain 83 % of what the channels can explain."
     printed = text_of_all(contents(explained, ()))
     assert sentence in text(explained) and sentence in printed and sentence in verdict(figures(explained))
-    assert "fall clearly short" not in text(explained) + printed
+    assert "show clearly more" not in text(explained) + printed
     assert tone_of(figures(explained)) == "good"
 
 
 def test_where_the_effects_fall_short_it_is_said_and_not_passed(found: Diagnosis, tmp_path: Path) -> None:
     short = with_ceiling(found, 40.0)
-    assert "They fall clearly short" in text(short) and "no remainder was added" in text(short)
+    assert "The channels show clearly more" in text(short) and "no remainder was added" in text(short)
     assert page(short).tone == "warn" and "The missing effects were found" not in page(short).verdict
     # The overview of the folder says the same.
     (tmp_path / "diagnosis.json").write_text(json.dumps(figures(short)), encoding="utf-8")
@@ -263,7 +263,7 @@ def test_where_the_effects_fall_short_it_is_said_and_not_passed(found: Diagnosis
 def test_channels_that_explain_next_to_nothing_make_no_share(found: Diagnosis) -> None:
     ceiling = Ceiling(rms_um=0.99 * found.before.rms_um, explained_pct=0.0)
     adequate = dataclasses.replace(found, ceiling=ceiling, verdict="explained")
-    assert "explain next to nothing" in text(adequate) and "fall clearly short" not in text(adequate)
+    assert "explain almost nothing" in text(adequate) and "show clearly more" not in text(adequate)
     assert page(adequate).tone == "good"
 
 
@@ -300,7 +300,7 @@ def test_without_effect_ceiling_and_remainder_the_page_says_so_and_claims_nothin
     nothing = {"effects": (), "steps": (), "tried": (), "ceiling": None, "remainder": None, "advice": None}
     bare = dataclasses.replace(found, **nothing, verdict="adequate")
     words = text(bare)
-    assert "No linear use of the logged channels leaves less" in words
+    assert "No linear combination of the logged channels has a smaller error" in words
     assert "before and after" not in words and "a correction that explains nothing" not in words
     assert "explain" not in verdict(figures(bare))
     assert not sections(bare)
