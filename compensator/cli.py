@@ -213,7 +213,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="compensator",
         usage="compensator [-h] [--version] COMMAND ...",
-        description=f"Thermal error compensation for machine tools.\n\n{_overview()}",
+        description=f"quill-compensator: thermal error compensation for machine tools.\n\n{_overview()}",
         epilog="`compensator COMMAND --help` shows options and an example.\nexample: compensator demo --out demo-out",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

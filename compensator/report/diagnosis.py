@@ -127,7 +127,8 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         ),
         edges=time.runs,
         below=below,
-        note="Residual of the fit to all data, zero and initial state fitted. Below: what the effects act by."
+        note="Residual of the fit to all data, zero and initial state fitted."
+        + (" Below: what the effects act by." if below else " No channel shows the cause.")
         + time.note,
     )
 
@@ -151,7 +152,10 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
 
 
 def _effect(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Section:
-    blocks: list[Block] = [explanation(diagnosis, effect), _effect_figure(time, diagnosis, effect)]
+    blocks: list[Block] = [explanation(diagnosis, effect)]
+    if len(diagnosis.effects) > 1:
+        # The only effect is in the first picture.
+        blocks.append(_effect_figure(time, diagnosis, effect))
     blocks.append(parameter_table(effect, count=SHOWN))
     count = len(effect.named)
     if count > SHOWN:
