@@ -21,7 +21,7 @@ from compensator import __version__
 from compensator.blas import one_thread_from_start
 from compensator.commands import Answer, arguments
 from compensator.commands.stopping import stoppable
-from compensator.commands.wrapping import wrapped
+from compensator.commands.wrapping import styled, wrapped
 from compensator.errors import CompensatorError
 from drivers.errors import DriverError
 
@@ -160,9 +160,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     text = json.dumps(answer.result) if given.json else answer.text
     if sys.stdout.isatty() and not given.json:
-        text = wrapped(text, shutil.get_terminal_size().columns)
+        _show(wrapped(text, shutil.get_terminal_size().columns))
+        return answer.code
     sys.stdout.write(f"{text}\n")
     return answer.code
+
+
+def _show(text: str) -> None:
+    """Print a result on a terminal."""
+    from rich.console import Console
+
+    Console(file=sys.stdout).print(styled(text), soft_wrap=True)
 
 
 def load(command: Command) -> Callable[[argparse.Namespace], Answer | None]:

@@ -66,7 +66,7 @@ class Plot {
       child.querySelectorAll("path[clip-path]").forEach(outline);
       // A filled area is drawn once at 0, a marker at each of its points.
       if (uses.some((use) => Number(use.getAttribute("x")) === 0)) child.querySelectorAll("defs path").forEach(outline);
-      else for (const use of uses) this.known.push({use, x: Number(use.getAttribute("x"))});
+      else for (const use of uses) this.known.push({use, whole: use.getAttribute("x")});
     }
     return this.known;
   }
@@ -77,8 +77,8 @@ class Plot {
     this.from = Math.min(Math.max((from + to - span) / 2, low), high - span);
     this.to = this.from + span;
     for (const shape of this.shapes) {
-      if (shape.use) { shape.use.setAttribute("x", this.moved(shape.x).toFixed(3)); continue; }
-      if (!this.zoomed) { shape.path.setAttribute("d", shape.whole); continue; }
+      if (!this.zoomed) { (shape.use ?? shape.path).setAttribute(shape.use ? "x" : "d", shape.whole); continue; }
+      if (shape.use) { shape.use.setAttribute("x", this.moved(Number(shape.whole)).toFixed(3)); continue; }
       let isX = true;
       shape.path.setAttribute("d", shape.parts.map((part) => {
         if (/[a-z]/i.test(part)) { isX = true; return part; }

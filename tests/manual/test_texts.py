@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from compensator.cli import _parser
+from compensator.cli import COMMANDS
 from tests.manual.texts import codes, helps, in_live_page, in_sources, page, sentences
 
 #: Words that had to be read twice, or mean nothing to an engineer who did not write them.
@@ -24,8 +24,7 @@ def test_no_text_has_a_word_that_was_replaced() -> None:
 
 def test_every_command_is_listed() -> None:
     listed = {where.split()[1] for where, _ in helps() if where.count(" ") == 1}
-    (commands,) = (action.choices for action in _parser()._actions if action.dest == "command")
-    assert commands is not None and set(commands) <= listed
+    assert {command.name for command in COMMANDS} <= listed
 
 
 def test_a_sentence_is_found_with_its_values_left_out_and_docstrings_are_not(tmp_path: Path) -> None:
