@@ -161,7 +161,7 @@ def headline(found: Mapping[str, Any]) -> str:
     contradicted = f" {free_run_sentence(found)}" if is_contradicted(found) else ""
     it = "it" if len(found["effects"]) == 1 else "them"
     return (
-        f"{_words(found)} {_names(found['effects'])}. Error on held-out data: {found['before']['rms_um']:.2f} µm rms "
+        f"{_names(found['effects'])}. {_words(found)} Error on held-out data: {found['before']['rms_um']:.2f} µm rms "
         f"without {it}, {named_rms(found):.2f} with {it}{_with_remainder(found)}.{share}{contradicted}"
     )
 
@@ -328,7 +328,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     if diagnosis.remainder:
         rows.append(["with the remainder", *diagnosis.after.cells()])
     if diagnosis.ceiling:
-        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
+        rows.append(["best linear combination of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
     return Table(
         title="Errors on held-out data, zero fitted",
         head=["", *SCORE_HEAD],

@@ -19,7 +19,7 @@ from compensator.clock import NS
 from compensator.recording.reading import read_messages, recordings
 from compensator.watch.server import PageServer
 from compensator.watch.shop import Shop
-from tests.watch.heard import Clock
+from tests.watch.heard import Clock, status
 
 TOP = Path(__file__).resolve().parents[2]
 MACHINE = "vmc-07"
@@ -50,10 +50,16 @@ def filled(folder: Path, hours: float) -> Shop:
     """Return a shop with one machine, as watch has it some hours after the start of a day's recordings."""
     clock = Clock()
     shop = Shop(clock)
+    shop.set_alive(f"shop/{MACHINE}/thermal/alive", True)
     begin = None
     for path in recordings(folder, "sim-conduction"):
         for record in read_messages(path, ("sample", "estimate", "offset", "event")):
-            begin = record.log_time_ns if begin is None else begin
+            if begin is None:
+                begin = record.log_time_ns
+                about = status(
+                    0, begin, machine="sim-conduction", model="sim-conduction", recording=path.name, effects=[]
+                )
+                shop.receive(f"shop/{MACHINE}/thermal/status", about)
             if record.log_time_ns - begin > hours * 3600.0 * NS:
                 return shop
             clock.advance((record.log_time_ns - clock.now_ns) / NS)
@@ -65,11 +71,11 @@ def filled(folder: Path, hours: float) -> Shop:
 def main(demo: str = "demo-out", out: str = "") -> None:
     """Make both pictures."""
     folder, conduction = Path(out) if out else TOP / "compensator/report", Path(demo) / "conduction"
-    photograph((conduction / "diagnosis/report.html").resolve().as_uri(), folder / "diagnosis.png", 1000, 880)
-    status = {"connected": True, "where": "tcp/127.0.0.1:7447", "prefix": "shop", "ignored": 0}
+    photograph((conduction / "diagnosis/report.html").resolve().as_uri(), folder / "diagnosis.png", 1000, 790)
+    about = {"connected": True, "where": "tcp/127.0.0.1:7447", "prefix": "shop", "ignored": 0}
     shop = filled(conduction / "with-effect" / "recordings", 12.0)
-    with PageServer(shop, lambda: status, 0) as server:
-        photograph(f"{server.address}#m=shop%2F{MACHINE}", folder / "live.png", 1000, 800)
+    with PageServer(shop, lambda: about, 0) as server:
+        photograph(f"{server.address}#m=shop%2F{MACHINE}", folder / "live.png", 1000, 1180)
 
 
 if __name__ == "__main__":

@@ -305,7 +305,7 @@ def test_the_remainder_is_named_as_what_it_is(found: Diagnosis) -> None:
     assert f"1.40 µm rms with them, {with_it.after.rms_um:.2f} with the remainder" in verdict(figures(with_it))
     assert [row[0] for row in error_table(with_it).rows][-3:] == [
         "with the remainder",
-        "best linear use of all channels",
+        "best linear combination of all channels",
         "sensor noise alone",
     ]
     worse = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, rms_after_um=1.5))
