@@ -74,13 +74,20 @@ def styled(text: str) -> Text:
     if "\x1b" in text:
         return Text.from_ansi(text)
     found = Text()
-    lines = text.split("\n")
-    for i, line in enumerate(lines):
-        style = next((style for start, style in _STYLES if start.match(line)), "")
-        after = lines[i + 1] if i + 1 < len(lines) else ""
-        is_title = bool(_COLUMNS.match(after.strip())) and not _COLUMNS.match(line.strip()) and line[:1] not in " -"
-        found.append(line, style or ("bold" if line and is_title else ""))
-        found.append("\n" if i + 1 < len(lines) else "")
+    is_result = True
+    for i, paragraph in enumerate(text.split("\n\n")):
+        lines = paragraph.split("\n")
+        is_table = [bool(_COLUMNS.match(line.strip())) for line in lines]
+        # Above the first row stands the title; in a folded table the names of its rows do.
+        titles = max((k for k, after in enumerate(is_table) if after), default=0)
+        is_result = is_result and i == 0
+        for k, line in enumerate(lines):
+            style = next((style for start, style in _STYLES if start.match(line)), "")
+            is_title = not is_table[k] and line[:1] not in " -" and (k < titles or is_result)
+            found.append("\n" if k else "\n\n" if i else "")
+            found.append(line, style or ("bold" if line and is_title else ""))
+            # The result is the first sentence, however many lines it has.
+            is_result = is_result and not line.endswith((".", ":")) and not is_table[k]
     return found
 
 

@@ -112,15 +112,24 @@ class Plot {
 
   label(value, step) {
     if (!this.clock) return signed(value.toFixed(Math.max(0, -Math.floor(Math.log10(step) + 1e-9))));
-    const time = new Date(Math.round((value + this.offset(value)) * MINUTES) * 60_000);
-    const day = `${MONTHS[time.getUTCMonth()]}-${two(time.getUTCDate())}`;
-    const clock = `${two(time.getUTCHours())}:${two(time.getUTCMinutes())}`;
-    return step === 0 ? `${day} ${clock}` : clock === "00:00" ? day : clock;
+    const time = this.time(value), clock = `${two(time.getUTCHours())}:${two(time.getUTCMinutes())}`;
+    return step === 0 ? `${this.date(value)} ${clock}` : clock === "00:00" ? this.date(value).slice(5) : clock;
+  }
+
+  // The time of day in the zone of the plot, as if it were UTC.
+  time(value) { return new Date(Math.round((value + this.offset(value)) * MINUTES) * 60_000); }
+
+  date(value) {
+    const time = this.time(value);
+    return `${time.getUTCFullYear()}-${MONTHS[time.getUTCMonth()]}-${two(time.getUTCDate())}`;
   }
 
   ticks() {
     const marks = this.axes.flatMap((axes) => [...axes.querySelectorAll('[id*="-xtick_"]')]);
-    marks.forEach((mark) => { mark.style.display = this.zoomed ? "none" : ""; });
+    // The date in the corner is that of the whole plot.
+    const corners = this.clock ? this.axes.flatMap((axes) => [...axes.querySelectorAll('[id*="axis_"] > g > text')])
+      .filter((one) => /^\s*\d{4}/.test(one.textContent)) : [];
+    [...marks, ...corners].forEach((mark) => { mark.style.display = this.zoomed ? "none" : ""; });
     if (this.own) this.own.remove();
     this.own = null;
     if (!this.zoomed) return;
@@ -134,6 +143,12 @@ class Plot {
       const label = made("text", {x, y: text.getAttribute("y"), style: text.getAttribute("style")}, this.own);
       label.style.textAnchor = "middle";
       label.textContent = this.label(first + k * step, step);
+    }
+    if (this.clock && text) {
+      const y = corners.length ? corners[0].getAttribute("y") : Number(text.getAttribute("y")) + 14;
+      const corner = made("text", {x: this.right, y, style: text.getAttribute("style"), class: "date"}, this.own);
+      corner.style.textAnchor = "end";
+      corner.textContent = this.date(this.to);
     }
     // Behind the curves.
     this.axes[0].before(this.own);

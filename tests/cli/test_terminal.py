@@ -75,12 +75,17 @@ def test_a_table_of_two_columns_wraps_its_second() -> None:
 
 
 def test_the_style_changes_no_letter_and_marks_the_verdict() -> None:
-    text = "✓ Proven: 3 samples.\n\nErrors\ndata  rms\na      1\n\nWarnings:\n- one\npage: a.html"
+    text = "✓ Proven: 3 samples.\n\nErrors of\nall\ndata  rms\na      1\n\nWarnings:\n- one\npage: a.html"
     found = styled(text)
     assert found.plain == text
     marked = {found.plain[span.start : span.end]: span.style for span in found.spans}
-    assert marked["✓ Proven: 3 samples."] == "bold green" and marked["Errors"] == "bold"
+    assert marked["✓ Proven: 3 samples."] == "bold green" and marked["Errors of"] == marked["all"] == "bold"
     assert marked["Warnings:"] == "yellow" and marked["page: a.html"] == "dim" and "data  rms" not in marked
+
+
+def test_the_first_sentence_is_the_result_and_bold() -> None:
+    found = styled("Smallest error: quill,\n3 µm.\nA sentence.\n\nA remark.\n- a line of a list")
+    assert [found.plain[span.start : span.end] for span in found.spans] == ["Smallest error: quill,", "3 µm."]
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
