@@ -1,4 +1,4 @@
-"""Thermal error compensation for machine tools.
+"""quill-compensator: thermal error compensation for machine tools.
 
     import compensator as tc
 

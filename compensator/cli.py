@@ -21,7 +21,7 @@ from compensator import __version__
 from compensator.blas import one_thread_from_start
 from compensator.commands import Answer, arguments
 from compensator.commands.stopping import stoppable
-from compensator.commands.wrapping import wrapped
+from compensator.commands.wrapping import styled, wrapped
 from compensator.errors import CompensatorError
 from drivers.errors import DriverError
 
@@ -84,7 +84,7 @@ USERS = {
         ),
         Command(
             "loop",
-            "what diagnosis, comparison and adoption make of a shop's recordings",
+            "run diagnosis, comparison and adoption over a shop's recordings",
             "loop recordings/vmc-07 recordings/vmc-08 --page shop.html",
         ),
     ),
@@ -104,7 +104,7 @@ USERS = {
     "CNC integrator": (
         Command(
             "bridge",
-            "the offset to a control over OPC UA; touch probes to the service",
+            "send the offset to a control over OPC UA, or touch probes to the service",
             "bridge opcua --config bridge.toml",
         ),
         Command("router", "run a Zenoh router where no zenohd is installed", "router --config router.json5"),
@@ -123,7 +123,7 @@ USERS = {
         Command("run", "run the service", "run --config machine.toml"),
         Command(
             "completion",
-            "print a script by which a shell completes commands and options",
+            "print a completion script for a shell",
             "completion bash",
             "completion:run",
         ),
@@ -160,9 +160,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     text = json.dumps(answer.result) if given.json else answer.text
     if sys.stdout.isatty() and not given.json:
-        text = wrapped(text, shutil.get_terminal_size().columns)
+        _show(wrapped(text, shutil.get_terminal_size().columns))
+        return answer.code
     sys.stdout.write(f"{text}\n")
     return answer.code
+
+
+def _show(text: str) -> None:
+    """Print a result on a terminal."""
+    from rich.console import Console
+
+    Console(file=sys.stdout).print(styled(text), soft_wrap=True)
 
 
 def load(command: Command) -> Callable[[argparse.Namespace], Answer | None]:
@@ -213,7 +221,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="compensator",
         usage="compensator [-h] [--version] COMMAND ...",
-        description=f"Thermal error compensation for machine tools.\n\n{_overview()}",
+        description=f"quill-compensator: thermal error compensation for machine tools.\n\n{_overview()}",
         epilog="`compensator COMMAND --help` shows options and an example.\nexample: compensator demo --out demo-out",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

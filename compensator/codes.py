@@ -137,8 +137,7 @@ class Reason(Code):
     )
     SUSPECT_CHANNEL = (
         "suspect_channel",
-        "The channel after the colon has jumped and is not used until it returns, or until the model or measured Y "
-        "agrees with it.",
+        "A channel has jumped; it is not used until it returns, or the model or measured Y confirms its new value.",
         "Check that sensor and its plug; if it is right, send resume; if it was replaced, send zero.",
     )
     OUTSIDE_VALIDITY = (
@@ -178,7 +177,7 @@ class Reason(Code):
     )
     IMPLAUSIBLE = (
         "implausible",
-        "Measured and predicted Y diverge; the most likely cause, a sensor or the model, is named after the colon.",
+        "Measured and predicted Y diverge; the code ends with the most likely cause, a sensor or the model.",
         "Check that sensor, its wiring and its mounting; for the model, run `compensator diagnose` on the recordings.",
     )
     RESIDUAL_TOO_LARGE = (
@@ -246,7 +245,7 @@ class ProbeCode(Code):
     )
     FUTURE = (
         "probe_future",
-        "The probe is from the future.",
+        "The time of the probe is in the future.",
         "Check the time service (NTP) of the control and of this computer.",
     )
     TOO_OLD = (
@@ -283,17 +282,17 @@ class ProbeCode(Code):
     )
     TOO_MANY_FEATURES = (
         "probe_features",
-        "Probes of more features than the service distinguishes.",
+        "There are probes of more features than the service distinguishes.",
         "Use few features, always with the same names; a zero forgets them.",
     )
     OUTLIER = (
         "probe_outlier",
         "The probe does not fit the prediction: a chip, or another feature.",
-        "Clean the feature and probe again; if it is right, two more that agree with it are believed.",
+        "Clean the feature and probe again; if the value is right, two more probes that agree confirm it.",
     )
     BELIEVED = (
         "probe_believed",
-        "The probe is taken against earlier ones: it agrees with refused ones, or the last one taken was wrong.",
+        "The probe contradicts earlier ones and is used: refused ones agree with it, or the last one used was wrong.",
         "Find out what moved: a clamping, a collision, the model (`compensator diagnose`).",
     )
     FIRST = (
@@ -303,7 +302,7 @@ class ProbeCode(Code):
     )
     DOUBTED = (
         "probe_doubted",
-        "A probe that was taken may have been wrong: until another one decides it, part of it acts.",
+        "A probe that is used may be wrong: until another probe confirms or refutes it, only part of it is applied.",
         "Clean the feature and probe again.",
     )
     DEVIATION = (
@@ -344,7 +343,7 @@ class SampleQuality(Code):
     )
     SUSPECT = (
         "suspect",
-        "The channel has jumped, and nothing has spoken for its new value yet.",
+        "The channel has jumped, and nothing confirms its new value yet.",
         "Check for a loose sensor, an exchanged plug or a couple that was replaced.",
     )
     STUCK = "stuck", "The value has not changed for too long.", "Check that the sensor and its module work."
@@ -452,7 +451,7 @@ class ModelWarning(Code):
     )
     NOT_CONFIRMED = (
         "not_confirmed",
-        "The effects are clear in the data as a whole, but what is found without a block does not predict that block.",
+        "The effects are clear in all data together, but a search without a block of time does not predict it.",
         "Check the extended model on another day: something in the data happened only once.",
     )
     PATH_REVERSED = (
@@ -532,17 +531,17 @@ class DataRemark(Code):
     )
     PROBES_LEFT_OUT = (
         "probes_left_out",
-        "Refused probes state that no offset was applied, while others of the recording show that offsets were.",
+        "Refused probes state that no offset was applied; other probes of the recording show that one was.",
         "Have the control send the offset that it had applied with each probe.",
     )
     Y_LEFT_OUT = (
         "y_left_out",
-        "Measured values of Y do not fit what the others show and take part in nothing.",
+        "Measured values of Y do not agree with the other values and are left out.",
         "Check these measurements: a chip on the feature, or another feature.",
     )
     Y_REFUSED = (
         "y_refused",
-        "Measured values of Y are further from the prediction than their noise allows and did not correct it.",
+        "Measured values of Y are further from the prediction than their noise allows, so they do not correct it.",
         "Check these measurements: a chip on the feature, or another feature.",
     )
     Y_BELIEVED = (
@@ -707,7 +706,7 @@ class ProbeSourceRemark(Code):
     )
     NO_OFFSET_SOURCE = (
         "no_offset_source",
-        "Nothing shows the offset that acted at the touch for this source, unless each of its lines has it.",
+        "For this source the offset at the time of the touch is unknown, unless each line states it.",
         "Set applied_file for the receiver and for the bridge, or let each line have the offset.",
     )
     LINE_INCOMPLETE = (
@@ -722,7 +721,7 @@ class ProbeSourceRemark(Code):
     )
     LINE_AGE_UNKNOWN = (
         "line_age_unknown",
-        "A line waited somewhere for an unknown time before it was read; when it was measured is not known.",
+        "A line was delayed by an unknown time before it was read, so the time of the measurement is unknown.",
         "Probe again while the bridge is connected.",
     )
     LINE_CLOCK_DISAGREES = (
@@ -819,7 +818,7 @@ class AuditRemark(Code):
     )
     UNSIGNED_BEHIND = (
         "unsigned_behind",
-        "Records follow the last valid signature of the newest file, or a false signature follows them.",
+        "Records at the end of the newest file are not covered by a valid signature yet.",
         "Audit it again once the file is finished or the next one exists.",
     )
     OUTSIDE_CHAIN = (

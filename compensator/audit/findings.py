@@ -29,7 +29,7 @@ class Fault(Enum):
     PARTS_REORDERED = AuditFinding.REORDERED, "attachments or metadata are in another order"
     NO_HASH = AuditFinding.ALTERED, "not a valid hash"
     OPENING_CHANGED = AuditFinding.ALTERED, "differs from what follows from the file"
-    OTHER_PREVIOUS = AuditFinding.ALTERED, "states another last value of the previous file than the metadata"
+    OTHER_PREVIOUS = AuditFinding.ALTERED, "its last value of the previous file is not the one in the metadata"
     PART_LATE = AuditFinding.INSERTED, "{what}"
     PART_CRC = AuditFinding.ALTERED, "{what}"
     UNREADABLE_MESSAGE = AuditFinding.ALTERED, "cannot be read"

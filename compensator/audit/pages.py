@@ -218,7 +218,7 @@ def _hashes(found: Audit) -> Details:
     blocks: list[Block] = [Table(head=["file", "chain continues from", "chain ends with", "model, SHA-256"], rows=rows)]
     if keys:
         blocks.append(Table(head=["public keys in the seals"], rows=[[key] for key in keys]))
-    blocks.append(Words(title="Made by", lines=[f"compensator {__version__} replay"]))
+    blocks.append(Words(title="Made by", lines=[f"quill-compensator {__version__}, compensator replay"]))
     return Details(title="Hashes, keys, program", blocks=blocks)
 
 

@@ -109,7 +109,7 @@ def loop(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     words = "recordings of a machine, or a folder that contains such folders"
     add("folder", type=Path, nargs="+", metavar="FOLDER", help=words)
-    words = "for a machine whose service has no loop of its own: what a better model leads to (default adopt)"
+    words = "without [loop] in the configuration of a machine: propose or adopt a better model (default adopt)"
     add("--policy", choices=("propose", "adopt"), default="adopt", help=words)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
     _page(parser)
@@ -126,7 +126,7 @@ def export(parser: argparse.ArgumentParser) -> None:
 
 def bridge(parser: argparse.ArgumentParser) -> None:
     """Describe the arguments of `bridge`."""
-    words = "opcua: the offset to a control; probes: what touch probes measure to the service"
+    words = "opcua: send the offset to a control; probes: send values of touch probes to the service"
     parser.add_argument("protocol", choices=("opcua", "probes"), help=words)
     words = "TOML with [receiver] and [opcua], or with [probes] and its sources"
     parser.add_argument("--config", required=True, metavar="FILE", help=words)
@@ -293,8 +293,8 @@ def watch(parser: argparse.ArgumentParser) -> None:
     add("--wait", type=_number(0.0, 86_400.0), default=0.0, metavar="S", help="with --once: how long to listen, s (0)")
     add("--page", action="store_true", help="serve a live page on 127.0.0.1 instead of the terminal view")
     add("--port", type=int, default=8710, help="port of the page (8710; 0: any free port)")
-    words = "with --page: serve it, read only, on this address of the computer, for a tablet at the machine; without "
-    words += "encryption, for whoever has the address that is printed, which ends in a token"
+    words = "with --page: serve it, read only and not encrypted, on this address of the computer, such as for a tablet "
+    words += "at the machine; the printed address ends in a token, without which nothing is shown"
     add("--bind", metavar="ADDRESS", help=words)
     words = "with --bind: file with the token, made if it does not exist (default: a new token at each start)"
     add("--token", type=Path, metavar="FILE", help=words)

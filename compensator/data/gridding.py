@@ -90,7 +90,9 @@ def to_grid(table: Table, period_s: float) -> SampledData:
     return SampledData(
         records=tuple(
             SampledRecord(
-                t_s=np.arange(a, b, dtype=np.float64) * period_s, columns={name: v[a:b] for name, v in columns.items()}
+                t_s=np.arange(a, b, dtype=np.float64) * period_s,
+                columns={name: v[a:b] for name, v in columns.items()},
+                row_s=round(_spacing(t_s), 3),
             )
             for a, b in records
         ),

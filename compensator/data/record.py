@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,10 +24,13 @@ class SampledRecord:
         Time of each sample from the start of the data, s, evenly spaced.
     columns : dict of str to numpy.ndarray, shape (n,)
         Channels by name; NaN where missing.
+    row_s : float
+        Usual time between the rows that the samples are made from, s; NaN where it is not known.
     """
 
     t_s: Vector
     columns: dict[str, Vector]
+    row_s: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -48,6 +49,8 @@ class Run:
         Which of several recordings it is a part of.
     y_std_um : float, optional
         Standard deviation of one measured value of the deformation as it was stated, µm.
+    row_s : float
+        Usual time between the rows that the samples are made from, s; NaN where it is not known.
     """
 
     name: str
@@ -60,6 +63,7 @@ class Run:
     channels: dict[str, Vector]
     recording: int = 0
     y_std_um: float | None = None
+    row_s: float = math.nan
 
     @property
     def has_sparse_y(self) -> bool:
@@ -117,7 +121,8 @@ def runs_of(name: str, record: SampledRecord) -> Iterator[tuple[Run, tuple[Remar
         part = {c: v[first:last] for c, v in columns.items()}
         bridged = {c: v if c == "y_um" else _bridged(v) for c, v in part.items()}
         label = name if len(parts) == 1 else f"{name} part {i}"
-        yield _run(label, record.t_s[first:last], bridged), tuple(remarks if i == 1 else ())
+        run = dataclasses.replace(_run(label, record.t_s[first:last], bridged), row_s=record.row_s)
+        yield run, tuple(remarks if i == 1 else ())
 
 
 def _run(name: str, t_s: Vector, columns: dict[str, Vector]) -> Run:

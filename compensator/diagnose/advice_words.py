@@ -13,8 +13,8 @@ from compensator.model.effects.seen import digits
 SAID = 2
 _WHAT = {
     "unobserved": "A source that no channel shows moves Y",
-    "remainder": "What the channels explain and no named effect does moves Y",
-    "residual": "What nothing explains moves Y",
+    "remainder": "A cause that the channels show but no named effect explains moves Y",
+    "residual": "A cause that nothing explains moves Y",
 }
 
 
@@ -27,7 +27,7 @@ def advice_lines(advice: Advice | None) -> list[str]:
         lines.append(_left(advice.unexplained))
         if alike := resembling(advice.nearest):
             named = ", ".join(f"{near.channel} (log evidence +{digits(near.evidence)})" for near in alike[:3])
-            lines.append(f"Logged channels that come nearest: {named}.")
+            lines.append(f"Logged channels that resemble it most: {named}.")
         lines.append(advice.sensor)
     lines += [f"Next test, {_purpose(test)}: {test.sentence}" for test in advice.tests[:SAID]]
     lines += [_repeat(seen) for seen in advice.seen_once[:SAID]]
@@ -36,11 +36,11 @@ def advice_lines(advice: Advice | None) -> list[str]:
 
 def _left(unexplained: Unexplained) -> str:
     event, times = unexplained.goes_with, unexplained.times
-    goes = "It goes with nothing that was logged."
+    goes = "It coincides with nothing that was logged."
     if event is not None and event.event == DAY:
         goes = "It follows the time of day."
     elif event is not None:
-        goes = f"It goes with {event.event}: {event.times} of {event.of} times fall on its switching."
+        goes = f"It coincides with the switching of {event.event} in {event.times} of {event.of} times."
     when = f", first at {times[0][1]:.1f} h" if unexplained.kind == "unobserved" and times else ""
     return (
         f"{_WHAT[unexplained.kind]} by {digits(unexplained.rms_um)} µm rms with a time constant of "

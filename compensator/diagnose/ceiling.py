@@ -61,16 +61,20 @@ def ceiling(found: Mapping[str, Any]) -> Words:
 
 def _lines(found: Mapping[str, Any]) -> list[str]:
     if (best := found.get("ceiling")) is None:
-        return ["No linear use of the logged channels leaves less on held-out data than the base model does."]
+        return [
+            "No linear combination of the logged channels has a smaller error on held-out data than the base model."
+        ]
     lines = [
-        f"The best linear use of all logged channels leaves {best['rms_um']:.2f} µm rms on held-out data, the base "
-        f"model {found['before']['rms_um']:.2f}."
+        f"With the best linear combination of all logged channels, the error on held-out data is "
+        f"{best['rms_um']:.2f} µm rms, with the base model {found['before']['rms_um']:.2f}."
     ]
     if not (share := explained(found)):
-        return [*lines, "The channels can explain next to nothing."]
+        return [*lines, "The channels can explain almost nothing of the error."]
     lines.append(share)
     if found["effects"] and (named := named_rms(found)) < _LESS * best["rms_um"]:
-        lines.append(f"They leave less, {named:.2f} µm rms: not every effect is a linear use of the channels.")
+        lines.append(
+            f"Their error is smaller, {named:.2f} µm rms: not every effect is a linear combination of the channels."
+        )
     if falls_short(found):
         rest = "no remainder was added"
         if beside := found.get("remainder"):
@@ -79,9 +83,9 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
                 "the remainder corrects some of the rest" if lowers else "the remainder does not lower the error there"
             )
         lines.append(
-            "They fall clearly short: the channels show more than the effects that have a name, and " + rest + "."
+            "The channels show clearly more than the named effects explain, and " + rest + "."
             if found["effects"]
-            else f"The channels show something that has no name here; {rest}."
+            else f"The channels show something that no named effect explains; {rest}."
         )
     return lines
 
@@ -95,7 +99,7 @@ def remainder(found: Mapping[str, Any]) -> list[Words]:
     deployed = "Deployed in the extended model." if rest["deployed"] else "Not deployed in the extended model."
     lines = [
         f"A regularised linear response of {', '.join(channels[:_NAMED])}{more}: a correction that explains nothing.",
-        f"It takes the error on held-out data from {rest['rms_before_um']:.2f} to {rest['rms_after_um']:.2f} µm rms.",
+        f"Error on held-out data: {rest['rms_before_um']:.2f} µm rms without it, {rest['rms_after_um']:.2f} with it.",
         deployed,
     ]
     return [Words(title="Remainder", lines=lines)]

@@ -131,8 +131,8 @@ def _alike(missed: Vector, agree_um: float) -> str:
     if missed.size < ALIKE or np.ptp(missed) > agree_um:
         return ""
     return (
-        f" All are off by about {np.mean(missed):+.0f} µm: what acts for less than the time between two values looks "
-        "like this, too."
+        f" All are off by about {np.mean(missed):+.0f} µm; an effect that lasts less than the time between two values "
+        "looks the same."
     )
 
 

@@ -180,16 +180,16 @@ def warnings_of(
     if effects and rms_after > rms_before:
         numbers = f"({rms_after:.2f} against {rms_before:.2f} µm rms)"
         if deployed or few:
-            text = f"The effects are clear in the data as a whole, but do not predict held-out blocks better {numbers}."
+            text = f"The effects are clear in all data together, but do not predict held-out blocks better {numbers}."
             warnings.append(Remark(ModelWarning.NOT_CONFIRMED, text))
         else:
-            text = f"On held-out blocks the effects make it worse {numbers}, so the model was left as it is."
+            text = f"The effects increase the error on held-out blocks {numbers}, so the model was left unchanged."
             warnings.append(Remark(ModelWarning.MADE_WORSE, text))
     for effect in effects:
         kind, named = effect.place[0], effect.named
         loose = [name for name, std in effect.std.items() if std > abs(named[name]) > 0.0]
         if effect.reverses_path:
-            text = f"{kind}: Y moves against the {effect.place[1]}, so the model was left as it is."
+            text = f"{kind}: Y moves against the {effect.place[1]}, so the model was left unchanged."
             warnings.append(Remark(ModelWarning.PATH_REVERSED, text))
         if loose:
             text = f"{kind}: the standard error of {', '.join(loose)} is larger than the value."

@@ -16,7 +16,7 @@ from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import free_run_sentence
+from compensator.diagnose.free_run import free_run_sentence, is_contradicted
 from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
 from compensator.display import Listing, Table, Words, warnings_of, with_std
 from compensator.model.free_run import FreeRunErrors, table_of
@@ -28,7 +28,7 @@ _VERDICTS = {
         "model's own error."
     ),
     "explained": (
-        "The missing effects were found; what the fit to all data leaves is within the noise and the model's own error."
+        "The missing effects were found; the rest of the residual is within the noise and the model's own error."
     ),
     "partly_explained": "Some of the missing effects were found; part of the residual remains unexplained.",
     "unexplained": "The model lacks an effect that no channel shows.",
@@ -37,11 +37,10 @@ _VERDICTS = {
 _ADEQUATE_VALUES = "The model is adequate as far as so few values can show: the residual is within their noise."
 #: The verdict if few values leave nothing but noise and could not have shown what matters.
 _CANNOT_SHOW = (
-    "The residual is within the noise, but these values could not have shown what matters: they do not say whether the "
-    "model is adequate."
+    "The residual is within the noise, but these values are too few or too noisy to show whether the model is adequate."
 )
 #: The verdict if few values leave nothing but noise and an effect would explain some of it.
-_UNDECIDED = "The residual is within the noise, yet {names} may act: these values do not decide it."
+_UNDECIDED = "The residual is within the noise, yet {names} may act: these values cannot decide this."
 #: What could hide in few values.
 _HIDDEN = {
     "gain": "an error of the {path}'s gain",
@@ -148,14 +147,58 @@ def _scores(scores: Scores) -> dict[str, float | None]:
     return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
-def verdict(found: Mapping[str, Any]) -> str:
-    """Return a diagnosis in one or two sentences.
+def headline(found: Mapping[str, Any]) -> str:
+    """Return the verdict of a diagnosis and one figure: what a page begins with.
 
     Parameters
     ----------
     found : mapping
         Result of :func:`figures`, or content of `diagnosis.json`.
     """
+    if not found["effects"]:
+        return _residual(found)
+    share = f" {explained(found)}" if falls_short(found) else ""
+    contradicted = f" {free_run_sentence(found)}" if is_contradicted(found) else ""
+    it = "it" if len(found["effects"]) == 1 else "them"
+    return (
+        f"{_names(found['effects'])}. {_words(found)} Error on held-out data: {found['before']['rms_um']:.2f} µm rms "
+        f"without {it}, {named_rms(found):.2f} with {it}{_with_remainder(found)}.{share}{contradicted}"
+    )
+
+
+def verdict(found: Mapping[str, Any]) -> str:
+    """Return a diagnosis in a few sentences: what the headline has, with noise, ceiling and errors in free run.
+
+    Parameters
+    ----------
+    found : mapping
+        Result of :func:`figures`, or content of `diagnosis.json`.
+    """
+    share = "".join(f" {sentence}" for sentence in (explained(found), free_run_sentence(found)) if sentence)
+    if not found["effects"]:
+        return _residual(found) + share
+    return (
+        f"{_words(found)} {_names(found['effects'])}. On held-out data, with a fitted zero, the residual was "
+        f"{found['before']['rms_um']:.2f} µm rms without and is {named_rms(found):.2f} µm rms with them"
+        f"{_with_remainder(found)} (sensor noise {found['noise_floor_um']:.2f}).{share}"
+    )
+
+
+def _residual(found: Mapping[str, Any]) -> str:
+    """Return the verdict where no effect was found, with the residual."""
+    hidden = "".join(f" {line}" for line in hiding_lines(found)[:1])
+    return (
+        f"{_words(found)} Residual {found['before']['rms_um']:.2f} µm rms{_with_remainder(found)}, sensor noise "
+        f"{found['noise_floor_um']:.2f}.{hidden}"
+    )
+
+
+def _with_remainder(found: Mapping[str, Any]) -> str:
+    return f", {found['after']['rms_um']:.2f} with the remainder" if found.get("remainder") else ""
+
+
+def _words(found: Mapping[str, Any]) -> str:
+    """Return the verdict without figures."""
     words = _VERDICTS[found["verdict"]]
     if found["verdict"] == "adequate" and "could_hide" in found:
         words = _ADEQUATE_VALUES
@@ -172,16 +215,7 @@ def verdict(found: Mapping[str, Any]) -> str:
         words = _FALLS_SHORT
     elif _without_a_name(found):
         words = _WITHOUT_A_NAME
-    before, after, noise = found["before"]["rms_um"], found["after"]["rms_um"], found["noise_floor_um"]
-    share = "".join(f" {sentence}" for sentence in (explained(found), free_run_sentence(found)) if sentence)
-    with_remainder = f", {after:.2f} with the remainder" if found.get("remainder") else ""
-    if not found["effects"]:
-        hidden = "".join(f" {line}" for line in hiding_lines(found)[:1])
-        return f"{words} Residual {before:.2f} µm rms{with_remainder}, sensor noise {noise:.2f}.{hidden}{share}"
-    return (
-        f"{words} {_names(found['effects'])}. On held-out data, with a fitted zero, the residual was {before:.2f} µm "
-        f"rms without and is {named_rms(found):.2f} µm rms with them{with_remainder} (sensor noise {noise:.2f}).{share}"
-    )
+    return words
 
 
 def _without_a_name(found: Mapping[str, Any]) -> bool:
@@ -211,11 +245,11 @@ def hiding_lines(found: Mapping[str, Any]) -> list[str]:
     beside = " beside the effects found" if found["effects"] else ""
     limit = f"{hides['matters_um']:.1f} µm, a tenth of Y's movement"
     lines = [
-        f"With {hides['values']} values, one each {hides['every_min']:g} min, {first} could act{beside} without being "
+        f"With {hides['values']} values, one every {hides['every_min']:g} min, {first} could act{beside} without being "
         f"seen (limit for an adequate model: {limit})."
     ]
     if others:
-        lines.append(f"Or {', '.join(others)}. What comes and goes between two values does not show at all.")
+        lines.append(f"So could {', '.join(others)}. What begins and ends between two values cannot be seen at all.")
     if hides["too_much"]:
         lines.append(
             f"That is more than the limit: about {hides['values_needed']} values like these are needed, or as many "
@@ -273,8 +307,8 @@ def channels_to_configure(diagnosis: Diagnosis) -> list[Listing | Words]:
         values = np.concatenate([run.channels[name] for run in diagnosis.evidence.runs if name in run.channels])
         ranges[name] = (float(np.nanmin(values)), float(np.nanmax(values)))
     title = (
-        "The extended model needs these channels in the service's configuration. Where they are not there yet, paste, "
-        "and name device and input of the sensor"
+        "The extended model needs these channels. Paste those that are missing into the service's configuration, with "
+        "device and input of the sensor"
     )
     found: list[Listing | Words] = [Listing(title=title, lines=channel_lines(new, ranges))]
     if bad := unusable_names(new):
@@ -294,7 +328,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     if diagnosis.remainder:
         rows.append(["with the remainder", *diagnosis.after.cells()])
     if diagnosis.ceiling:
-        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
+        rows.append(["best linear combination of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
     return Table(
         title="Errors on held-out data, zero fitted",
         head=["", *SCORE_HEAD],

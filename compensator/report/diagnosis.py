@@ -18,11 +18,11 @@ from compensator.diagnose.summary import (
     error_table,
     explanation,
     figures,
+    headline,
     hiding_lines,
     name,
     parameter_table,
     rivals,
-    verdict,
 )
 from compensator.model.effects.seen import unit_of_channel
 from compensator.model.free_run import FreeRunErrors, table_of
@@ -97,7 +97,7 @@ def page_of(
     title = f"Diagnosis: what {model.name} lacks"
     sources = model.provenance.get("diagnosis", {}).get("data", [])
     data = ", ".join(str(one.get("file") or one["table"]) for one in sources)
-    return Page(title=title, verdict=verdict(found), blocks=blocks, tone=tone_of(found), data=data)
+    return Page(title=title, verdict=headline(found), blocks=blocks, tone=tone_of(found), data=data)
 
 
 def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
@@ -127,7 +127,8 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         ),
         edges=time.runs,
         below=below,
-        note="Residual of the fit to all data, zero and initial state fitted. Below: what the effects act by."
+        note="Residual of the fit to all data, zero and initial state fitted."
+        + (" Below: what the effects act by." if below else " No channel shows the cause.")
         + time.note,
     )
 
@@ -145,13 +146,16 @@ def _before_and_after(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         y_label="residual, µm",
         lines=tuple(lines),
         edges=time.edges,
-        note="Measured − predicted: each block was left out of the search that predicts it. At the dashed edges "
-        "another search predicts: a jump there is none of the machine." + time.note,
+        note="Measured − predicted: each block is predicted by a search that did not use it. A jump at a dashed edge "
+        "comes from this change of search, not from the machine." + time.note,
     )
 
 
 def _effect(time: TimeAxis, diagnosis: Diagnosis, effect: FoundEffect) -> Section:
-    blocks: list[Block] = [explanation(diagnosis, effect), _effect_figure(time, diagnosis, effect)]
+    blocks: list[Block] = [explanation(diagnosis, effect)]
+    if len(diagnosis.effects) > 1:
+        # The only effect is in the first picture.
+        blocks.append(_effect_figure(time, diagnosis, effect))
     blocks.append(parameter_table(effect, count=SHOWN))
     count = len(effect.named)
     if count > SHOWN:
@@ -211,7 +215,10 @@ def _ranking(diagnosis: Diagnosis) -> Details:
 
 
 def _details(time: TimeAxis, diagnosis: Diagnosis, model: ThermalModel, remarks: Sequence[str]) -> Details:
-    rows = [["extended model, SHA-256", model.sha256], ["its own error as it states it, µm", f"{model.y_std_um:.2f}"]]
+    rows = [
+        ["extended model, SHA-256", model.sha256],
+        ["standard deviation that it states, µm", f"{model.y_std_um:.2f}"],
+    ]
     rows += [
         [f"data: {d.get('file') or d['table']}", d["sha256"]]
         for d in model.provenance.get("diagnosis", {}).get("data", [])

@@ -14,8 +14,10 @@ import numpy as np
 from dateutil.tz import tzlocal  # type: ignore[import-untyped]
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
+from matplotlib.lines import Line2D
 
 from compensator.report.figure import Bar, Edges, Figure, Line, described, thinned
+from compensator.report.reading import axes_id, can_be_read, line_id, plot_data
 
 #: Placeholder colours of text and axes, of grid and spans, and of curves; the page's CSS variables replace them.
 INK, GRID = "#010101", "#020202"
@@ -40,6 +42,8 @@ _DASHES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)))
 _DAY_S = 86400.0
 #: Narrowest piece of a strip, as a share of the figure: an event of one minute in a year remains visible.
 _NARROWEST = 1.0 / 500.0
+#: Digits of a coordinate beyond a hundredth of a point, which nobody sees.
+_DIGITS = re.compile(r"(\.\d\d)\d+")
 #: Longest line of a bar's name, letters.
 _NAME_LETTERS = 34
 #: Width of a letter, of a legend's sample line, and of the margin left of the axes, inches.
@@ -64,8 +68,9 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
         canvas = Canvas(figsize=(width, figure.full_height), layout="constrained")
         rows = canvas.subplots(len(panels), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         colours: dict[str, int] = {}
-        for axes, panel in zip(rows, panels, strict=True):
-            _draw(axes, panel, colours)
+        for i, (axes, panel) in enumerate(zip(rows, panels, strict=True)):
+            axes.set_gid(axes_id(i))
+            _draw(axes, panel, colours, i)
             axes.label_outer()
             if panel.strips:
                 _strips(axes, panel)
@@ -76,16 +81,18 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
         canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
+    text = re.sub(r' d="[^"]*"', lambda path: _DIGITS.sub(r"\1", path[0]), text)
     for colour, variable in COLOURS.items():
         text = text.replace(colour, f"var({variable})")
     text = re.sub(r'(id="|url\(#|href="#)', rf"\g<1>{prefix}-", text)
     label = html.escape(f"{figure.title}. {figure.note}".strip())
+    data = f' data-plot="{html.escape(plot_data(figure, list(rows), prefix))}"' if can_be_read(figure) else ""
     opening, _, rest = text.partition(">")
-    opening = opening.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+    opening = opening.replace("<svg ", f'<svg role="img" aria-label="{label}"{data} ', 1)
     return f"{opening}><desc>{html.escape(described(figure))}</desc>{rest}"
 
 
-def _draw(axes: Axes, figure: Figure, colours: dict[str, int]) -> None:
+def _draw(axes: Axes, figure: Figure, colours: dict[str, int], panel: int) -> None:
     """Draw a panel; a name that a panel above it has keeps its number, by which it has its colour."""
     named: set[str] = set()
     above, drawn = dict(colours), len(colours)
@@ -108,7 +115,7 @@ def _draw(axes: Axes, figure: Figure, colours: dict[str, int]) -> None:
         axes.plot(np.cos(angle), np.sin(angle), color=INK, linewidth=0.8)
         axes.set_aspect("equal", adjustable="datalim")
     for i, line in enumerate(figure.lines):
-        _curve(axes, line, i, number(line.name), figure)
+        _curve(axes, line, i, number(line.name), figure).set_gid(line_id(panel, i))
     for marks in figure.marks:
         hollow: dict[str, Any] = {"markerfacecolor": "none"} if marks.marker == "o" else {}
         colour = LINES[number(marks.name) % len(LINES)]
@@ -185,19 +192,21 @@ def _bars(axes: Axes, bars: tuple[Bar, ...]) -> None:
     axes.set_ylabel("")
 
 
-def _curve(axes: Axes, line: Line, i: int, number: int, figure: Figure) -> None:
+def _curve(axes: Axes, line: Line, i: int, number: int, figure: Figure) -> Line2D:
     """Draw the i-th curve of a panel with a dash of its own, in the colour of its number on the figure."""
     colour = LINES[number % len(LINES)]
     # The sixth curve has the colour of the first, but another dash.
     dash = _DASHES[(i + i // len(LINES)) % len(_DASHES)]
     x = line.x / _DAY_S if figure.clock else line.x
     keep = thinned(line.x, line.y, x_log=figure.x_log)
-    axes.plot(x[keep], line.y[keep], linestyle=dash, color=colour, label=_plain(line.name), linewidth=line.weight)
+    label = _plain(line.name)
+    (drawn,) = axes.plot(x[keep], line.y[keep], linestyle=dash, color=colour, label=label, linewidth=line.weight)
     if line.band is not None:
         edges = [thinned(line.x, edge, x_log=figure.x_log) for edge in line.band]
         keep = np.unique(np.concatenate([keep, *edges]))
         low, high = line.band
         axes.fill_between(x[keep], low[keep], high[keep], color=colour, alpha=0.2, linewidth=0)
+    return drawn
 
 
 def _legend(axes: Axes, width: float) -> None:

@@ -47,9 +47,9 @@ def fleet_table(rows: Sequence[FleetRow], *, on_page: bool = False) -> Table:
     head = ["error, µm rms", "found", "proposed", "adopted", "back", "recordings"]
     cells = [[row.error, row.found, row.proposed, row.adopted, row.gone_back, row.span] for row in rows]
     place = 0 if on_page else len(head)
-    head.insert(place, "a person has to")
+    head.insert(place, "action")
     for row, line in zip(rows, cells, strict=True):
-        line.insert(place, row.needs or "do nothing")
+        line.insert(place, row.needs or "none")
     note = (
         "Error: measured Y with the offset applied, or what touch probes found, in the last 24 h; with the model alone "
         "→ with the loop. Found: the last candidate; back: how often the loop went back."
@@ -62,9 +62,9 @@ def fleet_verdict(rows: Sequence[FleetRow]) -> str:
     """Return the result in one sentence."""
     waiting, bad = sum(bool(row.needs) for row in rows), sum(row.is_bad for row in rows)
     proposed = sum(bool(row.proposed) for row in rows)
-    words = f"{len(rows)} machine(s): {waiting} need(s) a person"
+    words = f"{len(rows)} machine(s): action needed on {waiting}"
     if proposed:
-        words += f", {proposed} of them for a proposal"
+        words += f", {proposed} of them with a proposal"
     return f"{words}; {bad} could not be read." if bad else f"{words}."
 
 

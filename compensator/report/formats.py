@@ -1,7 +1,8 @@
 """Writes a page as HTML, as PDF or as PNG; PDF and PNG are printed by an installed browser.
 
 The browser opens one file in a temporary folder, with a separate profile and no network, for at most `TIMEOUT_S`; the
-page's content security policy forbids scripts. The printed file replaces the target only when it is complete.
+page has no script then, and its content security policy forbids any. The printed file replaces the target only when it
+is complete.
 """
 
 from __future__ import annotations
@@ -112,11 +113,13 @@ def write(path: Path, page: Page) -> Path:
         source, printed = Path(name) / "page.html", Path(name) / f"page{suffix}"
         if suffix == ".pdf":
             # Older browsers ignore the rule of the print style that opens details.
-            source.write_text(html_of(page, date=today()).replace("<details>", "<details open>"), encoding="utf-8")
+            source.write_text(
+                html_of(page, date=today(), can_zoom=False).replace("<details>", "<details open>"), encoding="utf-8"
+            )
             options = ["--no-pdf-header-footer", "--print-to-pdf-no-header", f"--print-to-pdf={printed}"]
         else:
             first = _first_figure(page)
-            source.write_text(html_of(_excerpt(page, first), date=today()), encoding="utf-8")
+            source.write_text(html_of(_excerpt(page, first), date=today(), can_zoom=False), encoding="utf-8")
             height = _PNG_HEAD + round(_PNG_WIDTH / 9.0 * (first.full_height if first else 0.0))
             options = [f"--window-size={_PNG_WIDTH},{height}", f"--force-device-scale-factor={_PNG_SCALE}"]
             options += ["--hide-scrollbars", f"--screenshot={printed}"]

@@ -18,9 +18,9 @@ _GAP = 3.0
 #: Line colours of what is left, of what an effect removes, and of the remainder.
 _LEFT, _EFFECT, _REMAINDER = 1, 2, 3
 _NOTE = (
-    "Each bar ends at the error with everything down to it, by searches that did not see the block they predict. Mean "
-    "squares add, rms values do not: the percentages are shares of the mean square without any effect. Effects that "
-    "overlap share what they remove; the upper one shows it."
+    "Each bar ends at the error with all effects down to it; each block is predicted by a search that did not use it. "
+    "Percentages are shares of the mean square without any effect, because mean squares add and rms values do not. "
+    "Where effects overlap, the upper one shows what both remove."
 )
 
 

@@ -120,9 +120,18 @@ def _prediction(calibration: Calibration) -> Figure:
         lines=(Line("measured", t, y), Line("predicted", t, predicted)),
         spans=spans,
         below=tuple(below),
-        note=f"Measured Y is not fed back. Samples of {calibration.model.period_s:g} s: faster rows are averaged."
+        note=f"Measured Y is not fed back.{_averaged(calibration)}"
         + (" Shaded: held out from fitting and selection." if spans else ""),
     )
+
+
+def _averaged(calibration: Calibration) -> str:
+    """Return a sentence where the data have more than one row for each sample."""
+    period_s = calibration.model.period_s
+    rows_s = sorted({run.row_s for run in calibration.runs if run.row_s < period_s})
+    if not rows_s:
+        return f" Samples of {period_s:g} s."
+    return f" Rows every {' or '.join(f'{row_s:g}' for row_s in rows_s)} s are averaged to samples of {period_s:g} s."
 
 
 def _input(parts: Sequence[Part], key: str) -> Vector:

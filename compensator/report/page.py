@@ -1,7 +1,8 @@
 """A self-contained HTML page: the verdict, the figure that supports it, tables, and folded details.
 
-A page loads nothing and runs no script; its content security policy enforces both. Figures are SVG with CSS variables
-as colours, so that one page suits light and dark screens and paper. Each code on a page links to its meaning and action
+A page loads nothing and runs no script but its own, which zooms plots and shows their values; its content security
+policy enforces both. Without the script, and in print, a page shows the same. Figures are SVG with CSS variables as
+colours, so that one page suits light and dark screens and paper. Each code on a page links to its meaning and action
 at the end of the page.
 """
 
@@ -22,6 +23,7 @@ from compensator.display import Cell, CodeLink, Link, Listing, Table, Words, sen
 from compensator.report.drawing import svg
 from compensator.report.figure import Bar, Figure, Line, Marks, Span, Stems, Strip
 from compensator.report.local_time import today
+from compensator.report.reading import script, script_hash
 
 Tone = Literal["good", "warn", "bad"]
 #: Widths of a single figure and of one in a row, inches: the text of both stays readable.
@@ -29,7 +31,7 @@ _WIDE_IN, _NARROW_IN = 9.0, 4.8
 #: Longest cell on one line, and longest unbroken word (a file name, a hash), characters.
 _LONGEST_CELL, _LONGEST_WORD = 36, 24
 TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "bad": "✗ Failed"}
-#: A page needs inline styles only.
+#: A page needs inline styles only, and the script by its hash.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
 
@@ -82,7 +84,7 @@ class Page:
     data: str = ""
 
 
-def html_of(page: Page, *, date: str = "") -> str:
+def html_of(page: Page, *, date: str = "", can_zoom: bool = True) -> str:
     """Return a page as HTML.
 
     Parameters
@@ -91,23 +93,28 @@ def html_of(page: Page, *, date: str = "") -> str:
         Its content.
     date : str
         Date for its last line.
+    can_zoom : bool
+        With the script that zooms its plots, where it has any; without, no script runs.
     """
     style = resources.files("compensator.report").joinpath("style.css").read_text(encoding="utf-8")
     title = html.escape(page.title)
     numbers = count(1)
     body = "".join(_block(block, numbers, 2) for block in page.blocks)
+    zooms = can_zoom and " data-plot=" in body
+    policy = f"{_POLICY}; script-src {script_hash()}" if zooms else _POLICY
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style></head><body>'
         f'<main><h1>{title}</h1><p class="verdict {page.tone}"><b>{TONE_WORDS[page.tone]}</b>'
-        f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}{_origin(page, date)}</main></body></html>"
+        f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}{_origin(page, date)}</main>"
+        f"{f'<script>{script()}</script>' if zooms else ''}</body></html>"
     )
 
 
 def _origin(page: Page, date: str) -> str:
     """Return the last line: version, date, data."""
-    parts = [f"compensator {__version__}", date, f"data: {page.data}" if page.data else ""]
+    parts = [f"quill-compensator {__version__}", date, f"data: {page.data}" if page.data else ""]
     return f'<p class="note">{html.escape(", ".join(filter(None, parts)))}.</p>'
 
 

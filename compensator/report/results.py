@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from compensator.diagnose.summary import verdict as diagnosis_verdict
+from compensator.diagnose.summary import headline
 from compensator.identify.summary import verdict as calibration_verdict
 from compensator.input_file import MODEL_BYTES, RESULT_BYTES, parse_toml, read_file, resolved
 from compensator.model.model_file import HELD_OUT_KEY
@@ -56,7 +56,7 @@ def _diagnosis(page: Path) -> PageFile | None:
         return None
     with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
         found = json.loads(read_file(page.with_name("diagnosis.json"), RESULT_BYTES))
-        return PageFile(path=page, title="Diagnosis", verdict=diagnosis_verdict(found), tone=diagnosis_tone(found))
+        return PageFile(path=page, title="Diagnosis", verdict=headline(found), tone=diagnosis_tone(found))
     return None
 
 

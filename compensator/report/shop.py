@@ -54,7 +54,7 @@ def shop_table(day: ShopDay) -> Table:
         head=["conduction machine with the undeclared effect", "rms µm", "peak to peak µm", "left %"],
         rows=rows,
         note="Whole second day, first model, rms about the zero. Probe alone: the same probes, each held until "
-        "the next. Left: rms, of no compensation.",
+        "the next. Left: rms as a share of that without compensation.",
     )
 
 
@@ -100,7 +100,7 @@ def shop_section(day: ShopDay) -> Section:
                 lines=(lines["model"], lines["model_and_probe"]),
                 marks=_marks(day),
                 note="A probe shows the error that model and probe leave, with its noise. A correction stays until the "
-                "next probe: where the effect changes in between, more may be left than by the model alone.",
+                "next probe: where the effect changes in between, the error may be larger than with the model alone.",
             ),
             probe_words(day),
             shop_table(day),

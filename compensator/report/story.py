@@ -243,10 +243,10 @@ def _picture(story: Story, left_by_day: Mapping[float, float], x_limits: tuple[f
         if at.size:
             marks.append(Marks(WORDS[what], at, np.full(at.size, height * top), marker=marker))  # type: ignore[arg-type]
     return Figure(
-        title="Error that is left, day by day, and changes of the model",
+        title="Remaining error, day by day, and changes of the model",
         x_label=f"time, {zone_at(x_limits[1])}",
         y_label="error in Y, µm rms",
-        lines=(Line("left with the offset applied", x, y),),
+        lines=(Line("remaining error with the offset applied", x, y),),
         marks=tuple(marks),
         limits=(0.0,),
         clock=True,

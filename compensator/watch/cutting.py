@@ -111,15 +111,19 @@ def _headline(
 
 def _lost(channels: Mapping[str, Mapping[str, Any]], reasons: Sequence[str]) -> list[str]:
     """Return which temperature is missing, why, and what to do; the cause first."""
-    missing = [
-        name for name, reason in (("t_q_degc", Reason.T_Q_MISSING), ("at_degc", Reason.AT_MISSING)) if reason in reasons
-    ]
+    known = {"t_q_degc": Reason.T_Q_MISSING, "at_degc": Reason.AT_MISSING}
+    missing = [name for name, reason in known.items() if reason in reasons]
     if not missing:
         return []
     causes, to_do = [], []
     for name in missing:
         channel = channels.get(name, {})
         quality = str(channel.get("quality", ""))
+        if quality == SampleQuality.GOOD:
+            # The last sample that arrived is older than the offset: its quality explains nothing.
+            causes.append(f"{NAMES[name]}: missing.")
+            to_do.append(known[name].action)
+            continue
         causes.append(f"{NAMES[name]}: {_HAS.get(quality, quality.replace('_', ' ') or 'missing')}.")
         to_do.append(str(channel.get("do", "")))
     return [" ".join(causes), *dict.fromkeys(filter(None, to_do))]

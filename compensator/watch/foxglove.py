@@ -84,7 +84,7 @@ class FoxgloveServer:
         inner = ".".join(("127", *(str(1 + secrets.randbelow(254)) for _ in range(3))))
         try:
             server = self._foxglove.start_server(
-                name="thermal compensation",
+                name="quill-compensator",
                 host=inner,
                 port=0,
                 context=self._context,

@@ -76,7 +76,7 @@ function verdict(tone, word, text) {
 
 function showShop(shop, missing) {
   $("shop").hidden = false; $("machine").hidden = true; $("all").hidden = missing === null;
-  setText($("title"), "Thermal compensation, live"); document.title = "Machines, live";
+  setText($("title"), "quill-compensator, live"); document.title = "Machines, live";
   const tones = shop.machines.map((one) => one.tone);
   const tone = !tones.length || tones.includes("bad") ? "bad" : tones.includes("warn") ? "warn" : "good";
   if (missing !== null) verdict("bad", "Silent", `No messages from ${missing}.`);

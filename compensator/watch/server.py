@@ -14,6 +14,7 @@ import html
 import json
 import re
 import socket
+import sys
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -156,6 +157,11 @@ class _Server(ThreadingHTTPServer):
     allow_reuse_port = False
     answer: Callable[[str, dict[str, list[str]]], tuple[str, bytes] | None]
     token: str = ""
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing about a browser that was closed before it had its answer."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
 
 class _Server6(_Server):

@@ -55,6 +55,17 @@ def figures(demo):
         for name, v, m in (("first", first, hours_first > 1.5), ("extended", extended, judged), ("none", y, judged))
     }
     common = {"x_label": "time, h", "x_limits": (0.0, 24.0)}
+    below = Figure(
+        title="",
+        y_label="error in Y, µm",
+        height=2.9,
+        lines=(
+            Line(f"calibrated model: {rms['first']:.1f} µm rms", hours_first, first),
+            Line(f"model extended by diagnose, adopted after 1 h: {rms['extended']:.1f} µm rms", hours, extended),
+        ),
+        **common,
+    )
+    # One figure, so that both axes of time line up.
     return (
         Figure(
             title="A working day of the simulated conduction machine",
@@ -65,16 +76,7 @@ def figures(demo):
                 Line("remaining error", hours, extended),
             ),
             height=2.9,
-            **common,
-        ),
-        Figure(
-            title="Remaining error",
-            y_label="error in Y, µm",
-            height=2.9,
-            lines=(
-                Line(f"calibrated model: {rms['first']:.1f} µm rms", hours_first, first),
-                Line(f"model extended by diagnose, adopted after 1 h: {rms['extended']:.1f} µm rms", hours, extended),
-            ),
+            below=(below,),
             **common,
         ),
     ), rms
@@ -86,7 +88,8 @@ def stacked(pictures):
     light, dark = (" ".join(re.findall(r"--[\w-]+: #[0-9a-f]{6};", block)) for block in text.split("{", 4)[1:4:2])
     parts, below, width = [], 0.0, 0.0
     for i, picture in enumerate(pictures):
-        drawn = svg(picture, f"p{i}", WIDTH)
+        # The style below names the font once, and nobody zooms a picture of the README.
+        drawn = re.sub(r"font-family: [^;\"]*;? ?| data-plot=\"[^\"]*\"", "", svg(picture, f"p{i}", WIDTH))
         width, height = (float(v) for v in UNIT.search(drawn).groups())
         parts.append(drawn.replace("<svg ", f'<svg x="0" y="{below:g}" ', 1).replace('pt"', '"'))
         below += height + GAP

@@ -116,7 +116,7 @@ def test_a_shop_is_a_folder_of_folders_and_one_bad_machine_stops_no_other(
     page = tmp_path / "shop.html"
     assert main(["loop", str(tmp_path), "--page", str(page)]) == 0
     text = capsys.readouterr().out
-    assert "2 machine(s): 2 need(s) a person, 1 of them for a proposal; 1 could not be read." in text
+    assert "2 machine(s): action needed on 2, 1 of them with a proposal; 1 could not be read." in text
     assert "torn.mcap" in text and str(page) in text
     shown = page.read_text(encoding="utf-8")
     assert "gain:DTF" in shown and "Failed" in shown

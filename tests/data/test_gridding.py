@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from compensator.codes import Remark
 from compensator.data.measurement import read
+from compensator.data.runs import runs_of
+from compensator.report.identification import _averaged
 
 ROWS = 240
 
@@ -43,3 +46,15 @@ def test_a_sparse_temperature_is_said_with_its_share(tmp_path: Path, every: int,
 def test_a_long_gap_is_said_once(tmp_path: Path) -> None:
     found = remarks(tmp_path / "a.csv", [row(i, t_q=not 60 <= i < 160) for i in range(ROWS)])
     assert [one.code for one in found] == ["temperature_missing"]
+
+
+@pytest.mark.parametrize("row_s", [15.0, 60.0])
+def test_the_time_between_rows_stays_known_and_the_page_says_what_was_averaged(tmp_path: Path, row_s: float) -> None:
+    path = tmp_path / "a.csv"
+    rows = [row(i, t_s=row_s * i) for i in range(ROWS)]
+    path.write_text("\n".join(["t_s,t_q_degc,at_degc,y_um", *rows]) + "\n", encoding="utf-8")
+    (record,) = read(path).at_period(60.0).records
+    assert record.row_s == row_s
+    ((run, _),) = runs_of("a", record)
+    words = _averaged(SimpleNamespace(runs=[run], model=SimpleNamespace(period_s=60.0)))  # type: ignore[arg-type]
+    assert words == (" Rows every 15 s are averaged to samples of 60 s." if row_s == 15.0 else " Samples of 60 s.")

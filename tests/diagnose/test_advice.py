@@ -82,7 +82,7 @@ def test_the_advice_is_in_the_file_on_the_terminal_and_on_the_page(door):
         part for part in contents(found, ()) if isinstance(part, Words) and part.title.startswith("What to measure")
     ]
     assert len(said) == 1 and 3 <= len(said[0].lines) <= 6
-    assert "goes with coolant_flow_lpm" in said[0].lines[0]
+    assert "coincides with the switching of coolant_flow_lpm" in said[0].lines[0]
     titles = [getattr(block, "title", "") for block in page_of(found, found.model, ()).blocks]
     assert "What to measure and test next" in titles
 

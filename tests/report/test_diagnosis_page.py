@@ -16,7 +16,7 @@ import compensator as tc
 from compensator.diagnose import held_out as held_out_module
 from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Step, rms_of
-from compensator.diagnose.summary import contents, error_table, figures, verdict
+from compensator.diagnose.summary import contents, error_table, figures, headline, verdict
 from compensator.display import text_of_all
 from compensator.model.model_file import load_model
 from compensator.report.diagnosis import page_of, tone_of
@@ -167,17 +167,45 @@ def test_an_effect_lies_over_its_residual_and_its_channel_below_it(found: Diagno
 
 def test_what_no_channel_shows_has_no_channel_below(found: Diagnosis) -> None:
     step = dataclasses.replace(found.effects[0], term=drawn_term("step"))
-    section, *_ = sections(dataclasses.replace(found, effects=(step,), steps=found.steps[:1]))
+    section, *_ = sections(dataclasses.replace(found, effects=(step, *found.effects[1:])))
     picture = next(block for block in section.blocks if isinstance(block, Figure))
     assert picture.below == () and "No channel shows its cause." in picture.note
 
 
 def test_a_path_is_shown_with_what_drives_it(found: Diagnosis) -> None:
     gain = dataclasses.replace(found.effects[0], term=drawn_term("gain"))
-    section, *_ = sections(dataclasses.replace(found, effects=(gain,), steps=found.steps[:1]))
+    section, *_ = sections(dataclasses.replace(found, effects=(gain, *found.effects[1:])))
     picture = next(block for block in section.blocks if isinstance(block, Figure))
     assert picture.below[0].y_label == "W"
     assert picture.below[0].lines[0].y == pytest.approx(found.evidence.signals[0].drive)
+
+
+def test_the_only_effect_is_drawn_once_in_the_first_picture(found: Diagnosis) -> None:
+    effect = next(e for e in found.effects if e.channel)
+    one = dataclasses.replace(found, effects=(effect,), steps=found.steps[:1])
+    assert not [block for section in sections(one) for block in section.blocks if isinstance(block, Figure)]
+    first = page(one).blocks[0]
+    assert isinstance(first, Figure)
+    _, alone = first.lines
+    assert alone.y[np.isfinite(alone.y)] == pytest.approx(effect.signal)
+    assert [panel.lines[0].name for panel in first.below] == [effect.channel]
+
+
+def test_the_headline_is_the_verdict_and_one_figure(found: Diagnosis) -> None:
+    words = headline(figures(found))
+    before, after = found.before.rms_um, found.after.rms_um
+    assert f"{before:.2f} µm rms without them, {after:.2f} with them." in words and words == page(found).verdict
+    assert len(words) < 0.7 * len(verdict(figures(found))) and "free run" not in words
+    # Where another day contradicts, the headline has that day.
+    other = {"rms_um": 9.0, "rms_about_mean_um": 8.0}
+    base = {"rms_um": 2.0, "rms_about_mean_um": 1.9}
+    scores = {
+        "base model": base,
+        "extended model": other,
+        "no compensation": {"rms_um": 40.0, "rms_about_mean_um": 30.0},
+    }
+    worse = {"free_run": [{"name": "other.csv", "role": "held out", "scores": scores}]}
+    assert "so it is worse there" in headline(figures(found) | worse)
 
 
 def drawn_term(kind: str) -> Any:
@@ -245,13 +273,13 @@ def test_the_share_of_the_ceiling_is_said_everywhere(found: Diagnosis, tmp_path:
     sentence = "The named effects explain 83 % of what the channels can explain."
     printed = text_of_all(contents(explained, ()))
     assert sentence in text(explained) and sentence in printed and sentence in verdict(figures(explained))
-    assert "fall clearly short" not in text(explained) + printed
+    assert "show clearly more" not in text(explained) + printed
     assert tone_of(figures(explained)) == "good"
 
 
 def test_where_the_effects_fall_short_it_is_said_and_not_passed(found: Diagnosis, tmp_path: Path) -> None:
     short = with_ceiling(found, 40.0)
-    assert "They fall clearly short" in text(short) and "no remainder was added" in text(short)
+    assert "The channels show clearly more" in text(short) and "no remainder was added" in text(short)
     assert page(short).tone == "warn" and "The missing effects were found" not in page(short).verdict
     # The overview of the folder says the same.
     (tmp_path / "diagnosis.json").write_text(json.dumps(figures(short)), encoding="utf-8")
@@ -263,7 +291,7 @@ def test_where_the_effects_fall_short_it_is_said_and_not_passed(found: Diagnosis
 def test_channels_that_explain_next_to_nothing_make_no_share(found: Diagnosis) -> None:
     ceiling = Ceiling(rms_um=0.99 * found.before.rms_um, explained_pct=0.0)
     adequate = dataclasses.replace(found, ceiling=ceiling, verdict="explained")
-    assert "explain next to nothing" in text(adequate) and "fall clearly short" not in text(adequate)
+    assert "explain almost nothing" in text(adequate) and "show clearly more" not in text(adequate)
     assert page(adequate).tone == "good"
 
 
@@ -272,12 +300,12 @@ def test_the_remainder_is_named_as_what_it_is(found: Diagnosis) -> None:
     printed = text_of_all(contents(with_it, ()))
     for where in (text(with_it), printed):
         assert "t1_degc, base_degc: a correction that explains nothing." in where
-        assert "from 1.40 to 0.90 µm rms" in where and "the remainder corrects some of the rest" in where
+        assert "1.40 µm rms without it, 0.90 with it" in where and "the remainder corrects some of the rest" in where
     # The effects are not credited with what the remainder does.
     assert f"1.40 µm rms with them, {with_it.after.rms_um:.2f} with the remainder" in verdict(figures(with_it))
     assert [row[0] for row in error_table(with_it).rows][-3:] == [
         "with the remainder",
-        "best linear use of all channels",
+        "best linear combination of all channels",
         "sensor noise alone",
     ]
     worse = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, rms_after_um=1.5))
@@ -300,7 +328,7 @@ def test_without_effect_ceiling_and_remainder_the_page_says_so_and_claims_nothin
     nothing = {"effects": (), "steps": (), "tried": (), "ceiling": None, "remainder": None, "advice": None}
     bare = dataclasses.replace(found, **nothing, verdict="adequate")
     words = text(bare)
-    assert "No linear use of the logged channels leaves less" in words
+    assert "No linear combination of the logged channels has a smaller error" in words
     assert "before and after" not in words and "a correction that explains nothing" not in words
     assert "explain" not in verdict(figures(bare))
     assert not sections(bare)

@@ -29,6 +29,12 @@ def test_a_broken_couple_is_named_with_the_time_that_is_left() -> None:
     assert held.text == "The offset is frozen. T_Q: wire open. Check thermocouple and terminals."
 
 
+def test_a_missing_temperature_whose_last_known_quality_was_good_is_not_called_good() -> None:
+    found = of("degraded", "t_q_missing", "predicting", until_min=58.2, t_q_degc="good")
+    assert found.text.startswith("T_Q: missing. Predicted for another 58 min") and "Nothing" not in found.text
+    assert Reason.T_Q_MISSING.action in found.text
+
+
 @pytest.mark.parametrize(
     ("shown", "reasons", "cut", "words"),
     [

@@ -230,3 +230,13 @@ def test_a_channel_that_is_not_well_stands_above_the_numbers(tmp_path: Path) -> 
         't_q_degc: <a href="#word=open_circuit">open_circuit</a>: The thermocouple or its wiring is broken. <b>Action'
     )
     assert said in text and text.index(said) < text.index('<dl id="now"')
+
+
+def test_a_browser_that_closes_early_leaves_no_traceback(server: PageServer, capfd: pytest.CaptureFixture[str]) -> None:
+    assert server._server is not None
+    for error, printed in ((BrokenPipeError(), False), (ConnectionResetError(), False), (ValueError("a defect"), True)):
+        try:
+            raise error
+        except (OSError, ValueError):
+            server._server.handle_error(None, ("127.0.0.1", 1))
+        assert ("Traceback" in capfd.readouterr().err) == printed
