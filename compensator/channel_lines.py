@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 
@@ -30,14 +32,17 @@ def channel_lines(names: Iterable[str], ranges: Mapping[str, tuple[float, float]
     """
     tables = []
     for name in names:
-        lines = ["[[channel]]", f'name = "{name}"', 'device = "DEVICE"', "input = 0"]
+        lines = ["[[channel]]", f"name = {json.dumps(name, ensure_ascii=False)}", 'device = "DEVICE"', "input = 0"]
         if ranges is not None and name in ranges:
             low, high = ranges[name]
-            # A speed or a flow that is never negative stays so.
-            least = 0.0 if low >= 0.0 and not name.endswith("_degc") else 2.0 * low - high
-            lines.append(
-                f"range = [{max(2.0 * low - high, least):.1f}, {2.0 * high - low:.1f}]  # seen: {low:g} to {high:g}"
-            )
+            # A speed or a flow that is never negative, its noise aside, stays so.
+            span = max(high - low, 1e-9)
+            least = 0.0 if low >= -0.01 * span and not name.endswith("_degc") else low - span
+            digits = max(1, 1 - math.floor(math.log10(span)))
+            step = 10.0**-digits
+            ends = [math.floor(max(low - span, least) / step) * step, math.ceil((high + span) / step) * step]
+            shown = ", ".join(f"{end + 0.0:.{digits}f}" for end in ends)
+            lines.append(f"range = [{shown}]  # seen: {low:g} to {high:g}")
         tables.append("\n".join(lines))
     return "\n\n".join(tables)
 

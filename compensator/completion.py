@@ -6,9 +6,10 @@ import argparse
 
 from compensator.commands import Answer
 
-_BASH = """# compensator: completion of commands, options and files. To use it now and in every new shell:
+_WHERE = """# compensator: completion of commands, options and files. To use it in every new shell:
 #   compensator completion bash > ~/.local/share/bash-completion/completions/compensator
-_compensator() {{
+"""
+_BASH = """_compensator() {{
   local word="${{COMP_WORDS[COMP_CWORD]}}" command="${{COMP_WORDS[1]}}" options=""
   COMPREPLY=()
   if [ "$COMP_CWORD" -eq 1 ]; then
@@ -45,5 +46,5 @@ def run(arguments: argparse.Namespace) -> Answer:
         text = _FISH + "\n".join(lines)
     else:
         cases = "\n".join(f'    {name}) options="{" ".join(found)}" ;;' for name, found in options.items())
-        text = (_ZSH if arguments.shell == "zsh" else "") + _BASH.format(commands=" ".join(options), cases=cases)
+        text = (_ZSH if arguments.shell == "zsh" else _WHERE) + _BASH.format(commands=" ".join(options), cases=cases)
     return Answer({"shell": arguments.shell, "script": text}, text.rstrip("\n"))

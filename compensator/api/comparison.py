@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from compensator.api.files import ModelLike, Paged, model_of
 from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
 from compensator.blas import one_thread
 from compensator.data.frames import frame_of
-from compensator.data.measurement import DataLike, measurements
+from compensator.data.measurement import DataLike, measurements, runs_in
+from compensator.data.screening import check_deformation_scale, screen_temperatures
 from compensator.display import Table
 from compensator.errors import DataError, UsageError
 from compensator.model.free_run import NOTE, NOTHING, PERSISTENCE, TITLE, free_runs, in_words
@@ -79,7 +83,7 @@ class ComparisonResult(Paged):
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures."""
-        found = {name: dataclasses.asdict(row) for name, row in self.scores.items()}
+        found = {name: _without_nan(dataclasses.asdict(row)) for name, row in self.scores.items()}
         return {"from_h": self.from_h, "samples": self.samples, "scores": found}
 
     def contents(self) -> list[str | Table]:
@@ -137,7 +141,7 @@ class ComparisonResult(Paged):
             note="Above measured and predicted deformation, below measured − predicted.",
         )
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)
-        tone: Any = "good" if best in self._models else "bad"
+        tone: Any = None if best in self._models else "warn"
         return Page(
             title="Comparison of models",
             verdict=self._verdict(),
@@ -154,6 +158,10 @@ class ComparisonResult(Paged):
         curves += [(name, self.t_h, values) for name, values in self.predictions.items()]
         residuals = [(name, self.t_h, values) for name, values in self.residuals.items()]
         return stacked([("Y, µm", curves), ("measured − predicted, µm", residuals)])[0]
+
+
+def _without_nan(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
 
 
 @one_thread
@@ -192,9 +200,15 @@ def compare(
     if len(periods) != 1:
         raise UsageError(f"compare: {len(found)} model(s) of {len(periods)} sample periods, expected models of one")
     measured = measurements(data, "data", columns, needed=True)
+    [period_s] = periods
+    for one in measured:
+        screened, _ = runs_in([one], period_s)
+        screen_temperatures(one.label, screened, quiet_air=True)
+        check_deformation_scale(one.label, np.concatenate([run.y_um for run in screened]))
     runs = free_runs(found, measured, from_h=from_h)
-    if not runs.samples:
-        raise DataError(f"{measured[0].name}: no y_um from {from_h:g} h on, expected measured Y")
+    if runs.samples < 2:
+        where = f"{measured[0].name}: {runs.samples} samples with y_um from {from_h:g} h on"
+        raise DataError(f"{where}, expected at least 2")
     return ComparisonResult(
         scores=runs.scores,
         residuals=runs.residuals,

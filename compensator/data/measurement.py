@@ -241,7 +241,20 @@ def measurements(
         origins = tuple(_origin(path, sha256_of_file(path)) for path in recordings)
         label = recordings[0].name
         found.append(Measurement(table=table, label=label, origins=origins, roles=roles, remarks=left_out))
+    _check_different(found)
     return found
+
+
+def _check_different(measured: Sequence[Measurement]) -> None:
+    """Refuse the same values twice, whatever the files are named: they would count as twice the evidence."""
+    if len(measured) < 2:
+        return
+    seen: dict[str, str] = {}
+    for one in measured:
+        values = hash_of(one.table)
+        if values in seen:
+            raise DataError(f"{one.label}: has the values of {seen[values]}, expected each run once")
+        seen[values] = one.label
 
 
 def check_validation(fitted: Sequence[Measurement], validation: Sequence[Measurement]) -> None:

@@ -38,7 +38,8 @@ def free_run_sentence(found: Mapping[str, Any]) -> str:
         own = scores[EXTENDED]
         worse = ", so it is worse there" if own["rms_um"] > scores[BASE]["rms_um"] else ""
         words += f"; {EXTENDED} {own['rms_um']:.2f} and {own['rms_about_mean_um']:.2f}{worse}"
-    where = f"On {worst['name']}, which took no part in the search: " if held_out else ""
+    several = f" (the worst of {len(held_out)})" if len(held_out) > 1 else ""
+    where = f"On {worst['name']}{several}, which took no part in the search: " if held_out else ""
     text = f"{where}{words}."
     return f"{text[0].upper()}{text[1:]}"
 

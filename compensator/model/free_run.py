@@ -164,6 +164,10 @@ class FreeRunErrors:
         """Return the errors on data; see `free_runs`."""
         runs = free_runs(models, data, from_h=from_h, until_h=until_h)
         labels = ", ".join(dict.fromkeys(one.label for one in data))
+        if from_h:
+            labels += f" from {from_h:g} h on"
+        if until_h < np.inf:
+            labels += f" until {until_h:g} h"
         return cls(name=labels, role=role, samples=runs.samples, scores=runs.scores)
 
     def to_dict(self) -> dict[str, Any]:

@@ -71,7 +71,7 @@ class Page:
         The subject, and the result in one sentence.
     blocks : sequence of Block
         The content, in order.
-    tone : {"good", "warn", "bad"}
+    tone : {"good", "warn", "bad"} or None
         Shown with the verdict as a sign, a word and a colour.
     data : str
         Names of the data that it is made from, for its last line.
@@ -80,7 +80,7 @@ class Page:
     title: str
     verdict: str
     blocks: Sequence[Block] = field(default_factory=tuple)
-    tone: Tone = "good"
+    tone: Tone | None = "good"
     data: str = ""
 
 
@@ -102,11 +102,12 @@ def html_of(page: Page, *, date: str = "", can_zoom: bool = True) -> str:
     body = "".join(_block(block, numbers, 2) for block in page.blocks)
     zooms = can_zoom and " data-plot=" in body
     policy = f"{_POLICY}; script-src {script_hash()}" if zooms else _POLICY
+    tone = f"<b>{TONE_WORDS[page.tone]}</b>" if page.tone else ""
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{style}</style></head><body>'
-        f'<main><h1>{title}</h1><p class="verdict {page.tone}"><b>{TONE_WORDS[page.tone]}</b>'
+        f'<main><h1>{title}</h1><p class="verdict {page.tone or "plain"}">{tone}'
         f"{html.escape(page.verdict)}</p>{body}{_glossary(page.blocks)}{_origin(page, date)}</main>"
         f"{f'<script>{script()}</script>' if zooms else ''}</body></html>"
     )

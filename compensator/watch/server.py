@@ -77,7 +77,9 @@ class PageServer:
     @property
     def address(self) -> str:
         """Address of the page."""
-        host = f"[{self._host}]" if ":" in self._host else self._host
+        # Nobody can open the address of every network; the name of this computer may do.
+        name = socket.gethostname() if self._host in ("0.0.0.0", "::") else self._host
+        host = f"[{name}]" if ":" in name else name
         return f"http://{host}:{self._server.server_port if self._server else self._port}/" + (
             f"{self._token}/" if self._token else ""
         )
@@ -160,7 +162,7 @@ class _Server(ThreadingHTTPServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing about a browser that was closed before it had its answer."""
-        if not isinstance(sys.exception(), ConnectionError):
+        if not isinstance(sys.exception(), (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
 
 
@@ -181,7 +183,10 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._has_own_host():
             # 421: the host name in the request is not that of this server.
             return self._send(HTTPStatus.MISDIRECTED_REQUEST, "text/plain", b"expected this page by its own address\n")
-        parts = urlsplit(self.path)
+        try:
+            parts = urlsplit(self.path)
+        except ValueError:
+            return self._send(HTTPStatus.BAD_REQUEST, "text/plain", b"expected a path\n")
         path = self._below_token(parts.path)
         found = self.server.answer(path, parse_qs(parts.query)) if path is not None else None
         if found is None:

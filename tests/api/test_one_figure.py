@@ -78,7 +78,8 @@ def test_both_models_are_validated_on_what_took_no_part(
         capfd, "diagnose", data, "--model", "quill", "--fit-until", 7, "--validate", other, "--out", tmp_path / "d"
     )
     roles = [(one["name"], one["role"], one["samples"]) for one in found["free_run"]]
-    assert roles == [("effect.csv", "searched", 420), ("effect.csv", "held out", 180), ("run.csv", "held out", 720)]
+    later = "effect.csv from 7 h on"
+    assert roles == [("effect.csv", "searched", 420), (later, "held out", 180), ("run.csv", "held out", 720)]
     assert [list(one["scores"]) for one in found["free_run"]] == [
         ["base model", "extended model", "no compensation", "persistence"],
         ["base model", "extended model", "no compensation", "persistence"],
@@ -113,3 +114,37 @@ def test_compare_names_models_and_writes_curves(
         assert [y - one for one in predictions] == pytest.approx(residuals, abs=1e-6)
     assert main(["compare", str(folder / "run.csv"), "--model", "quill", "--model", "quill"]) == 2
     assert "given 2 times" in capfd.readouterr().err
+
+
+def refused(capfd: pytest.CaptureFixture[str], *words: object) -> str:
+    assert main([*map(str, words)]) == 2
+    return capfd.readouterr().err
+
+
+def test_the_same_values_do_not_count_twice(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Also under another name, and with semicolons."""
+    copy = tmp_path / "copy.csv"
+    copy.write_text((folder / "run.csv").read_text(encoding="utf-8").replace(",", ";"), encoding="utf-8")
+    for words in (
+        ["identify", folder / "run.csv", copy, "--out", tmp_path / "m.toml"],
+        ["compare", copy, copy, "--model", "quill"],
+    ):
+        assert "expected each run once" in refused(capfd, *words)
+
+
+def test_a_wrong_unit_is_no_worse_model(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with (folder / "run.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for column, change, words in (
+        ("y_um", lambda v: v / 1000.0, "millimetres"),
+        ("t_q_degc", lambda v: v + 273.15, "kelvin"),
+    ):
+        table = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        write_table(tmp_path / "wrong.csv", table | {column: change(table[column])})
+        assert words in refused(capfd, "compare", tmp_path / "wrong.csv", "--model", "quill")
+
+
+def test_hours_that_took_no_part_are_named(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["diagnose", folder / "effect.csv", "--model", "quill", "--out", tmp_path / "d", "--fit-until", 7]
+    found = run(capfd, *words)
+    assert [one["name"] for one in found["free_run"] if one["role"] == "held out"] == ["effect.csv from 7 h on"]

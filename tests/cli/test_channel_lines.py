@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from compensator.channel_lines import channel_lines
 from compensator.cli import main
 from compensator.config import load_config
 from compensator.demo.calibration import write_table
@@ -59,3 +60,16 @@ def test_a_diagnosis_prints_the_lines_of_the_channels_it_adds(
     seen = columns[channel["name"]]
     assert channel["range"][0] <= seen.min() and channel["range"][1] >= seen.max()
     assert channel["name"] in (tmp_path / "d" / "report.html").read_text(encoding="utf-8").split("[[channel]]")[1]
+
+
+@pytest.mark.parametrize("seen", [(-1.4e-5, 0.02), (0.3, 0.34), (0.0, 3000.0), (18.0, 24.0), (5.0, 5.0)])
+def test_the_range_proposed_holds_what_was_seen(seen: tuple[float, float]) -> None:
+    [channel] = tomllib.loads(channel_lines(["flow_lpm"], {"flow_lpm": seen}))["channel"]
+    low, high = channel["range"]
+    assert low <= seen[0] and high > seen[1]
+    assert low >= -0.001 or seen[0] >= 0.0
+    assert high - low <= 3.5 * max(seen[1] - seen[0], 0.2)
+
+
+def test_a_name_of_any_form_is_written_as_toml() -> None:
+    assert tomllib.loads(channel_lines(['a"b\\c=1']))["channel"][0]["name"] == 'a"b\\c=1'
