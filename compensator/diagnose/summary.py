@@ -16,7 +16,7 @@ from compensator.diagnose.ceiling import ceiling, explained, falls_short, named_
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect
-from compensator.diagnose.free_run import free_run_sentence, is_contradicted
+from compensator.diagnose.free_run import free_run_sentence
 from compensator.diagnose.outcome import Ceiling, Diagnosis, Remainder
 from compensator.display import Listing, Table, Words, warnings_of, with_std
 from compensator.model.free_run import FreeRunErrors, table_of
@@ -148,22 +148,24 @@ def _scores(scores: Scores) -> dict[str, float | None]:
 
 
 def headline(found: Mapping[str, Any]) -> str:
-    """Return the verdict of a diagnosis and one figure: what a page begins with.
+    """Return what a page begins with: the verdict and the error in free run; where that is not known, on held-out data.
 
     Parameters
     ----------
     found : mapping
         Result of :func:`figures`, or content of `diagnosis.json`.
     """
+    share = f" {explained(found)}" if found["effects"] and falls_short(found) else ""
+    error = free_run_sentence(found)
     if not found["effects"]:
-        return _residual(found)
-    share = f" {explained(found)}" if falls_short(found) else ""
-    contradicted = f" {free_run_sentence(found)}" if is_contradicted(found) else ""
-    it = "it" if len(found["effects"]) == 1 else "them"
-    return (
-        f"{_names(found['effects'])}. {_words(found)} Error on held-out data: {found['before']['rms_um']:.2f} µm rms "
-        f"without {it}, {named_rms(found):.2f} with {it}{_with_remainder(found)}.{share}{contradicted}"
-    )
+        return f"{_residual(found)} {error}".strip()
+    if not error:
+        it = "it" if len(found["effects"]) == 1 else "them"
+        error = (
+            f"Error on held-out data: {found['before']['rms_um']:.2f} µm rms without {it}, {named_rms(found):.2f} with "
+            f"{it}{_with_remainder(found)}."
+        )
+    return f"{_names(found['effects'])}. {_words(found)} {error}{share}"
 
 
 def verdict(found: Mapping[str, Any]) -> str:
@@ -328,7 +330,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     if diagnosis.remainder:
         rows.append(["with the remainder", *diagnosis.after.cells()])
     if diagnosis.ceiling:
-        rows.append(["best linear combination of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
+        rows.append(["best linear use of all channels", f"{diagnosis.ceiling.rms_um:.2f}", "", ""])
     return Table(
         title="Errors on held-out data, zero fitted",
         head=["", *SCORE_HEAD],

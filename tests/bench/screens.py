@@ -71,7 +71,7 @@ def filled(folder: Path, hours: float) -> Shop:
 def main(demo: str = "demo-out", out: str = "") -> None:
     """Make both pictures."""
     folder, conduction = Path(out) if out else TOP / "compensator/report", Path(demo) / "conduction"
-    photograph((conduction / "diagnosis/report.html").resolve().as_uri(), folder / "diagnosis.png", 1000, 790)
+    photograph((conduction / "diagnosis/report.html").resolve().as_uri(), folder / "diagnosis.png", 1000, 830)
     about = {"connected": True, "where": "tcp/127.0.0.1:7447", "prefix": "shop", "ignored": 0}
     shop = filled(conduction / "with-effect" / "recordings", 12.0)
     with PageServer(shop, lambda: about, 0) as server:

@@ -128,7 +128,7 @@ def test_values_that_could_not_show_what_matters_are_no_all_clear():
     assert found["verdict"] == "unexplained"
     assert found["could_hide"]["too_much"]
     assert found["could_hide"]["values_needed"] > found["could_hide"]["values"]
-    assert "do not say whether the model is adequate" in why.summary()
+    assert "too few or too noisy to show whether the model is adequate" in why.summary()
     assert "lacks an effect" not in why.summary()
 
 

@@ -229,7 +229,7 @@ def test_a_folder_with_results_leads_to_its_pages(tmp_path: Path, capsys: pytest
     )
     page = (tmp_path / "all.html").read_text(encoding="utf-8")
     assert re.findall(r'<a href="([^"]*)"', page) == ["demo%20out/report.html", "demo%20out/calibration/report.html"]
-    assert '<p class="verdict warn"><b>⚠ Caution</b>Some of the missing' in page and "not ours" not in page
+    assert '<p class="verdict warn"><b>⚠ Caution</b>Drift. Some of the missing' in page and "not ours" not in page
     assert "Calibration: The &lt;spindle&gt;" in page
 
 
