@@ -37,7 +37,7 @@ def channel_lines(names: Iterable[str], ranges: Mapping[str, tuple[float, float]
             low, high = ranges[name]
             # A speed or a flow that is never negative, its noise aside, stays so.
             span = max(high - low, 1e-9)
-            least = 0.0 if low >= -0.01 * span and not name.endswith("_degc") else low - span
+            least = min(low, 0.0) if low >= -0.01 * span and not name.endswith("_degc") else low - span
             digits = max(1, 1 - math.floor(math.log10(span)))
             step = 10.0**-digits
             ends = [math.floor(max(low - span, least) / step) * step, math.ceil((high + span) / step) * step]
