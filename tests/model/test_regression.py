@@ -444,8 +444,8 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
 
     found: Any = Bare()
     assert figures(found)["remainder"] is None and figures(found)["ceiling"] is None
-    # Without a ceiling no linear use of the channels is better, and that is said; a remainder is not made up.
-    assert "No linear use" in ceiling(figures(found)).text() and remainder(figures(found)) == []
+    # Without a ceiling no linear combination of the channels is better, and that is said; a remainder is not made up.
+    assert "No linear combination" in ceiling(figures(found)).text() and remainder(figures(found)) == []
     assert "remainder" not in verdict(figures(found))
     found.remainder = Remainder(deployed=True, channels=("t1_degc", "base_degc"), rms_before_um=1.4, rms_after_um=0.9)
     found.ceiling = Ceiling(rms_um=0.8, explained_pct=83.0)
@@ -467,9 +467,9 @@ def test_remainder_and_ceiling_are_in_the_file_and_on_the_terminal(monkeypatch: 
     for words in (
         "response of t1_degc, base_degc: a correction that explains nothing.",
         "Deployed in the extended model.",
-        "from 1.40 to 0.90 µm",
-        "leaves 0.80 µm rms",
-        "the base model 2.00",
+        "1.40 µm rms without it, 0.90 with it",
+        "the error on held-out data is 0.80 µm rms",
+        "with the base model 2.00",
     ):
         assert words in printed
     assert "2.00 µm rms, 2.00 with the remainder" in verdict(in_file)
