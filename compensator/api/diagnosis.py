@@ -29,6 +29,7 @@ from compensator.diagnose.outcome import Diagnosis
 from compensator.diagnose.series import series_of
 from compensator.diagnose.summary import contents, figures
 from compensator.display import Listing, Table, Words
+from compensator.errors import UsageError
 from compensator.model.free_run import FreeRunErrors
 from compensator.model.model_writer import write_model
 from compensator.model.simulation import csv_rows, require_channels
@@ -179,6 +180,9 @@ def diagnose(
     whole = measurements(data, "data", columns, needed=True)
     validation = measurements(validate, "validate", columns)
     check_validation(whole, validation)
+    longest = max(one.hours for one in whole)
+    if fit_until_h is not None and fit_until_h >= longest:
+        raise UsageError(f"fit until {fit_until_h:g} h: the data end after {longest:.3g} h, expected an earlier hour")
     measured = whole if fit_until_h is None else [one.before(fit_until_h) for one in whole]
     runs, remarks = runs_in(measured, base.period_s, y_std_um=y_std_um, check=partial(require_channels, base))
     name = ", ".join(dict.fromkeys(run.name for run in runs))

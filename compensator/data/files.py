@@ -88,7 +88,9 @@ def _lines(path: Path, text: str, roles: Mapping[str, str]) -> tuple[list[list[s
         lines, first, separators = lines[1:], 3, excel[1]
     else:
         separators = ",;\t"
-    separator = next((one for one in separators if time_names(roles) & _names(lines[:1], one)), ",")
+    # Without a time in the header, which is refused by name later, the separator is that of most names.
+    most = max(separators, key=lambda one: len(_names(lines[:1], one)))
+    separator = next((one for one in separators if time_names(roles) & _names(lines[:1], one)), most)
     try:
         return list(csv.reader(lines, delimiter=separator)), first, separator
     except csv.Error as error:

@@ -80,6 +80,7 @@ def _headline(
     if shown in (WatchWarning.SILENT, WatchWarning.UNKNOWN, State.FAULT, State.STARTING):
         return Headline("no", "Do not cut to size", " ".join(_words([*reasons[:1], shown])))
     lost = _lost(channels, reasons)
+    doubts = [reason for reason in reasons if reason.partition(":")[0] in _DOUBTS]
     if shown == State.HOLD:
         why = lost or _words([reason for reason in reasons if reason != Reason.PREDICTING][-1:])
         frozen = [] if Reason.OPERATOR_HOLD in reasons else ["The offset is frozen."]
@@ -89,8 +90,8 @@ def _headline(
             return Headline("care", "Cut with care", " ".join([*lost, "Predicted for a limited time, then held."]))
         minutes = max(until_ns - now_ns, 0) / 60e9
         held = f"Predicted for another {minutes:.0f} min, then held."
-        parts = [*lost[:1], held, *lost[1:]]
-        may = "Cut with care" if any(reason.partition(":")[0] in _DOUBTS for reason in reasons) else "May cut"
+        parts = [*lost[:1], held, *lost[1:], *_words(doubts[:1])[:1]]
+        may = "Cut with care" if doubts else "May cut"
         return Headline("until", f"{may} until {here(until_ns):%H:%M}", " ".join(parts))
     suspects = [reason.partition(":")[2] for reason in reasons if reason.startswith(f"{Reason.IMPLAUSIBLE}:")]
     if len(suspects) > 1:
@@ -99,7 +100,6 @@ def _headline(
         causes = " or ".join(filter(None, (lacks, others)))
         text = f"Measured and predicted Y diverge; not known yet whether {causes}."
         return Headline("care", "Cut with care", f"{text} Measure the part; check a sensor when it is named alone.")
-    doubts = [reason for reason in reasons if reason.partition(":")[0] in _DOUBTS]
     if doubts:
         return Headline("care", "Cut with care", " ".join(_words(doubts[:1])))
     if reasons:

@@ -148,3 +148,8 @@ def test_hours_that_took_no_part_are_named(folder: Path, tmp_path: Path, capfd: 
     words = ["diagnose", folder / "effect.csv", "--model", "quill", "--out", tmp_path / "d", "--fit-until", 7]
     found = run(capfd, *words)
     assert [one["name"] for one in found["free_run"] if one["role"] == "held out"] == ["effect.csv from 7 h on"]
+
+
+def test_data_that_end_before_validate_nothing(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["diagnose", folder / "effect.csv", "--model", "quill", "--out", tmp_path / "d", "--fit-until", 10]
+    assert "the data end after" in refused(capfd, *words)

@@ -143,3 +143,10 @@ def test_a_diagnosis_keeps_its_curves(run: Path, tmp_path: Path) -> None:
     assert rms == pytest.approx(diagnosis["before"]["rms_um"], rel=1e-6)
     assert {f"effect_{i}_um" for i in range(1, len(diagnosis["effects"]) + 1)} <= set(series.columns)
     assert {"run", "t_s", "y_um", "residual_before_um", "residual_after_um", "held_out_after_um"} <= set(series.columns)
+
+
+def test_a_spreadsheet_without_a_time_is_told_its_names(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Whatever the separator is: decimal commas must not be taken for it."""
+    (tmp_path / "de.csv").write_text("Zeit [h];T_Q;AT\n0,0;20,1;20,0\n0,1;20,2;20,0\n", encoding="utf-8")
+    assert main(["compare", str(tmp_path / "de.csv"), "--model", "quill"]) == 2
+    assert "the header has: Zeit [h], T_Q, AT" in capfd.readouterr().err

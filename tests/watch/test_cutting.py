@@ -57,6 +57,9 @@ def test_each_state_says_whether_one_may_cut(shown: str, reasons: tuple[str, ...
 def test_a_doubt_in_the_model_beside_a_lost_couple_asks_for_care() -> None:
     found = of("degraded", "t_q_missing", "implausible:model", "predicting", until_min=29.0, t_q_degc="open_circuit")
     assert found.cut == "until" and found.word.startswith("Cut with care until ")
+    # The doubt has its words beside the wire that is open.
+    meaning, _ = explain("implausible:model") or ("", "")
+    assert "T_Q: wire open." in found.text and meaning and found.text.endswith(meaning)
 
 
 def test_the_standard_deviation_stands_beside_what_may_be_cut() -> None:
