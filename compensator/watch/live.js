@@ -168,7 +168,7 @@ function fill(table, rows) {
 function faulty(machine) {
   const channels = Object.entries(machine.channels).filter(([, one]) => one.quality !== "good").map(([name, one]) =>
     [`${name}: `, wordLink(one.quality), `: ${one.means} `, make("b", {}, "Action: "), one.do]);
-  const devices = Object.entries(machine.devices ?? {}).filter(([, error]) => error !== "ok").map(([name, error]) => [`${name}: ${error}`]);
+  const devices = Object.entries(machine.devices ?? {}).filter(([, error]) => error !== "ok").map(([name, error]) => [error.startsWith(`${name}: `) ? error : `${name}: ${error}`]);
   list("faulty", [...channels, ...devices], "warning");
 }
 

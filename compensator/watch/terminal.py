@@ -274,7 +274,12 @@ def _lists(machine: dict[str, Any], past: list[str], now: datetime) -> list[tupl
     channels = [
         _channel(name, one) for name, one in machine["channels"].items() if one["quality"] != SampleQuality.GOOD
     ]
-    devices = [f"{name}: {error}" for name, error in (machine["devices"] or {}).items() if error != "ok"]
+    # A driver's error begins with the name of its device.
+    devices = [
+        f"{name}: {error.removeprefix(f'{name}: ')}"
+        for name, error in (machine["devices"] or {}).items()
+        if error != "ok"
+    ]
     events = [
         f"{here(event['time_utc_ns']):%m-%d %H:%M:%S} {event['kind']}: {event['text']}"
         + (f" → {event['do']}" if event["do"] else "")
