@@ -18,7 +18,7 @@ from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
 from compensator.blas import one_thread
 from compensator.data.frames import frame_of
-from compensator.data.measurement import DataLike, measurements, runs_in
+from compensator.data.measurement import DataLike, check_each_once, measurements, runs_in
 from compensator.data.screening import check_deformation_scale, screen_temperatures
 from compensator.display import Table
 from compensator.errors import DataError, UsageError
@@ -200,6 +200,7 @@ def compare(
     if len(periods) != 1:
         raise UsageError(f"compare: {len(found)} model(s) of {len(periods)} sample periods, expected models of one")
     measured = measurements(data, "data", columns, needed=True)
+    check_each_once(measured)
     [period_s] = periods
     for one in measured:
         screened, _ = runs_in([one], period_s)
@@ -207,8 +208,8 @@ def compare(
         check_deformation_scale(one.label, np.concatenate([run.y_um for run in screened]))
     runs = free_runs(found, measured, from_h=from_h)
     if runs.samples < 2:
-        where = f"{measured[0].name}: {runs.samples} samples with y_um from {from_h:g} h on"
-        raise DataError(f"{where}, expected at least 2")
+        count = "only one" if runs.samples else "no"
+        raise DataError(f"{measured[0].name}: {count} y_um from {from_h:g} h on, expected measured Y")
     return ComparisonResult(
         scores=runs.scores,
         residuals=runs.residuals,

@@ -20,7 +20,7 @@ from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write, require_folder
 from compensator.blas import in_one_thread, one_thread
 from compensator.codes import DataRemark, Remark
-from compensator.data.measurement import DataLike, Measurement, check_validation, measurements, runs_in
+from compensator.data.measurement import DataLike, Measurement, check_each_once, check_validation, measurements, runs_in
 from compensator.data.screening import check_deformation_scale, require_y_noise, screen_temperatures
 from compensator.diagnose.diagnosis import diagnose as find_effects
 from compensator.diagnose.found_effect import FoundEffect
@@ -179,6 +179,7 @@ def diagnose(
     base = model_of(model)
     whole = measurements(data, "data", columns, needed=True)
     validation = measurements(validate, "validate", columns)
+    check_each_once(whole)
     check_validation(whole, validation)
     longest = max(one.hours for one in whole)
     if fit_until_h is not None and fit_until_h >= longest:

@@ -11,7 +11,15 @@ from compensator import __version__
 from compensator.api.files import ModelLike, as_in_file, model_of
 from compensator.api.identification_result import IdentificationResult
 from compensator.blas import one_thread
-from compensator.data.measurement import PERIOD_S, DataLike, Measurement, check_validation, measurements, runs_in
+from compensator.data.measurement import (
+    PERIOD_S,
+    DataLike,
+    Measurement,
+    check_each_once,
+    check_validation,
+    measurements,
+    runs_in,
+)
 from compensator.data.screening import require_y_noise, screen_temperatures
 from compensator.errors import UsageError
 from compensator.identify.calibration import calibrate
@@ -111,6 +119,8 @@ def identify(
         role: measurements(given, name, columns, needed=role == "fit")
         for role, name, given in (("fit", "data", data), ("etve", "etve", etve), ("validation", "validate", validate))
     }
+    for several in sources.values():
+        check_each_once(several)
     check_validation([*sources["fit"], *sources["etve"]], sources["validation"])
     remarks: list[str] = []
     runs = {}

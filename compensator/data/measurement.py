@@ -241,12 +241,17 @@ def measurements(
         origins = tuple(_origin(path, sha256_of_file(path)) for path in recordings)
         label = recordings[0].name
         found.append(Measurement(table=table, label=label, origins=origins, roles=roles, remarks=left_out))
-    _check_different(found)
     return found
 
 
-def _check_different(measured: Sequence[Measurement]) -> None:
-    """Refuse the same values twice, whatever the files are named: they would count as twice the evidence."""
+def check_each_once(measured: Sequence[Measurement]) -> None:
+    """Refuse the same values twice, whatever the files are named: they would count as twice the evidence.
+
+    Raises
+    ------
+    DataError
+        Naming the second.
+    """
     if len(measured) < 2:
         return
     seen: dict[str, str] = {}
