@@ -16,7 +16,8 @@ import numpy as np
 
 from compensator.arrays import Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, raw_columns, response, summed
+from compensator.diagnose.fit import Fit, Term, response, summed
+from compensator.diagnose.points import raw_columns
 from compensator.model.effects.hypothesis import Hypothesis
 
 #: What an effect must add to the logarithm of the evidence, beyond the number of places tried.

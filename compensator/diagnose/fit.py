@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.likelihood import Likelihood, learned_rest
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, Rest, raw_columns
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis, Place
 
@@ -140,11 +140,6 @@ def as_deployed(fit: Fit) -> tuple[tuple[Term, ...], list[Vector]]:
     others = iter(fit_terms(Likelihood(Points(corrected), fit.rest), starts).terms)
     terms = tuple(late if term is late else next(others) for term in fit.terms)
     return terms, [added if term is late else response(corrected, term) for term in terms]
-
-
-def raw_columns(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> Matrix:
-    """Return the columns of a hypothesis on every sample."""
-    return np.concatenate([hypothesis.columns(record, values) for record in evidence.signals])
 
 
 @dataclass(frozen=True, slots=True)

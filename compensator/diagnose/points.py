@@ -174,8 +174,7 @@ class Points:
         """Return the averaged columns of a hypothesis; one fit after another asks for the same."""
         known = self._known.get((hypothesis, values))
         if known is None:
-            raw = np.concatenate([hypothesis.columns(record, values) for record in self.evidence.signals])
-            known = self.averaged(raw)
+            known = self.averaged(raw_columns(self.evidence, hypothesis, values))
             if len(self._known) >= MOST_KNOWN:
                 self._known.clear()
             self._known[hypothesis, values] = known
@@ -265,6 +264,11 @@ class Points:
         _, sizes, directions = np.linalg.svd(table - table.mean(axis=0), full_matrices=False)
         kept = sizes > DISTINCT * sizes[0]
         return np.asarray(table @ directions[kept].T / sizes[kept] * math.sqrt(self.count / kept.sum()))
+
+
+def raw_columns(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> Matrix:
+    """Return the columns of a hypothesis on every sample."""
+    return np.concatenate([hypothesis.columns(record, values) for record in evidence.signals])
 
 
 def _edges(evidence: Evidence, stride: int) -> list[Indices]:

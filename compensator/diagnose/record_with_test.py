@@ -18,9 +18,9 @@ from scipy.linalg import block_diag
 
 from compensator.arrays import Indices, Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.fit import Fit, Term, raw_columns
+from compensator.diagnose.fit import Fit, Term
 from compensator.diagnose.nuisances import nuisances_of
-from compensator.diagnose.points import Points, Rest
+from compensator.diagnose.points import Points, Rest, raw_columns
 from compensator.diagnose.trials import Trial
 from compensator.diagnose.whitening import Whitening
 
