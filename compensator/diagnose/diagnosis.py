@@ -27,7 +27,7 @@ from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
 from compensator.diagnose.search import Candidate
-from compensator.diagnose.standard_errors import standard_errors, time_words, with_time_errors
+from compensator.diagnose.standard_errors import standard_errors, std_factors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials
 from compensator.model.effects import Effect
 from compensator.model.late_observer import late_variance_um2
@@ -219,7 +219,7 @@ def _extended(
 ) -> tuple[ThermalModel, tuple[Remark, ...]]:
     """Return the model with every effect that can be deployed and the remainder; the model itself without any."""
     evidence = found.search.evidence
-    deployed: list[Effect] = [effect.effect for effect in effects if effect.deployable]
+    deployed = _with_factors(model, found, [effect for effect in effects if effect.deployable])
     remarks: tuple[Remark, ...] = ()
     base, remainder = model, found.remainder.effect if found.remainder else None
     if found.refitted:
@@ -234,6 +234,24 @@ def _extended(
     return dataclasses.replace(base, effects=(*model.effects, *deployed), sha256=""), remarks
 
 
+def _with_factors(model: ThermalModel, found: Findings, effects: Sequence[FoundEffect]) -> list[Effect]:
+    """Return effects with what the data leave open of all their parameters together.
+
+    Where the base's paths were fitted anew with them, none is stated: what the paths make up for is not known apart.
+    """
+    if found.refitted or not effects:
+        return [effect.effect for effect in effects]
+    rows = dict(zip(map(id, found.terms), std_factors(found.selection.fit, found.terms), strict=True))
+    # Rows belong together by their place: those of effects that the model has already come first.
+    before = max((len(one.std_factor) for one in model.effects if not one.has_variance), default=0)
+    return [
+        effect.effect
+        if effect.effect.lateness
+        else dataclasses.replace(effect.effect, std_factor=((),) * before + rows[id(effect.term)])
+        for effect in effects
+    ]
+
+
 def _with_deviation(
     extended: ThermalModel, model: ThermalModel, found: Findings, effects: Sequence[FoundEffect], held_out: HeldOut
 ) -> ThermalModel:
@@ -246,8 +264,10 @@ def _with_deviation(
     of_machine = [effect for effect in effects if effect.effect.deployable or not effect.effect.observed]
     kept_out = [effect.signal[evidence.used] for effect in of_machine if not (deploys and effect.effect.deployable)]
     left = found.rest_um**2 + (rms_of(np.sum(kept_out, axis=0)) ** 2 if kept_out else 0.0)
-    if deploys and not kept_out and len(of_machine) == len(effects) and not evidence.is_sparse:
-        # Half what the fit expects, half what held-out blocks show: the one is too small, the other has few blocks.
+    has_response = found.remainder is not None or found.refitted is not None
+    if deploys and has_response and not kept_out and len(of_machine) == len(effects) and not evidence.is_sparse:
+        # Responses without a name: half what the fit expects, half what held-out blocks show. The one is too small, the
+        # other has few blocks. Named effects state by themselves what the data leave open of them.
         shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
         left = 0.5 * (left + shown)
     # The engine states by itself what it cannot know of a late T_Q.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from compensator.diagnose.likelihood import Likelihood
 
 #: The parameter that is a time.
 AT = "at_min"
+#: Directions of less than this share of the variance of y in the record are not stated.
+UNSTATED = 0.001
 
 
 def standard_errors(fit: Fit) -> list[dict[str, float]]:
@@ -28,9 +30,9 @@ def standard_errors(fit: Fit) -> list[dict[str, float]]:
     exact = Likelihood(points, fit.rest.without_own_error()) if points.is_exact else fit.likelihood
 
     def named(values: Vector) -> Vector:
-        return np.array([v for term in _moved(fit, values) for v in term.named.values()])
+        return np.array([v for term in _moved(fit.terms, values) for v in term.named.values()])
 
-    spread = _slopes(named, _values(fit)) @ _root(fit, exact)
+    spread = _slopes(named, _values(fit.terms)) @ _root(fit, exact)
     errors = iter(np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread), 0.0)).tolist())
     return [dict(zip(term.named, errors, strict=False)) for term in fit.terms]
 
@@ -46,34 +48,81 @@ def deviations(fit: Fit) -> list[tuple[float, float]]:
     for i in range(len(fit.terms)):
 
         def added(values: Vector, i: int = i) -> Vector:
-            columns = response(points.evidence, _moved(fit, values)[i])
+            columns = response(points.evidence, _moved(fit.terms, values)[i])
             return points.averaged(columns[:, None])[:, 0]
 
-        spread = _slopes(added, _values(fit)) @ root
-        found.append((float(np.std(added(_values(fit)))), float(np.sqrt(np.sum(np.var(spread, axis=0))))))
+        spread = _slopes(added, _values(fit.terms)) @ root
+        found.append((float(np.std(added(_values(fit.terms)))), float(np.sqrt(np.sum(np.var(spread, axis=0))))))
     return found
 
 
-def _root(fit: Fit, likelihood: Likelihood) -> Matrix:
-    """Return a root of the covariance of all parameters: searched ones and amplitudes of each effect in turn."""
+def std_factors(fit: Fit, terms: Sequence[Term]) -> list[tuple[tuple[float, ...], ...]]:
+    """Return the rows of `Effect.std_factor` of each effect: how all of them may differ together.
+
+    The directions are those that move y most in this record, so that few rows say nearly all.
+
+    Parameters
+    ----------
+    fit : Fit
+        What the data say of all parameters.
+    terms : sequence of Term
+        Its effects as the engine runs them, where that refitted them.
+    """
+    if not terms:
+        return []
+    points, values = fit.likelihood.points, _values(fit.terms)
+    free = [one for term in fit.terms for one in (*term.hypothesis.free, *[None] * len(term.amplitudes))]
+
+    def added(values: Vector) -> Vector:
+        return points.averaged(summed(points.evidence, _moved(fit.terms, values))[:, None])[:, 0]
+
+    slopes = _slopes(added, values)
+    # What the data leave wholly open is known as well as before them.
+    spread, moves = points.evidence.spread_um, np.std(slopes, axis=0)
+    prior = [
+        spread / move if one is None else (one.high - one.low) * math.sqrt(1.0 / 12.0)
+        for one, move in zip(free, np.maximum(moves, 1e-9 * spread).tolist(), strict=True)
+    ]
+    root = _root(fit, fit.likelihood, np.array(prior))
+    _, sizes, directions = np.linalg.svd(slopes @ root, full_matrices=False)
+    count = int(np.searchsorted(np.cumsum(sizes**2), (1.0 - UNSTATED) * float(sizes @ sizes))) + 1
+    deployed = _values(terms)
+    rows: list[list[tuple[float, ...]]] = [[] for _ in terms]
+    for step in (root @ directions[:count].T).T:
+        inside = [
+            v if one is None else min(max(v, one.low), one.high)
+            for one, v in zip(free, (deployed + step).tolist(), strict=True)
+        ]
+        for found, term, moved in zip(rows, terms, _moved(terms, np.array(inside)), strict=True):
+            found.append(tuple(b - a for a, b in zip(term.effect.parameters, moved.effect.parameters, strict=True)))
+    return [tuple(found) for found in rows]
+
+
+def _root(fit: Fit, likelihood: Likelihood, prior: Vector | None = None) -> Matrix:
+    """Return a root of the covariance of all parameters: searched ones and amplitudes of each effect in turn.
+
+    With the standard deviation that each had before the data, where it is given.
+    """
 
     def predicted(values: Vector) -> Vector:
-        total = summed(likelihood.points.evidence, _moved(fit, values))
+        total = summed(likelihood.points.evidence, _moved(fit.terms, values))
         return likelihood.projected(likelihood.points.averaged(total[:, None]))[:, 0]
 
-    jacobian = _slopes(predicted, _values(fit))
+    jacobian = _slopes(predicted, _values(fit.terms))
+    if prior is not None:
+        jacobian = np.concatenate([jacobian, np.diag(1.0 / prior)])
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
     _, s, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
     return np.asarray(vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None])
 
 
-def _values(fit: Fit) -> Vector:
-    return np.array([v for term in fit.terms for v in (*term.values, *term.amplitudes)])
+def _values(terms: Sequence[Term]) -> Vector:
+    return np.array([v for term in terms for v in (*term.values, *term.amplitudes)])
 
 
-def _moved(fit: Fit, values: Vector) -> list[Term]:
-    """Return the terms of a fit with other values of all parameters."""
+def _moved(terms: Sequence[Term], values: Vector) -> list[Term]:
+    """Return terms with other values of all parameters."""
     one = iter(values.tolist())
     return [
         dataclasses.replace(
@@ -81,7 +130,7 @@ def _moved(fit: Fit, values: Vector) -> list[Term]:
             values=tuple(itertools.islice(one, len(term.values))),
             amplitudes=tuple(itertools.islice(one, len(term.amplitudes))),
         )
-        for term in fit.terms
+        for term in terms
     ]
 
 

@@ -9,6 +9,7 @@ ends a gap: it returns to the last complete sample and repeats the missing ones 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -436,6 +437,9 @@ class Engine:
         variance = observer.y_variance_um2 + self.model.y_std_um**2
         for effect in self._uncertain:
             variance += effect.variance_um2()
+        # What the effects of one direction leave open together; fsum rounds once, so the bits are the same everywhere.
+        for changes in itertools.zip_longest(*(effect.deviations_um for effect in self._effects), fillvalue=0.0):
+            variance += math.fsum(changes) ** 2
         heat = self.model.kind == "heat"
         return Estimate(
             heat_w=observer.drive if heat else NAN,

@@ -71,14 +71,17 @@ class TomlTable:
             raise ModelError(f"{self.where}: {key} = {shown(values)}, expected {expected}")
         return tuple(float(v) for v in values)
 
-    def rows(self, key: str, *, needed: bool = True) -> tuple[tuple[float, ...], ...]:
-        """Return a list of lists of finite numbers; empty where it is left out and not needed."""
+    def rows(self, key: str, *, needed: bool = True, empty: bool = False) -> tuple[tuple[float, ...], ...]:
+        """Return a list of lists of finite numbers; empty where it is left out and not needed.
+
+        With `empty`, lists without a number may be among them.
+        """
         values: Any = self._bounded(key)
         if values is None and not needed:
             return ()
         if not isinstance(values, list) or not values or not all(isinstance(row, list) for row in values):
             raise ModelError(f"{self.where}: {key} = {shown(values)}, expected a list of lists of numbers")
-        return tuple(TomlTable(self.where, {key: row}).numbers(key) for row in values)
+        return tuple(() if empty and not row else TomlTable(self.where, {key: row}).numbers(key) for row in values)
 
     def texts(self, key: str) -> tuple[str, ...]:
         """Return a list of strings."""

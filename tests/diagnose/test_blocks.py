@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensator.model.effects.base import EffectStream, effect_from, filters, forms
+from compensator.model.effects.base import effect_from, filters, forms
+from compensator.model.effects.stream import EffectStream
 from compensator.model.effects.blocks import (
     ChangeSeen,
     Delay,

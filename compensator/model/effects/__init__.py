@@ -6,7 +6,8 @@ so a new kind is a new file and nothing else.
 
 from __future__ import annotations
 
-from compensator.model.effects.base import Effect, EffectStream, effect_from, kinds, register
+from compensator.model.effects.base import Effect, effect_from, kinds, register
 from compensator.model.effects.signals import Signals
+from compensator.model.effects.stream import EffectStream
 
 __all__ = ["Effect", "EffectStream", "Signals", "effect_from", "kinds", "register"]

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, TypeVar, dataclass_transform
 import numpy as np
 
 from compensator.arrays import NAN, Matrix, Vector
+from compensator.errors import ModelError
 from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.lateness import Lateness
 from compensator.model.effects.seen import Seen
@@ -29,7 +30,7 @@ MODES = 64
 #: `step` or `filter` of a block.
 Run = Callable[..., S]
 #: Keys that a diagnosis gives every effect in the model file.
-_FOUND = ("std", "explanation")
+_FOUND = ("std", "std_factor", "explanation")
 
 
 def number(low: float = -math.inf, high: float = math.inf) -> Any:
@@ -82,6 +83,10 @@ class Effect:
         by `number`, `numbers` and `text`.
     std : mapping of str to float
         Standard error of each parameter, where a diagnosis found it.
+    std_factor : tuple of tuple of float
+        Rows F_r with the covariance of the numeric parameters Σ_r F_r' F_r: one number for each of them, in the order
+        of the model file, or none in a row of another effect. Rows of one place in several effects belong together.
+        Empty: no variance is stated.
     explanation : str
         For an engineer; empty where no diagnosis found it.
     """
@@ -115,6 +120,7 @@ class Effect:
     path: str = ""
     channel: str = ""
     std: Mapping[str, Any] = dataclasses.field(default_factory=dict, hash=False)
+    std_factor: tuple[tuple[float, ...], ...] = ()
     explanation: str = ""
 
     @property
@@ -185,6 +191,30 @@ class Effect:
         """By how much T_Q is late: not added to y, but corrected in the estimate of the heat."""
         return None
 
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """Every numeric parameter, in the order of the model file."""
+        return tuple(number for f in _read(type(self)) for number in _numbers(getattr(self, f.name)))
+
+    def moved(self, row: Sequence[float]) -> Effect:
+        """Return the effect with a row of `std_factor` added to its parameters.
+
+        Raises
+        ------
+        ValueError
+            If it is not as many numbers as there are parameters.
+        """
+        count = len(self.parameters)
+        if len(row) != count:
+            raise ValueError(f"{len(row)} numbers, expected {count}, one for each parameter")
+        steps, values = iter(row), dict[str, Any]()
+        for f in _read(type(self)):
+            value = getattr(self, f.name)
+            numbers = tuple(number + next(steps) for number in _numbers(value))
+            if numbers:
+                values[f.name] = numbers if isinstance(value, tuple) else numbers[0]
+        return dataclasses.replace(self, **values, std_factor=())
+
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the parameters that people read, from all that are searched or linear."""
         return given
@@ -215,6 +245,13 @@ def label_of(table: Mapping[str, Any]) -> str:
     return " ".join([*parts, *([f"of {len(several)} channels"] if several else [])])
 
 
+def _numbers(value: Any) -> tuple[float, ...]:
+    """Return the numbers of a parameter: itself, those of a list, or none of a name."""
+    if isinstance(value, tuple):
+        return tuple(one for one in value if isinstance(one, float))
+    return (value,) if isinstance(value, float) else ()
+
+
 def _as_list(value: Any) -> Any:
     return [_as_list(item) for item in value] if isinstance(value, tuple) else value
 
@@ -242,55 +279,6 @@ class BankEffect:
 def filters(blocks: Sequence[Block]) -> list[Run[Vector]]:
     """Return what blocks do with a whole record."""
     return [block.filter for block in blocks]
-
-
-class EffectStream:
-    """An effect at work, one sample at a time.
-
-    Parameters
-    ----------
-    effect : Effect
-        Parameters and law.
-    period_min : float
-        Sample period, min.
-    """
-
-    def __init__(self, effect: Effect, period_min: float) -> None:
-        self.effect, self.kind, self.channels = effect, effect.kind, effect.measured
-        self._awaited = () if effect.acts_in_part else self.channels
-        self._blocks: tuple[Block, ...] = effect.blocks(period_min)
-        self._steps = [block.step for block in self._blocks]
-
-    def step(self, signals: Signals[float]) -> float:
-        """Advance by one sample and return the addition to y, µm; 0 until each of its channels has had a value."""
-        for channel in self._awaited:
-            if math.isnan(signals.channels.get(channel, NAN)):
-                return 0.0
-        return float(self.effect.law(signals, self._steps))
-
-    def peek(self, signals: Signals[float]) -> float:
-        """Return what `step` would, without a change of state."""
-        states = [block.state for block in self._blocks]
-        y = self.step(signals)
-        for block, state in zip(self._blocks, states, strict=True):
-            block.state = state
-        return y
-
-    def variance_um2(self) -> float:
-        """Return the variance that the effect states for its last addition, µm²."""
-        return self.effect.variance_um2(self._blocks)
-
-    def snapshot(self) -> tuple[float, ...]:
-        """Return everything that it must remember to continue with the same bits."""
-        return tuple(value for block in self._blocks for value in block.state)
-
-    def restore(self, state: tuple[float, ...]) -> None:
-        """Continue from a snapshot."""
-        start = 0
-        for block in self._blocks:
-            end = start + len(block.state)
-            block.state = tuple(state[start:end])
-            start = end
 
 
 # ---------------------------------------------------------------------- registration
@@ -347,8 +335,26 @@ def effect_from(kind: str, table: Mapping[str, Any]) -> Effect:
     plain = [form for form in candidates if not _choices(form)]
     named = not plain or (choices and "form" in table)
     form = choices[keys.text("form", tuple(choices))] if named else plain[0]
-    found = {key: table[key] for key in _FOUND if key in table}
-    return form(**{f.name: f.metadata["read"](keys, f.name) for f in _read(form)}, **found)
+    read = {f.name: f.metadata["read"](keys, f.name) for f in _read(form)}
+    found = {key: table[key] for key in _FOUND if key in table and key not in read}
+    if "std_factor" in found:
+        found["std_factor"] = keys.rows("std_factor", empty=True)
+    effect = form(**read, **found)
+    if not effect.has_variance:
+        _check_moved(effect)
+    return effect
+
+
+def _check_moved(effect: Effect) -> None:
+    """Refuse rows of `std_factor` that lead out of what the parameters may be."""
+    if len(effect.std_factor) > MODES:
+        raise ModelError(f"effect {effect.kind}: std_factor of {len(effect.std_factor)} rows, expected at most {MODES}")
+    for number, row in enumerate(effect.std_factor, start=1):
+        if row:
+            try:
+                effect_from(effect.kind, dataclasses.replace(effect.moved(row), std={}, explanation="").to_table())
+            except (ModelError, ValueError) as error:
+                raise ModelError(f"effect {effect.kind}: std_factor, row {number}: {error}") from error
 
 
 def _read(form: type[Effect]) -> list[dataclasses.Field[Any]]:
