@@ -264,10 +264,10 @@ def _with_deviation(
     of_machine = [effect for effect in effects if effect.effect.deployable or not effect.effect.observed]
     kept_out = [effect.signal[evidence.used] for effect in of_machine if not (deploys and effect.effect.deployable)]
     left = found.rest_um**2 + (rms_of(np.sum(kept_out, axis=0)) ** 2 if kept_out else 0.0)
-    has_response = found.remainder is not None or found.refitted is not None
-    if deploys and has_response and not kept_out and len(of_machine) == len(effects) and not evidence.is_sparse:
-        # Responses without a name: half what the fit expects, half what held-out blocks show. The one is too small, the
-        # other has few blocks. Named effects state by themselves what the data leave open of them.
+    is_approximate = found.refitted is not None or not found.search.points.is_exact
+    if deploys and is_approximate and not kept_out and len(of_machine) == len(effects) and not evidence.is_sparse:
+        # No effect has exactly this form: half what the fit expects, half what held-out blocks show. The one is too
+        # small, the other has few blocks. What is open of the parameters the effects state by themselves.
         shown = max(rms_of(held_out.whole) ** 2 - evidence.noise.noise_um**2, 0.0)
         left = 0.5 * (left + shown)
     # The engine states by itself what it cannot know of a late T_Q.

@@ -229,7 +229,7 @@ class Effect:
         """Return its `[[effect]]` table, without the kind."""
         table = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if "read" in f.metadata}
         found = {key: _as_list(value) for key, value in table.items()}
-        return found | {key: value for key in _FOUND if (value := getattr(self, key))}
+        return found | {key: _as_list(value) for key in _FOUND if (value := getattr(self, key))}
 
 
 def label_of(table: Mapping[str, Any]) -> str:
