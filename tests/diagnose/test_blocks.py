@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compensator.model.effects.base import effect_from, filters, forms
-from compensator.model.effects.stream import EffectStream
 from compensator.model.effects.blocks import (
     ChangeSeen,
     Delay,
@@ -21,6 +20,7 @@ from compensator.model.effects.blocks import (
     lag_or_none,
 )
 from compensator.model.effects.signals import RecordSignals, Signals
+from compensator.model.effects.stream import EffectStream
 from compensator.model.transfer_function import SampledTransferFunction
 
 FUNCTION = SampledTransferFunction(b=(0.2, 0.1), a=(1.0, -0.7), period_s=60.0)

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
-from compensator.arrays import NAN, Matrix, Vector
+from compensator.arrays import Matrix, Vector
 from compensator.errors import ModelError
 from compensator.model.effects.blocks import Block, FilterBank, S
 from compensator.model.effects.lateness import Lateness
