@@ -209,6 +209,10 @@ class _Parser(argparse.ArgumentParser):
         wrong = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
         if wrong is not None and (near := _did_you_mean(wrong[1], re.findall(r"[^', ]+", wrong[2]))):
             message = f"{message[: wrong.start()]}{wrong[1]!r} is unknown{near}"
+        missing = re.search(r"arguments are required: (.*)", message)
+        for action in self._actions if missing else ():
+            if action.choices is not None and action.dest in message.replace(",", "").split():
+                message = message.replace(action.dest, f"{action.dest} (one of {', '.join(map(str, action.choices))})")
         options = [name for action in self._actions for name in action.option_strings]
         for word in self._words:
             name = word.partition("=")[0]

@@ -138,6 +138,11 @@ def _json(found: Any) -> tuple[str, bytes]:
     return "application/json", json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
 
 
+def _prose(text: str) -> str:
+    """Return a text as HTML; a command between backticks is code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+
+
 @cache
 def page() -> tuple[bytes, str]:
     """Return the page and its content security policy, which permits its style and script by their hashes."""
@@ -146,10 +151,9 @@ def page() -> tuple[bytes, str]:
         return resources.files(room).joinpath(name).read_text(encoding="utf-8")
 
     style = part("compensator.report", "style.css") + part("compensator.watch", "live.css")
-    script = part("compensator.watch", "live.js")
+    script = part("compensator.watch", "live_plots.js") + part("compensator.watch", "live.js")
     words = "".join(
-        f'<dt id="word={code}"><code>{code}</code></dt>'
-        f"<dd>{html.escape(meaning)} <b>Action:</b> {html.escape(action)}</dd>"
+        f'<dt id="word={code}"><code>{code}</code></dt><dd>{_prose(meaning)} <b>Action:</b> {_prose(action)}</dd>'
         for code, (meaning, action) in {**WORDS, **SUFFIX_WORDS}.items()
     )
     text = part("compensator.watch", "live.html")

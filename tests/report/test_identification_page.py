@@ -54,7 +54,9 @@ def test_hashes_warnings_and_remarks_are_there(page, calibration):
     assert "ab" * 32 in page and "cd" * 32 in page
     assert "gap of 3 sample(s)" in page
     for warning in criticise(calibration).warnings:
-        assert f'<li>{html.escape(warning)} <a href="#word-{warning.code}">' in page
+        # A command is shown as the code that it is.
+        words = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(warning))
+        assert f'<li>{words} <a href="#word-{warning.code}">' in page
         assert f'<div id="word-{warning.code}">' in page
 
 
@@ -78,7 +80,7 @@ def test_every_part_is_a_row_with_its_own_errors(page, calibration):
             part.model.fit_pct,
             part.nothing.rms_um,
         )
-        shown = [f"{value:.{1 if i == 0 else 2}f}" for i, value in enumerate(figures)]
+        shown = [f"{value:.{1 if i == 0 else 2}f}".replace("-", "−") for i, value in enumerate(figures)]
         assert [part.name, part.role, *shown] in rows
 
 
