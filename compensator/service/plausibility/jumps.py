@@ -355,7 +355,7 @@ class JumpWatch:
             self._end()
         return Judgement()
 
-    def _jump_note(self, name: str, then: str = "and is not used until evidence speaks for it") -> Note:
+    def _jump_note(self, name: str, then: str = "and is not used until its new value is confirmed") -> Note:
         shift = self._state.shifts_k[name]
         return Note(
             EventKind.PLAUSIBILITY,
