@@ -14,6 +14,7 @@ import logging
 import re
 import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, NoReturn
 
@@ -104,7 +105,7 @@ USERS = {
     "CNC integrator": (
         Command(
             "bridge",
-            "send the offset to a control over OPC UA, or touch probes to the service",
+            "send the offset to a control over OPC UA, or probes to the service",
             "bridge opcua --config bridge.toml",
         ),
         Command("router", "run a Zenoh router where no zenohd is installed", "router --config router.json5"),
@@ -252,9 +253,11 @@ def options_of(command: Command) -> list[str]:
 
 
 def _overview() -> str:
-    """Return the commands grouped by user, one line each."""
-    groups = (
-        f"{user}:\n" + "\n".join(f"  {command.name:<10} {command.text}" for command in commands)
-        for user, commands in USERS.items()
-    )
+    """Return the commands grouped by user, one line each where the terminal is wide enough."""
+    wide = shutil.get_terminal_size().columns
+
+    def line(command: Command) -> str:
+        return textwrap.fill(f"  {command.name:<10} {command.text}", wide, subsequent_indent=" " * 13)
+
+    groups = (f"{user}:\n" + "\n".join(map(line, commands)) for user, commands in USERS.items())
     return "\n\n".join(groups)
