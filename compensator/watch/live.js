@@ -147,8 +147,8 @@ function joined(before, news, now_s) {
 
 function sentence(machine) {
   const offset = `${signed(machine.y_offset_um)} µm`;
-  if (machine.shown === "silent") return `for ${age(machine.age_s)}; the last offset was ${offset}. ${machine.means} ${machine.do}`;
-  if (machine.shown === "unknown") return `${machine.means} ${machine.do}`;
+  if (machine.shown === "silent") return `for ${age(machine.age_s)}; the last offset was ${offset}.`;
+  if (machine.shown === "unknown") return machine.means;
   return `${known(machine.y_offset_um) ? `offset ${offset}` : "no offset"}. ${machine.means}`;
 }
 
