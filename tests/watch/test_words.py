@@ -20,7 +20,7 @@ def test_an_event_with_several_suspects_sends_nobody_to_a_healthy_sensor() -> No
         data = {"state": "degraded", "reasons": list(reasons)}
         return to_do(Event(schema=SCHEMA, machine="m", seq=1, time_utc_ns=1, kind="state", text="", data=data))
 
-    assert "Check" in state("implausible:at_degc") and "terminals" not in state(
+    assert "Compare AT" in state("implausible:at_degc") and "Compare AT" not in state(
         "implausible:at_degc", "implausible:model"
     )
     both = state("implausible:at_degc", "implausible:t_q_degc", "t_q_missing")

@@ -1,4 +1,4 @@
-"""Jumps of T_Q and AT: a channel that has jumped is not used until evidence speaks for it.
+"""Jumps of T_Q and AT: a channel that has jumped is not used until its new value is confirmed.
 
 From the jump on, two more engines run beside the one that predicts without the channel:
 
