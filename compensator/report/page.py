@@ -32,8 +32,8 @@ _NARROW_IN = 4.8
 #: Longest cell on one line, and longest unbroken word (a file name, a hash), characters.
 _LONGEST_CELL, _LONGEST_WORD = 36, 24
 TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "bad": "✗ Failed"}
-#: A negative number in a cell, and a command in a text, after both are escaped.
-_NEGATIVE, _COMMAND = re.compile(r"-[\d.]+(?: ± .*| %)?"), re.compile(r"`([^`]+)`")
+#: A command in a text, shown as the code that it is.
+_COMMAND = re.compile(r"`([^`]+)`")
 #: A page needs inline styles only, and the script by its hash.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
@@ -252,8 +252,7 @@ def _inline(cell: Cell) -> str:
     if isinstance(cell, CodeLink):
         code = f"<code>{html.escape(cell.code)}</code>"
         return code if explain(cell.code) is None else f'<a href="#word-{html.escape(cell.word)}">{code}</a>'
-    # A minus as in all text of the page; a command as the code that it is.
-    return _COMMAND.sub(r"<code>\1</code>", html.escape(f"−{cell[1:]}" if _NEGATIVE.fullmatch(cell) else cell))
+    return _COMMAND.sub(r"<code>\1</code>", html.escape(cell))
 
 
 # Figures are blocks of a page, too.

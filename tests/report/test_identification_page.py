@@ -80,7 +80,7 @@ def test_every_part_is_a_row_with_its_own_errors(page, calibration):
             part.model.fit_pct,
             part.nothing.rms_um,
         )
-        shown = [f"{value:.{1 if i == 0 else 2}f}".replace("-", "−") for i, value in enumerate(figures)]
+        shown = [f"{value:.{1 if i == 0 else 2}f}" for i, value in enumerate(figures)]
         assert [part.name, part.role, *shown] in rows
 
 
