@@ -14,6 +14,7 @@ import logging
 import re
 import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, NoReturn
 
@@ -104,7 +105,7 @@ USERS = {
     "CNC integrator": (
         Command(
             "bridge",
-            "send the offset to a control over OPC UA, or touch probes to the service",
+            "send the offset to a control over OPC UA, or probes to the service",
             "bridge opcua --config bridge.toml",
         ),
         Command("router", "run a Zenoh router where no zenohd is installed", "router --config router.json5"),
@@ -209,6 +210,10 @@ class _Parser(argparse.ArgumentParser):
         wrong = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
         if wrong is not None and (near := _did_you_mean(wrong[1], re.findall(r"[^', ]+", wrong[2]))):
             message = f"{message[: wrong.start()]}{wrong[1]!r} is unknown{near}"
+        missing = re.search(r"arguments are required: (.*)", message)
+        for action in self._actions if missing else ():
+            if action.choices is not None and action.dest in message.replace(",", "").split():
+                message = message.replace(action.dest, f"{action.dest} (one of {', '.join(map(str, action.choices))})")
         options = [name for action in self._actions for name in action.option_strings]
         for word in self._words:
             name = word.partition("=")[0]
@@ -248,9 +253,11 @@ def options_of(command: Command) -> list[str]:
 
 
 def _overview() -> str:
-    """Return the commands grouped by user, one line each."""
-    groups = (
-        f"{user}:\n" + "\n".join(f"  {command.name:<10} {command.text}" for command in commands)
-        for user, commands in USERS.items()
-    )
+    """Return the commands grouped by user, one line each where the terminal is wide enough."""
+    wide = shutil.get_terminal_size().columns
+
+    def line(command: Command) -> str:
+        return textwrap.fill(f"  {command.name:<10} {command.text}", wide, subsequent_indent=" " * 13)
+
+    groups = (f"{user}:\n" + "\n".join(map(line, commands)) for user, commands in USERS.items())
     return "\n\n".join(groups)

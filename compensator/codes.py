@@ -484,6 +484,16 @@ class DataRemark(Code):
         "The table is an exported recording; values that the service estimated or published are not measurements.",
         "Nothing; measured heat is read from heat_measured_w.",
     )
+    MARKED_BAD = (
+        "marked_bad",
+        "Values are marked bad in the column <channel>_quality of the table and are not used.",
+        "See the meaning of the mark; check the sensor.",
+    )
+    COLUMN_LEFT_OUT = (
+        "column_left_out",
+        "Many cells of a column are words, so it is taken as a column of words and left out.",
+        "If it is a channel, leave the cells empty where its value is missing.",
+    )
     ROWS_SORTED = (
         "rows_sorted",
         "Rows of the table were out of order and have been sorted by time.",

@@ -86,8 +86,8 @@ class Channel(_Table, frozen=True, kw_only=True):
 class Guards(_Table, frozen=True, kw_only=True):
     """`[guards]`: plausibility between channels, and what a jump of T_Q or AT leads to.
 
-    `suspect_jumps`: after a change beyond `rate_max_per_min` the channel is not used until evidence speaks for it; by
-    default it is used again as soon as the permitted change, which grows with the time, includes its value.
+    `suspect_jumps`: after a change beyond `rate_max_per_min` the channel is not used until its new value is confirmed;
+    by default it is used again as soon as the permitted change, which grows with the time, includes its value.
     `jump_min_k`: a smaller jump, too, down to this one, makes the channel suspect if the next samples show that it is
     no change of the heat; needs `suspect_jumps`.
     """

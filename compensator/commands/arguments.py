@@ -11,7 +11,7 @@ _SCHEDULER = "run on this Dask scheduler, such as tcp://host:8786 (default: all 
 
 
 def _column(parser: argparse.ArgumentParser) -> None:
-    words = "use the column NAME as ROLE, such as t_q_degc, t_s or time_utc; may be repeated"
+    words = "use the column NAME as ROLE, such as t_q_degc, t_s, time_utc or time_h; may be repeated"
     parser.add_argument("--column", action="append", default=[], metavar="ROLE=NAME", help=words)
 
 

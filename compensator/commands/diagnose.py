@@ -68,5 +68,11 @@ def diagnose_files(
     found.save_all(out, also=also, series=True)
     model_file, page, curves = out / FILES[0], out / FILES[2], out / FILES[3]
     paths = {"model": str(model_file), "model_sha256": found.model.sha256, "report": str(page), "series": str(curves)}
-    text = f"{found.summary()}\n\nmodel: {model_file}\ncurves: {curves}\n{pages_text(page, also)}"
+    extended = found.diagnosis.model
+    unchanged = (
+        ""
+        if extended.effects != base.effects or extended.dtf != base.dtf
+        else " (the given model: nothing was added to it)"
+    )
+    text = f"{found.summary()}\n\nmodel: {model_file}{unchanged}\ncurves: {curves}\n{pages_text(page, also)}"
     return Answer(found.to_dict() | paths, text)

@@ -7,6 +7,7 @@ import itertools
 import logging
 import re
 import secrets
+import stat
 import sys
 import threading
 from contextlib import ExitStack
@@ -93,14 +94,24 @@ def run(arguments: argparse.Namespace) -> Answer | None:
 
 def _token(path: Path | None) -> str:
     """Return the token of the page: of its file, which is made if it does not exist, or a new one."""
+    from compensator.watch.server import TOKEN
+
     if path is None:
         return secrets.token_urlsafe(16)
     try:
-        return read_file(path, KEY_BYTES).decode("ascii", "replace").strip()
+        token = read_file(path, KEY_BYTES).decode("ascii", "replace").strip()
     except FileNotFoundError:
         token = secrets.token_urlsafe(16)
         replace_file(path, f"{token}\n".encode(), mode=0o600)
         return token
+    if not TOKEN.fullmatch(token):
+        shown = f"{len(token)} characters" if token else "empty"
+        words = "expected 16 to 128 letters, digits, - or _; remove the file and it is made"
+        raise UsageError(f"--token {path}: {shown}, {words}")
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o037:
+        raise UsageError(f"--token {path}: mode {mode:04o}, expected 0600; otherwise other users could open the page")
+    return token
 
 
 def _source(arguments: argparse.Namespace, loaded: LoadedConfig | None) -> Source:

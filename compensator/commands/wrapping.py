@@ -24,7 +24,7 @@ _STYLES = (
     (re.compile(r"⚠ "), "bold yellow"),
     (re.compile(r"✗ "), "bold red"),
     (re.compile(r"Warnings:$"), "yellow"),
-    (re.compile(r"(page|pages|table|model|folder): "), "dim"),
+    (re.compile(r"(page|pages|table|model|folder|curves): "), "dim"),
 )
 
 
@@ -121,10 +121,11 @@ def _below(label: str, value: str, longest: int, width: int) -> list[str]:
     if not value:
         return []
     start = f"  {label:<{longest}}  " if longest else "  "
-    if len(start) + len(value) > width:
+    if label and len(start) + len(value) > width:
         start = f"  {label} "
+    follows = "    " if label else "  "
     options = {"break_long_words": False, "break_on_hyphens": False}
-    return textwrap.wrap(value, width, initial_indent=start, subsequent_indent="    ", **options)  # type: ignore[arg-type]
+    return textwrap.wrap(value, width, initial_indent=start, subsequent_indent=follows, **options)  # type: ignore[arg-type]
 
 
 def _line(line: str, width: int) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from compensator.arrays import LARGEST, Indices, Mask, Vector
 from compensator.codes import DataRemark, Remark
+from compensator.config import ROLES
 from compensator.data.record import SHORT_GAP_SAMPLES, SampledData, SampledRecord
 from compensator.data.table import Table
 from compensator.errors import DataError
@@ -23,6 +24,12 @@ _FASTEST_S, _SHORTEST_S, _UNIT_ROWS = 0.2, 600.0, 100
 #: No heat makes T_Q change by so much from one minute to the next, K, in more than a fifth of so many minutes. A table
 #: in minutes has rows at most 6 of them apart and is at most 44,640 long, a month.
 _FASTEST_K, _UNIT_SHARE, _UNIT_MINUTES, _UNIT_STEP_S, _UNIT_SPAN_S = 2.0, 0.8, 5, 6.0, 44_640.0
+#: Numbers that loggers and converters write in place of a missing value: in any column; in one with a role or of a
+#: temperature, where a large number is no count or program; and those that converters of thermocouples and Pt100 give.
+#: One is a fault's code where it is further from all other values than so many times their range, or the only negative.
+_ANYWHERE = (-999.0, -999.9, -9999.0, -9999.9, -99999.0, -999999.0, -32768.0, -3276.8)
+_MEASURED = (999.0, 999.9, 9999.0, 9999.9, 99999.0, 999999.0, 32767.0, 3276.7, 65535.0, 6553.5)
+_TEMPERATURE, _APART = (850.0, 1370.0, 1372.0, 1768.0, -200.0, -242.0, -270.0), 3.0
 #: Number of stretches that a remark lists.
 _SHOWN = 3
 #: Share of rows without a temperature, outside long gaps, from which it is remarked on.
@@ -45,6 +52,7 @@ def to_grid(table: Table, period_s: float) -> SampledData:
         If a value or time cannot have been measured.
     """
     _check_size(table, period_s)
+    _check_fault_codes(table)
     _check_unit_of_time(table)
     _check_clock(table, period_s)
     remarks = []
@@ -179,6 +187,32 @@ def _check_size(table: Table, period_s: float) -> None:
         )
 
 
+def _check_fault_codes(table: Table) -> None:
+    """Refuse values that stand for a fault, before they are averaged with good ones.
+
+    Raises
+    ------
+    DataError
+        Naming row, column and value.
+    """
+    for column, values in table.columns.items():
+        is_temperature = column.endswith("_degc")
+        codes = (*_ANYWHERE, *(_MEASURED if is_temperature or column in ROLES else ()))
+        is_code = np.isin(values, (*codes, *_TEMPERATURE) if is_temperature else codes)
+        others = values[~is_code & ~np.isnan(values)]
+        if not is_code.any() or others.size == 0:
+            continue
+        low, high = float(others.min()), float(others.max())
+        away = np.maximum(values - high, low - values)
+        is_apart = (away > _APART * (high - low)) | ((values < 0.0) & (low >= 0.0))
+        if (is_fault := is_code & is_apart).any():
+            i = int(np.argmax(is_fault))
+            raise DataError(
+                f"{table.name}: row {table.rows[i]}: {column} = {values[i]:g}, {int(is_fault.sum())} row(s) like it: a "
+                "fault's code? expected an empty cell where a value is missing"
+            )
+
+
 def _check_unit_of_time(table: Table) -> None:
     """Refuse a `t_s` that is hardly one of seconds: in hours or minutes a day would last half a minute or so.
 
@@ -192,7 +226,10 @@ def _check_unit_of_time(table: Table) -> None:
         return
     step, span = float(np.median(np.diff(t_s))), float(np.ptp(t_s))
     if step < _FASTEST_S and span < _SHORTEST_S:
-        raise DataError(f"{table.name}: t_s runs over {span:.3g} in {t_s.size} rows: hours? expected seconds")
+        raise DataError(
+            f"{table.name}: t_s runs over {span:.3g} in {t_s.size} rows: hours? expected seconds; a time in hours is "
+            "named time_h, or by --column time_h=NAME"
+        )
     t_q = table.columns.get("t_q_degc")
     if t_q is None or span > _UNIT_SPAN_S or step > _UNIT_STEP_S:
         return
@@ -203,7 +240,7 @@ def _check_unit_of_time(table: Table) -> None:
     if changes.size >= _UNIT_MINUTES and (fast := float(np.quantile(changes, _UNIT_SHARE))) > _FASTEST_K:
         raise DataError(
             f"{table.name}: t_q_degc changes by {fast:.1f} K from one minute to the next: t_s in minutes? expected "
-            "seconds"
+            "seconds; a time in minutes is named time_min, or by --column time_min=NAME"
         )
 
 

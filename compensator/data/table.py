@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -11,12 +11,16 @@ from typing import Any
 import numpy as np
 
 from compensator.arrays import LARGEST, Vector
-from compensator.codes import DataRemark, Remark
+from compensator.codes import DataRemark, Remark, SampleQuality
 from compensator.config import ROLES
 from compensator.errors import DataError, UsageError
 
-#: Columns that hold the time: s from the start, or date and time. With both, the first is used.
-TIMES = ("t_s", "time_utc")
+#: Seconds in the unit of a column that holds the time from the start.
+_SECONDS_IN = {"t_s": 1.0, "time_min": 60.0, "time_h": 3600.0}
+#: Columns that hold the time: from the start, or date and time. With several, the first is used.
+TIMES = ("t_s", "time_utc", "time_min", "time_h")
+#: Rows at least so far apart, s, have whole seconds: a time in hours or minutes is rounded by its logger.
+_WHOLE_S = 5.0
 #: Largest number of columns.
 COLUMNS = 1000
 #: A column with more words than this share of its numbers is one of words, and left out.
@@ -55,6 +59,8 @@ class Table:
         Number of each row as its user counts it, for messages.
     start_utc_s : float, optional
         Time of the first row, s since 1970, where the table has `time_utc`.
+    remarks : tuple of Remark
+        What was left out when it was read.
     """
 
     name: str
@@ -62,6 +68,7 @@ class Table:
     columns: dict[str, Vector]
     rows: Sequence[int]
     start_utc_s: float | None = None
+    remarks: tuple[Remark, ...] = ()
 
     def with_roles(self, roles: Mapping[str, str]) -> Table:
         """Return the table with columns renamed to their roles; `table_of` has renamed the time.
@@ -86,12 +93,12 @@ class Table:
         Its heat is the model's own estimate: a model fitted to it as to a measured heat would reproduce itself.
         """
         if not {"y_pred_um", "y_offset_um"} <= self.columns.keys():
-            return self, ()
+            return self, self.remarks
         kept = {name: values for name, values in self.columns.items() if name not in EXPORTED}
         if "heat_measured_w" in kept:
             kept["heat_w"] = kept.pop("heat_measured_w")
         words = f"{self.name}: an exported recording; the service's estimates and offsets are left out, with heat_w."
-        return replace(self, columns=kept), (Remark(DataRemark.ESTIMATES_LEFT_OUT, words),)
+        return replace(self, columns=kept), (*self.remarks, Remark(DataRemark.ESTIMATES_LEFT_OUT, words))
 
 
 def _check_named(table: str, role: str, name: str, columns: Mapping[str, Any]) -> None:
@@ -116,7 +123,7 @@ def table_of(
     cells : mapping of str to array_like, shape (n,)
         Columns by name; the time among them. A column that is not numeric is left out unless it has a role.
     roles : mapping of str to str, optional
-        Column name for each role; those of `t_s` and `time_utc` are used here, the others by `Table.with_roles`.
+        Column name for each role; those of `TIMES` are used here, the others by `Table.with_roles`.
     rows : sequence of int, optional
         Number of each row for messages; from 0 where it is not given.
     has : str
@@ -138,33 +145,39 @@ def table_of(
     time_column = next((column for column in TIMES if column in cells), None)
     if time_column is None:
         names = ", ".join(cells)[:100]
-        raise DataError(f"{name}: no column t_s or time_utc; {has}: {names}. Name it with --column t_s=NAME")
+        raise DataError(
+            f"{name}: no column t_s or time_utc; {has}: {names}. Name it with --column t_s=NAME, time_min=NAME or "
+            "time_h=NAME"
+        )
     arrays = {column: _flat(name, column, values) for column, values in cells.items()}
     size = arrays[time_column].size
     if size == 0:
         raise DataError(f"{name}: no rows in it, expected data")
     rows = range(size) if rows is None else rows
     numbers: dict[str, Vector] = {}
+    remarks: list[Remark] = []
     for column, values in arrays.items():
         if values.size != size:
             raise DataError(f"{name}: {column} has {values.size} values, {time_column} {size}, expected equally many")
-        if column in (time_column, "time_utc"):
+        if column in (time_column, *TIMES):
             continue
         is_needed = column in ROLES or column in (roles or {}).values()
-        if (converted := _numbers(name, column, values, rows, is_needed=is_needed)) is not None:
+        converted, left_out = _numbers(name, column, values, rows, is_needed=is_needed)
+        if converted is not None:
             numbers[column] = converted
-    if time_column == "t_s":
-        time = _numbers(name, time_column, arrays[time_column], rows, is_needed=True)
-    else:
+        remarks += left_out
+    remarks += _without_bad(name, numbers, arrays, rows)
+    if time_column == "time_utc":
         time = _seconds(name, time_column, arrays[time_column], rows)
-    assert time is not None
+    else:
+        time = _elapsed(name, time_column, arrays[time_column], rows)
     if np.isnan(time).any():
         raise DataError(f"{name}: row {rows[int(np.argmax(np.isnan(time)))]}: time is missing")
     if (far := np.abs(time) > LARGEST).any():
         i = int(np.argmax(far))
         raise DataError(f"{name}: row {rows[i]}: {time_column} = {time[i]:g} s, expected at most {LARGEST:g}")
     start = float(time[0]) if time_column == "time_utc" else None
-    return Table(name=name, t_s=time - time[0], columns=numbers, rows=rows, start_utc_s=start)
+    return Table(name=name, t_s=time - time[0], columns=numbers, rows=rows, start_utc_s=start, remarks=tuple(remarks))
 
 
 def check_columns(name: str, count: int) -> None:
@@ -205,8 +218,8 @@ def _flat(name: str, column: str, values: Any) -> np.ndarray[Any, Any]:
 
 def _numbers(
     name: str, column: str, values: np.ndarray[Any, Any], rows: Sequence[int], *, is_needed: bool
-) -> Vector | None:
-    """Return a column as numbers, None where most of it is something else and it is not needed."""
+) -> tuple[Vector | None, tuple[Remark, ...]]:
+    """Return a column as numbers; None, and why, where much of it is something else and it is not needed."""
     if values.dtype.kind in "biuf":
         numbers = values.astype(np.float64)
     else:
@@ -216,25 +229,61 @@ def _numbers(
                 numbers[i] = _number(cell)
             except (ValueError, TypeError, OverflowError):
                 others.append(i)
-        # A column of words is left out; one word among numbers, such as Excel's #NV, would cost the whole channel.
-        if others and not is_needed and len(others) > _WORDS * np.sum(np.isfinite(numbers)):
-            return None
         if others:
             cell, more = str(values[others[0]]).strip()[:40], f" ({len(others)} like it)" if len(others) > 1 else ""
-            raise DataError(
-                f"{name}: row {rows[others[0]]}: {column} = {cell!r}{more}, expected a number, or an empty cell where "
-                "it is missing"
-            )
+            where = f"{name}: row {rows[others[0]]}: {column} = {cell!r}{more}"
+            # A column of words is left out; one word among numbers, such as Excel's #NV, would cost the whole channel.
+            known = int(np.sum(np.isfinite(numbers)))
+            if not is_needed and len(others) > _WORDS * known:
+                words = f"{where}: no number; the column is left out."
+                return None, (Remark(DataRemark.COLUMN_LEFT_OUT, words),) if known else ()
+            raise DataError(f"{where}, expected a number, or an empty cell where it is missing")
     if np.isinf(numbers).any():
         i = int(np.argmax(np.isinf(numbers)))
         raise DataError(f"{name}: row {rows[i]}: {column} = {numbers[i]}, expected a finite number")
-    return numbers
+    return numbers, ()
+
+
+def _without_bad(
+    name: str, numbers: dict[str, Vector], arrays: Mapping[str, np.ndarray[Any, Any]], rows: Sequence[int]
+) -> Iterator[Remark]:
+    """Leave out values that are marked bad by a column `<channel>_quality`, as an exported recording has it.
+
+    Yields a remark on each channel that lost values.
+    """
+    for column, marks in arrays.items():
+        channel = column.removesuffix("_quality")
+        if channel == "heat_w" and "heat_measured_w" in numbers:
+            channel = "heat_measured_w"
+        if column == channel or column in numbers or channel not in numbers:
+            continue
+        words = [str(mark).strip().lower() for mark in marks.tolist()]
+        # Where no quality is stated, as between the values of touch probes, the value stands.
+        bad = np.array([word not in ("", "none", "nan", SampleQuality.GOOD) for word in words]) & ~np.isnan(
+            numbers[channel]
+        )
+        if bad.any():
+            at = int(np.argmax(bad))
+            numbers[channel] = np.where(bad, np.nan, numbers[channel])
+            what = f"{name}: row {rows[at]}: {channel} is marked {words[at]!r}"
+            yield Remark(DataRemark.MARKED_BAD, f"{what}; {int(bad.sum())} value(s) marked bad left out.")
 
 
 def _number(cell: Any) -> float:
     if cell is None:
         return math.nan
     return float(cell) if not isinstance(cell, str) or cell.strip() else math.nan
+
+
+def _elapsed(name: str, column: str, values: np.ndarray[Any, Any], rows: Sequence[int]) -> Vector:
+    """Return a time from the start, in the unit that the column's name says, as seconds."""
+    time, _ = _numbers(name, column, values, rows, is_needed=True)
+    assert time is not None
+    if column == "t_s":
+        return time
+    seconds = time * _SECONDS_IN[column]
+    steps = np.abs(np.diff(seconds))
+    return np.round(seconds) if steps.size and np.median(steps) >= _WHOLE_S else seconds
 
 
 def _seconds(name: str, column: str, values: np.ndarray[Any, Any], rows: Sequence[int]) -> Vector:

@@ -11,6 +11,7 @@ import re
 import shutil
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO
@@ -49,6 +50,8 @@ false_alarm_days = 30.0
 STUCK_AFTER_MIN = {"t_q": 15.0, "at": 15.0, "y": 3.0}
 #: A value that stands still is counted from the first whole sample on, and a fault is published with the next sample.
 _SEEN_MIN = 2.0
+#: Longest line that is read as a typed command, characters, and the shortest time between two, s.
+_LONGEST, _PAUSE_S = 200, 0.1
 #: Faults of an input by typed command, and faults of a whole device by sensor.
 INPUT_FAULTS = {"break": "open", "freeze": "frozen"}
 UNPLUG = {"t_q": "silence", "at": "silence", "y": "disconnect"}
@@ -121,7 +124,7 @@ def _clear(recordings: Path) -> None:
 
 
 async def _serve(
-    config: Path, world: World, devices: Hardware, hours: float, explain: Callable[[], None], typed: IO[str]
+    config: Path, world: World, devices: Hardware, hours: float, explain: Callable[[], None], typed: IO[str] | None
 ) -> None:
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
         bar = progress.add_task("simulated past", total=hours * 3600.0)
@@ -165,11 +168,22 @@ Ctrl-C ends the demo.
     sys.stderr.flush()
 
 
-def _read_commands(typed: IO[str], faults: Breakable) -> None:
-    """Execute typed commands until the end of the input."""
-    for line in typed:
+def _read_commands(typed: IO[str] | None, faults: Breakable) -> None:
+    """Execute typed commands until the end of the input, which may be closed, endless, or no text."""
+    while typed is not None:
+        try:
+            line = typed.readline(_LONGEST)
+        except ValueError:
+            line = "\0"
+        if not line:
+            return
+        if "\0" in line or (len(line) == _LONGEST and not line.endswith("\n")):
+            sys.stderr.write("The input is no text: typed commands are not read any more.\n")
+            return
         sys.stderr.write(apply_fault(line, faults) + "\n")
         sys.stderr.flush()
+        # Nobody types faster; what writes to the input without an end must not keep the machine from its samples.
+        time.sleep(_PAUSE_S)
 
 
 def apply_fault(line: str, breakable: Breakable) -> str:

@@ -14,6 +14,8 @@ SHORT_PCT = 80.0
 _LITTLE = 0.1
 #: Named effects leave less than the ceiling where they leave no more than this share of it.
 _LESS = 0.9
+#: A remainder that leaves more than this share of the error removes nothing that shows in two digits.
+_MEASURABLE = 0.995
 #: Channels of the remainder that are named.
 _NAMED = 6
 
@@ -78,7 +80,7 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     if falls_short(found):
         rest = "no remainder was added"
         if beside := found.get("remainder"):
-            lowers = beside["rms_after_um"] < beside["rms_before_um"]
+            lowers = _lowers(beside)
             rest = (
                 "the remainder corrects some of the rest" if lowers else "the remainder does not lower the error there"
             )
@@ -90,6 +92,11 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def _lowers(rest: Mapping[str, Any]) -> bool:
+    """Whether a remainder lowers the error on held-out data by what can be measured."""
+    return bool(rest["rms_after_um"] < _MEASURABLE * rest["rms_before_um"])
+
+
 def remainder(found: Mapping[str, Any]) -> list[Words]:
     """Return what the remainder is and does; empty where there is none."""
     if (rest := found.get("remainder")) is None:
@@ -97,9 +104,11 @@ def remainder(found: Mapping[str, Any]) -> list[Words]:
     channels = rest["channels"]
     more = f" and {len(channels) - _NAMED} more" if len(channels) > _NAMED else ""
     deployed = "Deployed in the extended model." if rest["deployed"] else "Not deployed in the extended model."
+    removes = [] if _lowers(rest) else ["It removes nothing that can be measured on held-out data."]
     lines = [
         f"A regularised linear response of {', '.join(channels[:_NAMED])}{more}: a correction that explains nothing.",
         f"Error on held-out data: {rest['rms_before_um']:.2f} µm rms without it, {rest['rms_after_um']:.2f} with it.",
+        *removes,
         deployed,
     ]
     return [Words(title="Remainder", lines=lines)]

@@ -64,7 +64,7 @@ class PlannedTest:
     @property
     def sentence(self) -> str:
         """What to do, how long, and by how much it decides."""
-        change = f"expected change of the log evidence {self.expected_evidence:.3g}, {DECIDES:g} decides"
+        change = f"expected change of the log evidence {self.expected_evidence:.3g}; {DECIDES:g} decides"
         if self.probes:
             change = f"{self.probes} more probes, one each {self.every_min:g} min; {change}"
         if self.decides:

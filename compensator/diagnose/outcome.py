@@ -192,7 +192,10 @@ def warnings_of(
             text = f"{kind}: Y moves against the {effect.place[1]}, so the model was left unchanged."
             warnings.append(Remark(ModelWarning.PATH_REVERSED, text))
         if loose:
-            text = f"{kind}: the standard error of {', '.join(loose)} is larger than the value."
+            # Two lags near each other share one response: what matters at rest is known.
+            known = [name for name in named if name.startswith("gain_um_per_") and name not in loose]
+            together = f"; their sum, {known[0]}, is determined" if known and len(loose) > 1 else ""
+            text = f"{kind}: the standard error of {', '.join(loose)} is larger than the value{together}."
             warnings.append(Remark(ModelWarning.HARDLY_DETERMINED, text))
         if effect.rivals:
             names = ", ".join(rival.label for rival in effect.rivals)

@@ -26,11 +26,11 @@ WORDS: Mapping[str, tuple[str, str]] = {
     ),
     "service_degraded": (
         "The service compensates with a restriction; the offset is followed.",
-        "Look at the service's reasons.",
+        "See the service's reasons.",
     ),
     "service_gone": (
         "The service's liveliness token is gone; the last offset is used while it is valid, then held.",
-        "Look for the service, the router and the network.",
+        "Check the service, the router and the network.",
     ),
     "malformed": (
         "A message was dropped: it is not a valid offset message.",

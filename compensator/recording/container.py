@@ -436,7 +436,7 @@ class Container:
         elif stated != crc:
             raise Damaged(self.path, offset, "the CRC of the data is wrong")
         if len(body) > 4:
-            self._note("the end of the data is longer than it is written")
+            self._note("the end of the data is longer than the recorder writes it")
         self._at += 9 + len(body)
         summary, summary_start = zlib.crc32(b""), self._base + self._at
         while True:
@@ -454,7 +454,7 @@ class Container:
             summary = zlib.crc32(record, summary)
         stated = int.from_bytes(record[25:29], "little")
         if len(record) > 29:
-            self._note("the footer is longer than it is written")
+            self._note("the footer is longer than the recorder writes it")
         if not stated:
             self._note("the summary has no CRC")
         elif stated != zlib.crc32(record[:25], summary):

@@ -307,7 +307,7 @@ class Index:
         body = fields.rest()
         number = int.from_bytes(body[:2], "little")
         if self._described[kind].get(number) != body or number in self._repeated[kind]:
-            self._fault(f"{_NAMES[kind]} {number}", "is repeated in the summary otherwise than in the file")
+            self._fault(f"{_NAMES[kind]} {number}", "differs between the summary and the file")
         self._repeated[kind].add(number)
 
     def finish(self, summary_start: int, footer_at: int, footer: Fields) -> None:

@@ -19,7 +19,7 @@ def advice_blocks(diagnosis: Diagnosis) -> list[Block]:
             Table(
                 head=["nearest channel", "adds to the log evidence", "best single lag, min"],
                 rows=rows,
-                note="Each channel alone, behind and ahead of lags. Negative: the channel comes after the cause.",
+                note="Each channel alone, with lags in both directions. Negative: the channel follows the cause.",
             )
         )
     return [Section(title="What to measure and test next", blocks=blocks)]

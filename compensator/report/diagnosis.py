@@ -128,7 +128,7 @@ def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:
         edges=time.runs,
         below=below,
         note="Residual of the fit to all data, zero and initial state fitted."
-        + (" Below: what the effects act by." if below else " No channel shows the cause.")
+        + (" Below: the inputs of the effects." if below else " No channel shows the cause.")
         + time.note,
     )
 

@@ -46,11 +46,13 @@ _NARROWEST = 1.0 / 500.0
 _DIGITS = re.compile(r"(\.\d\d)\d+")
 #: Longest line of a bar's name, letters.
 _NAME_LETTERS = 34
+#: Width of a figure alone in its row, inches.
+WIDTH_IN = 9.0
 #: Width of a letter, of a legend's sample line, and of the margin left of the axes, inches.
-_LETTER_IN, _SAMPLE_IN, _LEFT_IN = 0.09, 0.65, 0.8
+_LETTER_IN, _SAMPLE_IN, _LEFT_IN = 0.09, 0.65, 0.88
 
 
-def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
+def svg(figure: Figure, prefix: str, width: float = WIDTH_IN) -> str:
     """Draw a figure.
 
     Parameters
@@ -77,6 +79,8 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
             if panel.bars:
                 _bars(axes, panel.bars)
             _legend(axes, width)
+        if width == WIDTH_IN:
+            _align(canvas, rows[0])
         buffer = io.StringIO()
         canvas.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
@@ -90,6 +94,15 @@ def svg(figure: Figure, prefix: str, width: float = 9.0) -> str:
     opening, _, rest = text.partition(">")
     opening = opening.replace("<svg ", f'<svg role="img" aria-label="{label}"{data} ', 1)
     return f"{opening}><desc>{html.escape(described(figure))}</desc>{rest}"
+
+
+def _align(canvas: Canvas, axes: Axes) -> None:
+    """Give the axes the left margin that all figures of a page have, so that figures below each other line up."""
+    canvas.draw_without_rendering()
+    engine, width = canvas.get_layout_engine(), canvas.get_figwidth()
+    missing = _LEFT_IN / width - axes.get_position().x0
+    if missing > 0.0 and engine is not None:
+        engine.set(rect=(missing, 0.0, 1.0 - missing, 1.0))  # type: ignore[call-arg]
 
 
 def _draw(axes: Axes, figure: Figure, colours: dict[str, int], panel: int) -> None:
@@ -161,6 +174,7 @@ def _strips(axes: Axes, figure: Figure) -> None:
     for row, strip in enumerate(figure.strips):
         pieces = [(a / unit, max(b - a, least) / unit) for a, b in strip.spans]
         axes.broken_barh(pieces, (row - 0.35, 0.7), color=LINES[strip.line % len(LINES)], linewidth=0)
+    axes.set_axisbelow(True)
     axes.set_yticks(range(len(figure.strips)), [_plain(strip.name) for strip in figure.strips])
     axes.set_ylim(len(figure.strips) - 0.5, -0.5)
 
@@ -181,12 +195,13 @@ def _bars(axes: Axes, bars: tuple[Bar, ...]) -> None:
         if bar.hatched:
             look = {"facecolor": "none", "edgecolor": colour, "hatch": "///", "linewidth": 1.5}
         axes.broken_barh([(min(bar.first, bar.last), abs(bar.last - bar.first))], (row - 0.3, 0.6), **look)
-        if row + 1 < len(bars):
+        if row + 1 < len(bars) and bar.joined:
             axes.vlines(bar.last, row - 0.3, row + 1.3, color=INK, linewidth=0.8)
     names = [f"{textwrap.fill(_plain(bar.name), _NAME_LETTERS)}\n{_plain(bar.value)}" for bar in bars]
     axes.set_yticks(range(len(bars)), names)
     axes.set_ylim(len(bars) - 0.4, -0.6)
-    axes.set_xlim(left=0.0)
+    # The last tick's label has room: a browser's letters are wider than those of the layout.
+    axes.set_xlim(left=0.0, right=1.1 * max(max(bar.first, bar.last) for bar in bars) or 1.0)
     axes.grid(visible=False, axis="y")
     axes.set_axisbelow(True)
     axes.set_ylabel("")

@@ -102,11 +102,13 @@ class Bar:
     name, value : str
         Texts beside it, one below the other.
     first, last : float
-        Where it begins and ends; the next bar is joined to where it ends.
+        Where it begins and ends.
     line : int
         Index of the line colour.
     hatched : bool
         Hatched instead of filled.
+    joined : bool
+        Whether a line leads from its end to the next bar.
     """
 
     name: str
@@ -115,6 +117,7 @@ class Bar:
     last: float
     line: int = 0
     hatched: bool = field(default=False, kw_only=True)
+    joined: bool = field(default=True, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

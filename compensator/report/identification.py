@@ -191,10 +191,15 @@ def _path_section(view: PathView) -> Block:
     return Section(title=view.name, blocks=[Row(figures=shown), details])
 
 
+def _minutes(tau_min: float, std_min: float) -> str:
+    value, space, rest = with_std(tau_min, std_min).partition(" (")
+    return f"{value} min{space}{rest}"
+
+
 def _time_constants(view: PathView) -> Figure:
     """Show the time constants as bars: on a z plane slow poles are dots on top of each other at 1."""
     bars = tuple(
-        Bar(f"time constant {i}", f"{with_std(tau, std)} min", 0.0, tau, 1)
+        Bar(f"time constant {i}", _minutes(tau, std), 0.0, tau, 1, joined=False)
         for i, (tau, std) in enumerate(zip(view.taus_min, view.taus_std_min, strict=True), start=1)
         if math.isfinite(tau) and tau > 0.0
     )

@@ -9,6 +9,7 @@ at the end of the page.
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -20,17 +21,19 @@ from compensator import __version__
 from compensator.atomic_write import atomic_write
 from compensator.codes import explain
 from compensator.display import Cell, CodeLink, Link, Listing, Table, Words, sentence_of, text_of, warnings_of
-from compensator.report.drawing import svg
+from compensator.report.drawing import WIDTH_IN, svg
 from compensator.report.figure import Bar, Figure, Line, Marks, Span, Stems, Strip
 from compensator.report.local_time import today
 from compensator.report.reading import script, script_hash
 
 Tone = Literal["good", "warn", "bad"]
-#: Widths of a single figure and of one in a row, inches: the text of both stays readable.
-_WIDE_IN, _NARROW_IN = 9.0, 4.8
+#: Width of a figure in a row of several, inches: the text stays readable.
+_NARROW_IN = 4.8
 #: Longest cell on one line, and longest unbroken word (a file name, a hash), characters.
 _LONGEST_CELL, _LONGEST_WORD = 36, 24
 TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "bad": "✗ Failed"}
+#: A command in a text, shown as the code that it is.
+_COMMAND = re.compile(r"`([^`]+)`")
 #: A page needs inline styles only, and the script by its hash.
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
@@ -168,7 +171,7 @@ def _glossary(blocks: Sequence[Block]) -> str:
         meaning, action = explain(word) or ("", "")
         entries.append(
             f'<div id="word-{html.escape(word)}"><dt><code>{html.escape(word)}</code></dt>'
-            f"<dd>{html.escape(meaning)}</dd><dd><b>Action:</b> {html.escape(action)}</dd></div>"
+            f"<dd>{_inline(meaning)}</dd><dd><b>Action:</b> {_inline(action)}</dd></div>"
         )
     return f"<section><h2>Codes</h2><dl>{''.join(entries)}</dl></section>" if entries else ""
 
@@ -183,7 +186,7 @@ def _figure(figure: Figure, numbers: Iterator[int], width: float) -> str:
 
 def _block(block: Block, numbers: Iterator[int], level: int) -> str:
     if isinstance(block, Figure):
-        return _figure(block, numbers, _WIDE_IN)
+        return _figure(block, numbers, WIDTH_IN)
     if isinstance(block, Row):
         return f'<div class="row">{"".join(_figure(figure, numbers, _NARROW_IN) for figure in block.figures)}</div>'
     if isinstance(block, Table):
@@ -249,7 +252,7 @@ def _inline(cell: Cell) -> str:
     if isinstance(cell, CodeLink):
         code = f"<code>{html.escape(cell.code)}</code>"
         return code if explain(cell.code) is None else f'<a href="#word-{html.escape(cell.word)}">{code}</a>'
-    return html.escape(cell)
+    return _COMMAND.sub(r"<code>\1</code>", html.escape(cell))
 
 
 # Figures are blocks of a page, too.

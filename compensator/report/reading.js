@@ -267,4 +267,11 @@ class Plot {
   }
 }
 
+// Only a table that is wider than its box says that it scrolls.
+function fits() {
+  for (const box of document.querySelectorAll('.scroll[role="region"]')) box.dataset.scrolls = box.scrollWidth > box.clientWidth + 1;
+}
+fits();
+addEventListener("resize", fits);
+for (const details of document.querySelectorAll("details")) details.addEventListener("toggle", fits);
 for (const svg of document.querySelectorAll("svg[data-plot]")) new Plot(svg);

@@ -305,7 +305,7 @@ def story_tables(story: Story) -> list[Block]:
         blocks.append(Table(head=head, rows=[_row(step) for step in told], note=note))
     lines: list[Cell] = [f"{shown(step.at_s)}: {step.text}" for step in story.steps]
     if lines:
-        blocks.append(Details(title=f"All {len(lines)} steps in words", blocks=[Words(title="", lines=lines)]))
+        blocks.append(Details(title=f"All steps in words ({len(lines)})", blocks=[Words(title="", lines=lines)]))
     return blocks
 
 

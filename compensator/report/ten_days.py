@@ -222,7 +222,7 @@ def _panel(one: MachineDays) -> Figure:
     return Figure(
         title="",
         x_label="day of the run, 1 to 10",
-        y_label=f"{'touch probe' if one.is_probed else 'sensor'}: rms error, µm",
+        y_label=f"{'probe' if one.is_probed else 'sensor'}: rms, µm",
         lines=(_steps("first model", first), _steps("with the loop", loop)),
         marks=tuple(marks),
         edges=changes,

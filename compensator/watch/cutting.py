@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from compensator.codes import Reason, SampleQuality, State, WatchWarning, explain
 from compensator.report.local_time import here
+from compensator.watch.words import SEVERAL_SUSPECTS
 
 #: Names of channels at the machine.
 NAMES: Mapping[str, str] = {"t_q_degc": "T_Q", "at_degc": "AT", "y_um": "Y", "heat_w": "Heat"}
@@ -45,6 +46,7 @@ def headline(
     until_ns: int | None,
     now_ns: int,
     std_um: float | None = None,
+    warnings: Sequence[str] = (),
 ) -> Headline:
     """Return the headline of a machine.
 
@@ -62,8 +64,10 @@ def headline(
         Now, ns since 1970 UTC.
     std_um : float, optional
         Standard deviation of the offset, µm.
+    warnings : sequence of str
+        What the watch warns about in a state without a reason, the severest first.
     """
-    found = _headline(shown, tone, reasons, channels, until_ns, now_ns)
+    found = _headline(shown, tone, reasons, channels, until_ns, now_ns, warnings)
     if found.cut == "no" or std_um is None:
         return found
     return found._replace(text=f"{found.text} Offset ±{std_um:.1f} µm (one standard deviation).")
@@ -76,6 +80,7 @@ def _headline(
     channels: Mapping[str, Mapping[str, Any]],
     until_ns: int | None,
     now_ns: int,
+    warnings: Sequence[str],
 ) -> Headline:
     if shown in (WatchWarning.SILENT, WatchWarning.UNKNOWN, State.FAULT, State.STARTING):
         return Headline("no", "Do not cut to size", " ".join(_words([*reasons[:1], shown])))
@@ -99,13 +104,13 @@ def _headline(
         lacks = "the model lacks an effect" if "model" in suspects else ""
         causes = " or ".join(filter(None, (lacks, others)))
         text = f"Measured and predicted Y diverge; not known yet whether {causes}."
-        return Headline("care", "Cut with care", f"{text} Measure the part; check a sensor when it is named alone.")
+        return Headline("care", "Cut with care", f"{text} {SEVERAL_SUSPECTS}")
     if doubts:
         return Headline("care", "Cut with care", " ".join(_words(doubts[:1])))
     if reasons:
         return Headline("care", "Cut with care", " ".join([*lost, *([] if lost else _words(reasons[:1]))]))
     if tone != "good":
-        return Headline("care", "Cut with care", "See the warnings below.")
+        return Headline("care", "Cut with care", " ".join(warnings[:1] or _words([shown])))
     return Headline("yes", "May cut", "The offset follows the model.")
 
 

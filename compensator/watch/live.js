@@ -1,4 +1,3 @@
-"use strict";
 // Requests the present state every two seconds and draws it. Everything from a machine is inserted as text.
 const POLL_MS = 2000, MOST_ACTIONS = 10, DAY_S = 86400, SIGNS = {good: "✓", warn: "⚠", bad: "✗"};
 const TONES = {ok: "good", starting: "warn", degraded: "warn", hold: "bad", fault: "bad"};
@@ -12,6 +11,8 @@ const make = (tag, attributes = {}, ...children) => {
   element.append(...children);
   return element;
 };
+// A command between backticks is shown as the code that it is.
+const prose = (text) => text.split("`").map((part, i) => i % 2 ? make("code", {}, part) : part);
 const setText = (element, text) => { if (element.textContent !== text) element.textContent = text; };
 const known = (value) => typeof value === "number" && isFinite(value);
 const signed = (value, digits = 2) => known(value) ? (value < 0 ? "−" : "+") + Math.abs(value).toFixed(digits) : "–";
@@ -50,7 +51,8 @@ async function update() {
     lastAnswer = new Date();
     if (prefix === null || !shop.machines.some((one) => one.prefix === prefix)) showShop(shop, prefix);
     else await showOne(prefix, shop.machines.length);
-    connection(shop.status);
+    connection({...shop.status, machines: shop.machines.length});
+    for (const box of document.querySelectorAll('.scroll[role="region"]')) box.dataset.scrolls = box.scrollWidth > box.clientWidth + 1;
   } catch (error) {
     const since = lastAnswer ? lastAnswer.toLocaleTimeString("en-GB") : "the page was opened";
     verdict("bad", "No answer", `compensator watch has not answered since ${since}; the values below are out of date. Restart compensator watch --page.`);
@@ -58,7 +60,7 @@ async function update() {
 }
 
 function connection(status) {
-  const text = status.connected ? `Connected to ${status.where}.` : `No connection to ${status.where}; retrying. The values below are out of date.`;
+  const text = status.connected ? `Connected to ${status.where}.` : `No connection to ${status.where}; retrying.${status.machines ? " The values below are out of date." : ""}`;
   setText($("note"), text + (status.ignored ? ` ${status.ignored} message(s) with unknown keys or of further machines ignored.` : ""));
   const now_s = Date.now() / 1000, place = Intl.DateTimeFormat().resolvedOptions().timeZone;
   setText($("zone"), `Times of day are in this computer's time zone, ${place === "UTC" ? "" : `${place}, `}${zone(now_s)}.`);
@@ -67,9 +69,9 @@ function connection(status) {
 
 function verdict(tone, word, text) {
   const element = $("verdict"), words = `${SIGNS[tone]} ${word}`;
-  if (element.textContent === words + text) return;
+  if (element.textContent === words + text.replaceAll("`", "")) return;
   element.className = `verdict ${tone}`;
-  element.replaceChildren(make("b", {}, words), text);
+  element.replaceChildren(make("b", {}, words), ...prose(text));
 }
 
 // ---------------------------------------------------------------- a shop
@@ -77,6 +79,7 @@ function verdict(tone, word, text) {
 function showShop(shop, missing) {
   $("shop").hidden = false; $("machine").hidden = true; $("all").hidden = missing === null;
   setText($("title"), "quill-compensator, live"); document.title = "Machines, live";
+  $("machines").closest("section > .scroll").hidden = $("heard").hidden = !shop.machines.length;
   const tones = shop.machines.map((one) => one.tone);
   const tone = !tones.length || tones.includes("bad") ? "bad" : tones.includes("warn") ? "warn" : "good";
   if (missing !== null) verdict("bad", "Silent", `No messages from ${missing}.`);
@@ -115,7 +118,7 @@ function fillRow(row, machine) {
 // ---------------------------------------------------------------- one machine
 
 async function showOne(prefix, count) {
-  if (past.prefix !== prefix) { past = {prefix, history: null}; drawn = ""; }
+  if (past.prefix !== prefix) { past = {prefix, history: null}; drawn = ""; shown = null; }
   const times = past.history ? past.history.t_s : [];
   // The newest points are requested again: their values come in several messages.
   const since = times.length ? Math.max(times[times.length - 1] - 300, 0) : 0;
@@ -144,8 +147,8 @@ function joined(before, news, now_s) {
 
 function sentence(machine) {
   const offset = `${signed(machine.y_offset_um)} µm`;
-  if (machine.shown === "silent") return `for ${age(machine.age_s)}; the last offset was ${offset}. ${machine.means} ${machine.do}`;
-  if (machine.shown === "unknown") return `${machine.means} ${machine.do}`;
+  if (machine.shown === "silent") return `for ${age(machine.age_s)}; the last offset was ${offset}.`;
+  if (machine.shown === "unknown") return machine.means;
   return `${known(machine.y_offset_um) ? `offset ${offset}` : "no offset"}. ${machine.means}`;
 }
 
@@ -154,7 +157,7 @@ function list(id, lines, kind) {
   section.hidden = !lines.length;
   if (section.dataset.key === key) return;
   section.dataset.key = key;
-  const items = make("ul", {}, ...lines.map((line) => make("li", {}, ...line)));
+  const items = make("ul", {}, ...lines.map((line) => make("li", {}, ...line.flatMap((part) => typeof part === "string" ? prose(part) : part))));
   section.lastElementChild.replaceChildren(make("div", {class: `words ${kind}`}, items));
 }
 
@@ -226,7 +229,7 @@ function events(found) {
   if ($("events").dataset.key === key) return;
   $("events").dataset.key = key;
   const lines = found.slice(0, 20).map((event) => make("li", {}, make("b", {}, `${stamp(event.time_utc_ns / 1e9)} ${event.kind}: `),
-    event.text, ...(event.do ? [" ", make("b", {}, "Action: "), event.do] : [])));
+    ...prose(event.text), ...(event.do ? [" ", make("b", {}, "Action: "), ...prose(event.do)] : [])));
   $("events").replaceChildren(lines.length ? make("ul", {}, ...lines) : make("p", {}, "None."));
 }
 
@@ -247,123 +250,6 @@ function points(history) {
   const rows = history.t_s.map((t, i) => [clock(t), history.state[i] ?? "–", signed(history.y_offset_um[i]), plain(history.y_offset_std_um[i]),
     signed(history.y_dtf_um[i]), signed(history.y_tdtf_um[i]), signed(history.residual_um[i]), plain(history.t_q_degc[i]), plain(history.at_degc[i])]);
   fill($("points"), rows.slice(-60).reverse());
-}
-
-// ---------------------------------------------------------------- pictures
-
-const gap = () => Math.max(150, current_valid);
-let current_valid = 150;
-
-function pictures(machine, history, end) {
-  current_valid = machine.valid_for_s ?? 150;
-  const width = $("pictures").clientWidth;
-  const key = `${machine.prefix} ${width} ${JSON.stringify([history.t_s.length, ...["t_s", "y_offset_um", "residual_um", "t_q_degc", "y_dtf_um"].map((n) => history[n][history[n].length - 1])])} ${Math.floor(end / 60)}`;
-  if (key === drawn) return;
-  drawn = key;
-  const from = Math.max(end - DAY_S, Math.min(history.t_s[0] ?? end, end - 600));
-  const frame = {from, end, width, t: history.t_s};
-  const line = (name, y, band) => ({name, y, band});
-  const count = Math.max(0, ...history.effects.map((one) => one.length));
-  const several = count > (machine.probe ? 2 : 3)
-    ? [line("effects together", history.effects.map((one) => one.length ? one.reduce((a, b) => a + (b ?? NaN), 0) : null))]
-    : Array.from({length: count}, (_, i) => line(effects[i] ?? `effect ${i + 1}`, history.effects.map((one) => one[i] ?? null)));
-  const probes = machine.probe ? [line("probes", history.y_pred_um.map((y, i) => [y, history.y_base_um[i], history.y_dtf_um[i], history.y_tdtf_um[i], ...history.effects[i]].every(known)
-    ? y + history.y_base_um[i] - history.y_dtf_um[i] - history.y_tdtf_um[i] - history.effects[i].reduce((a, b) => a + b, 0) : null))] : [];
-  $("loop-picture").replaceChildren(...shadow(frame, machine, history));
-  $("pictures").replaceChildren(
-    chart(frame, "Offset, added to the commanded Y, with its standard deviation", "µm", [line("offset", history.y_offset_um, history.y_offset_std_um)], history.state),
-    chart(frame, "Predicted deformation by path", "µm", [line("DTF (heat)", history.y_dtf_um), line("TDTF (air)", history.y_tdtf_um), ...several, ...probes]),
-    chart(frame, "Residual: measured − predicted deformation", "µm", [line("residual", history.residual_um)]),
-    chart(frame, "Temperatures", "°C", [line("T_Q", history.t_q_degc), line("AT", history.at_degc)]));
-}
-
-function ticks(low, high, count) {
-  const rough = (high - low) / count, ten = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((m) => m * ten).find((s) => s >= rough);
-  const found = [];
-  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push(k * step);
-  return {found, digits: Math.max(0, -Math.floor(Math.log10(step)))};
-}
-
-function hours(from, end, count) {
-  const steps = [60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 14400, 21600];
-  const step = steps.find((s) => (end - from) / s <= count) ?? 43200;
-  const shift = new Date(1000 * end).getTimezoneOffset() * 60, found = [];
-  for (let t = Math.ceil((from - shift) / step) * step + shift; t <= end; t += step) found.push(t);
-  return found;
-}
-
-function chart(frame, title, unit, series, states) {
-  const {from, end, width, t} = frame;
-  const left = 52, right = 8, top = 6, strip = states ? 26 : 0, tall = width < 500 ? 170 : 210, height = tall + strip + 40;
-  const caption = make("figcaption", {}, title), keys = make("ul", {class: "keys"});
-  const values = series.flatMap((one) => one.y.flatMap((v, i) => known(v) ? (one.band && known(one.band[i]) ? [v - one.band[i], v + one.band[i]] : [v]) : []));
-  const ranges = series.map((one) => { const seen = one.y.filter(known); return seen.length ? `${one.name} last ${plain(seen[seen.length - 1])} ${unit}, from ${plain(Math.min(...seen))} to ${plain(Math.max(...seen))}` : `${one.name}: no values`; });
-  const svg = make("svg", {viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${title}. ${ranges.join("; ")}; in the last ${((end - from) / 3600).toFixed(1)} h.`});
-  const figure = make("figure", {}, caption, keys, svg);
-  series.forEach((one, i) => keys.append(make("li", {}, make("svg", {viewBox: "0 0 32 12", "aria-hidden": "true"}, make("path", {d: "M0 6H32", class: `curve c${i}`})), one.name)));
-  if (!values.length) { keys.replaceChildren(make("li", {}, "no values yet")); }
-  let low = values.length ? Math.min(...values) : 0, high = values.length ? Math.max(...values) : 1;
-  if (high - low < 0.2) { const middle = (high + low) / 2; low = middle - 0.1; high = middle + 0.1; }
-  const margin = 0.06 * (high - low); low -= margin; high += margin;
-  const x = (s) => left + (s - from) / (end - from) * (width - left - right), y = (v) => top + (high - v) / (high - low) * (tall - top);
-  const rungs = ticks(low, high, 6);
-  for (const v of rungs.found) svg.append(make("line", {x1: left, x2: width - right, y1: y(v), y2: y(v), class: "axis"}),
-    make("text", {x: left - 6, y: y(v) + 4, "text-anchor": "end"}, plain(v, rungs.digits)));
-  for (const s of hours(from, end, width / 75)) svg.append(make("line", {x1: x(s), x2: x(s), y1: top, y2: tall + strip, class: "axis"}),
-    make("text", {x: Math.min(Math.max(x(s), left), width - 20), y: tall + strip + 16, "text-anchor": "middle"}, clock(s)));
-  svg.append(make("text", {x: width - right, y: height - 6, "text-anchor": "end"}, `time of day, ${zone(end)}`), make("text", {x: 2, y: height - 6}, `${title.split(/[:,]/)[0].toLowerCase().replace("predicted deformation by path", "share")}, ${unit}`));
-  series.forEach((one, i) => {
-    if (one.band) svg.append(make("path", {d: bands(t, one, from, x, y), class: `band c${i}`}));
-    svg.append(make("path", {d: curve(t, one.y, from, x, y), class: `curve c${i}`}));
-  });
-  if (states) strips(svg, t, states, from, x, tall + 4);
-  return figure;
-}
-
-function curve(t, values, from, x, y) {
-  let path = "", before = null;
-  t.forEach((s, i) => {
-    if (!known(values[i]) || s < from) { before = s < from ? before : null; return; }
-    const joins = before !== null && s - before < gap();
-    // An isolated point is drawn as a dot.
-    path += joins ? `L${x(s).toFixed(1)} ${y(values[i]).toFixed(1)}` : `M${x(s).toFixed(1)} ${y(values[i]).toFixed(1)}h.1`;
-    before = s;
-  });
-  return path;
-}
-
-function bands(t, one, from, x, y) {
-  let path = "", run = [];
-  const close = () => {
-    if (run.length > 1) path += "M" + run.map(([s, v, d]) => `${x(s).toFixed(1)} ${y(v + d).toFixed(1)}`).join("L") + "L"
-      + run.reverse().map(([s, v, d]) => `${x(s).toFixed(1)} ${y(v - d).toFixed(1)}`).join("L") + "Z";
-    run = [];
-  };
-  t.forEach((s, i) => {
-    if (s < from || !known(one.y[i]) || !known(one.band[i])) return close();
-    if (run.length && s - run[run.length - 1][0] > gap()) close();
-    run.push([s, one.y[i], one.band[i]]);
-  });
-  close();
-  return path;
-}
-
-function strips(svg, t, states, from, x, top) {
-  // Higher is worse, so that the strip is readable without colour; intervals without messages are blank.
-  const tall = {good: 5, warn: 12, bad: 20};
-  let i = 0;
-  while (i < t.length) {
-    let j = i;
-    while (j + 1 < t.length && states[j + 1] === states[i] && t[j + 1] - t[j] < gap()) j++;
-    if (t[j] >= from && states[i]) {
-      const tone = TONES[states[i]] ?? "bad", h = tall[tone];
-      const first = Math.max(t[i] - 60, from), bar = make("rect", {x: x(first), y: top + 20 - h, width: Math.max(x(t[j]) - x(first), 1.5), height: h, class: `s-${tone}`});
-      svg.append(bar);
-    }
-    i = j + 1;
-  }
-  svg.append(make("text", {x: 46, y: top + 18, "text-anchor": "end"}, "state"));
 }
 
 // ---------------------------------------------------------------- always

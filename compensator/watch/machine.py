@@ -16,7 +16,17 @@ from compensator.messages import MESSAGES, SCHEMA, EstimateMessage, Event, Offse
 from compensator.watch.cutting import Headline, headline
 from compensator.watch.history import MachineHistory, usable
 from compensator.watch.sequence import Sequence
-from compensator.watch.words import LOOP_COMMANDS, TONES, ExplainedCode, Tone, age, explained, loop_text, to_do
+from compensator.watch.words import (
+    LOOP_COMMANDS,
+    TONES,
+    ExplainedCode,
+    Tone,
+    age,
+    explained,
+    explained_together,
+    loop_text,
+    to_do,
+)
 
 #: Kinds of messages by the part of their key after `thermal/`.
 KINDS = {"y/offset": "offset", "sample": "sample", "estimate": "estimate", "status": "status", "event": "event"}
@@ -28,6 +38,7 @@ EVENTS = 50
 MISFIT_MIN, MISFIT_STDS, MISFIT_UM = 30, 5.0, 1.0
 #: Warnings that need attention although the service itself reports `ok`.
 ATTENTION = {WatchWarning.TOKEN_GONE, WatchWarning.MALFORMED_MESSAGES, WatchWarning.MISFIT}
+_SEVERE = {*ATTENTION, WatchWarning.TWO_SERVICES}
 #: A message farther ahead of this computer's clock than this shows that the clocks differ, s.
 AHEAD_S = 5.0
 #: Values of a snapshot that are copied from the messages.
@@ -255,7 +266,7 @@ class WatchedMachine:
         offset, status = self._offset, self._status
         shown = self.shown(now_ns, monotonic_s)
         old_s = self.age_s(now_ns, monotonic_s)
-        reasons = [explained(code) for code in offset.reasons] if offset else []
+        reasons = explained_together(offset.reasons) if offset else []
         warnings = self.warnings(now_ns, monotonic_s)
         found: dict[str, Any] = {
             "prefix": self.prefix,
@@ -267,7 +278,7 @@ class WatchedMachine:
             "alive": self.alive,
             "reasons": [words._asdict() for words in reasons],
             "to_do": _to_do(shown, reasons, warnings),
-            "headline": self._headline(shown, _tone(shown, warnings), now_ns)._asdict(),
+            "headline": self._headline(shown, warnings, now_ns)._asdict(),
             "warnings": list(warnings),
             "warning_codes": [warning.code for warning in warnings],
             "age_s": round(old_s, 3) if old_s is not None else None,
@@ -290,18 +301,19 @@ class WatchedMachine:
         found["probe"] = self._probe(status) if self._fresh(status, now_ns) else None
         return found | {name: getattr(status, name, None) for name in _STATUS}
 
-    def _headline(self, shown: str, tone: str, now_ns: int) -> Headline:
+    def _headline(self, shown: str, warnings: list[Remark], now_ns: int) -> Headline:
         """Return whether one may cut, and until when."""
         status = self._status if self._fresh(self._status, now_ns) else None
         until = status.predicts_until_utc_ns if status is not None else UNSET
         return headline(
             shown=shown,
-            tone=tone,
+            tone=_tone(shown, warnings),
             reasons=self._offset.reasons if self._offset is not None else (),
             channels=self._measured(now_ns)["channels"],
             until_ns=None if isinstance(until, UnsetType) else until,
             now_ns=now_ns,
             std_um=self._offset.y_offset_std_um if self._offset is not None else None,
+            warnings=list(map(str, sorted(warnings, key=lambda one: one.code not in _SEVERE))),
         )
 
     @staticmethod

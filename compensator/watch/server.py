@@ -8,6 +8,7 @@ be changed through it, and the page loads nothing from other servers.
 from __future__ import annotations
 
 import base64
+import errno
 import hashlib
 import hmac
 import html
@@ -90,7 +91,7 @@ class PageServer:
             self._server = server((self._host, self._port), _Handler)
         except (OSError, OverflowError) as error:
             where = f"--port {self._port}" if self._host == HOST else f"--bind {self._host} --port {self._port}"
-            raise ServiceError(f"{where}: {error}; 0 selects a free port") from error
+            raise ServiceError(f"{where}: {error}; {_to_do(error)}") from error
         self._server.answer, self._server.token = self._answer, self._token
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="live page")
         self._thread.start()
@@ -124,8 +125,22 @@ class PageServer:
         return None
 
 
+def _to_do(error: Exception) -> str:
+    """Return what to do about a server that could not be bound."""
+    if isinstance(error, socket.gaierror) or getattr(error, "errno", None) == errno.EADDRNOTAVAIL:
+        return "expected --bind with an address of this computer, such as 192.168.0.10, or 0.0.0.0 for all of them"
+    if getattr(error, "errno", None) == errno.EACCES:
+        return "ports below 1024 are for the system; 0 selects a free one"
+    return "0 selects a free port"
+
+
 def _json(found: Any) -> tuple[str, bytes]:
     return "application/json", json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
+
+
+def _prose(text: str) -> str:
+    """Return a text as HTML; a command between backticks is code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
 
 
 @cache
@@ -136,10 +151,9 @@ def page() -> tuple[bytes, str]:
         return resources.files(room).joinpath(name).read_text(encoding="utf-8")
 
     style = part("compensator.report", "style.css") + part("compensator.watch", "live.css")
-    script = part("compensator.watch", "live.js")
+    script = part("compensator.watch", "live_plots.js") + part("compensator.watch", "live.js")
     words = "".join(
-        f'<dt id="word={code}"><code>{code}</code></dt>'
-        f"<dd>{html.escape(meaning)} <b>Action:</b> {html.escape(action)}</dd>"
+        f'<dt id="word={code}"><code>{code}</code></dt><dd>{_prose(meaning)} <b>Action:</b> {_prose(action)}</dd>'
         for code, (meaning, action) in {**WORDS, **SUFFIX_WORDS}.items()
     )
     text = part("compensator.watch", "live.html")
@@ -187,6 +201,9 @@ class _Handler(BaseHTTPRequestHandler):
             parts = urlsplit(self.path)
         except ValueError:
             return self._send(HTTPStatus.BAD_REQUEST, "text/plain", b"expected a path\n")
+        if self._is_token(parts.path.removeprefix("/")):
+            # Without the last slash the page's own requests would miss the token.
+            return self._send(HTTPStatus.PERMANENT_REDIRECT, "text/plain", b"", Location=f"/{self.server.token}/")
         path = self._below_token(parts.path)
         found = self.server.answer(path, parse_qs(parts.query)) if path is not None else None
         if found is None:
@@ -206,9 +223,12 @@ class _Handler(BaseHTTPRequestHandler):
         if not self.server.token:
             return path
         _, given, rest = [*path.split("/", 2), "", ""][:3]
-        right = hmac.compare_digest(given.encode("utf-8", "replace"), self.server.token.encode())
-        # Without the last slash the page's own requests would miss the token.
-        return f"/{rest}" if right and path.count("/") > 1 else None
+        return f"/{rest}" if self._is_token(given) and path.count("/") > 1 else None
+
+    def _is_token(self, given: str) -> bool:
+        return bool(self.server.token) and hmac.compare_digest(
+            given.encode("utf-8", "replace"), self.server.token.encode()
+        )
 
     def _has_own_host(self) -> bool:
         if self.server.token:
@@ -217,7 +237,7 @@ class _Handler(BaseHTTPRequestHandler):
         port = self.server.server_port
         return self.headers.get("Host", "") in (f"{HOST}:{port}", f"localhost:{port}")
 
-    def _send(self, code: HTTPStatus, kind: str, body: bytes) -> None:
+    def _send(self, code: HTTPStatus, kind: str, body: bytes, **headers: str) -> None:
         self.send_response(code)
         for name, value in (
             ("Content-Type", kind),
@@ -227,6 +247,7 @@ class _Handler(BaseHTTPRequestHandler):
             ("X-Content-Type-Options", "nosniff"),
             ("Cross-Origin-Resource-Policy", "same-origin"),
             ("Referrer-Policy", "no-referrer"),
+            *headers.items(),
         ):
             self.send_header(name, value)
         if code == HTTPStatus.METHOD_NOT_ALLOWED:

@@ -128,7 +128,7 @@ def headline(machines: list[dict[str, Any]]) -> str:
     '3 machines: 1 silent, 2 ok'
     """
     if not machines:
-        return "No machine received."
+        return "No machine is heard."
     counts: dict[str, int] = {}
     for name in TONES:
         count = sum(machine["shown"] == name for machine in machines)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
-from compensator.codes import State, WatchWarning, explain
+from compensator.codes import Reason, State, WatchWarning, explain
 from compensator.events import EventKind, LoopAction, RecordingCode, RecordingData, data_of
 from compensator.messages import Event
 from compensator.report.local_time import here
@@ -25,6 +25,8 @@ TONES: Mapping[str, Tone] = {
 }
 #: Sign of each severity, readable without colour.
 SIGNS: Mapping[Tone, str] = {"good": "✓", "warn": "⚠", "bad": "✗"}
+#: What to do as long as several suspects explain why measured and predicted Y diverge.
+SEVERAL_SUSPECTS = "Measure the part; check a sensor when it is named alone."
 #: What probes on demand are for.
 PROBE_FOR = (
     "Probing before a tight feature only when a probe is wanted saves about half of the probes; timing alone saves "
@@ -68,6 +70,21 @@ def explained(code: str) -> ExplainedCode:
     return ExplainedCode(code, *found)
 
 
+def explained_together(codes: Sequence[str]) -> list[ExplainedCode]:
+    """Return the reasons of an offset; several suspects send nobody to a sensor that may be healthy.
+
+    Examples
+    --------
+    >>> explained_together(["implausible:at_degc", "implausible:model"])[0].do
+    'Measure the part; check a sensor when it is named alone.'
+    """
+    found = [explained(code) for code in codes]
+    suspects = [code for code in codes if code.startswith(f"{Reason.IMPLAUSIBLE}:")]
+    if len(suspects) < 2:
+        return found
+    return [one._replace(do=SEVERAL_SUSPECTS) if one.code in suspects else one for one in found]
+
+
 def to_do(event: Event) -> str:
     """Return the action for an event; empty if none is needed."""
     if event.kind in (EventKind.DEVICE, EventKind.ADOPT) and event.data.get("ok") is not False:
@@ -79,7 +96,9 @@ def to_do(event: Event) -> str:
         state = str(event.data.get("state", ""))
         reasons = event.data.get("reasons")
         codes = [str(code) for code in reasons] if isinstance(reasons, list) and reasons else [state]
-        return " ".join(dict.fromkeys(explained(code).do for code in codes)) if state not in ("", State.OK) else ""
+        return (
+            " ".join(dict.fromkeys(one.do for one in explained_together(codes))) if state not in ("", State.OK) else ""
+        )
     if event.kind == EventKind.DIAGNOSIS:
         return str(event.data.get("needs", ""))
     if event.kind == EventKind.LOOP and event.data.get("step") == LoopAction.PROPOSE:
@@ -123,11 +142,12 @@ def loop_text(loop: Mapping[str, Any]) -> str:
         `loop` of a status.
     """
     effects = ", ".join(loop["effects"]) or "no added effect"
+    why = f"{loop['text'][:1].upper()}{loop['text'][1:]}"
     words = {
         "idle": "Model: nothing better is known.",
-        "shadow": f"Model: a candidate with {effects} runs beside the present one. {loop['text']}.",
-        "proposed": f"Model: a better one is proposed, with {effects}. {loop['text']}.",
-        "watching": f"Model: the one before ({effects}) goes on beside the adopted one. {loop['text']}.",
+        "shadow": f"Model: a candidate with {effects} runs beside the present one. {why}.",
+        "proposed": f"Model: a better one is proposed, with {effects}. {why}.",
+        "watching": f"Model: the one before ({effects}) goes on beside the adopted one. {why}.",
     }
     text = words[loop["phase"]]
     return f"{text} A diagnosis is in progress." if loop["diagnosing"] else text

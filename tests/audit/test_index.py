@@ -162,7 +162,7 @@ CASES: dict[str, tuple[Callable[[list[Record]], list[Record]], str, str]] = {
     "statistics, end": (edit(STATISTICS, add(34, -(10**9))), "statistics", "last message (ns):"),
     "statistics, one channel": (edit(STATISTICS, add(48, 1)), "statistics", "messages by channel:"),
     "statistics gone": (edit(STATISTICS, gone), "statistics", "are missing"),
-    "channel under another name": (edit(CHANNEL, renamed, -4), "channel 3", "otherwise than in the file"),
+    "channel under another name": (edit(CHANNEL, renamed, -4), "channel 3", "differs between the summary and the file"),
     "channel gone": (edit(CHANNEL, gone, -1), "channel 6", "is not repeated"),
     "schema gone": (edit(SCHEMA, gone, -1), "schema 6", "is not repeated"),
     "summary offset gone": (edit(SUMMARY_OFFSET, gone, 3), "summary offset", "none leads to those at byte"),

@@ -2,7 +2,7 @@
 
 The published model runs on three days of work; the machine differs from it: the DTF's gain by ±10 % alone, or with a
 drift, a slow response to the ambient, or a source that no channel shows. Probes have 1.5 µm of noise; in a second run
-one in 20 is wrong by 20 µm besides. Rows of probes are not judged, nor those before the first.
+one in 20 is wrong by 20 µm besides. Rows of probes do not count, nor those before the first.
 
 left      rms of the error, % of that without compensation.
 stated    rms of the error over that of the stated deviation.

@@ -148,7 +148,7 @@ def test_without_recordings_it_is_said_that_nothing_was_judged(
 ) -> None:
     model = stronger(tmp_path, Path(__file__).parents[2] / "compensator/model/quill.toml")
     assert main(["adopt", str(model), "--config", str(idle)]) == 0
-    assert "not judged" in capsys.readouterr().out
+    assert "no verdict" in capsys.readouterr().out
 
 
 def test_an_adopted_model_that_was_damaged_is_said_and_the_configured_one_stands_in(
@@ -258,7 +258,7 @@ def test_killed_restarted_and_given_another_model(tmp_path: Path, capsys: pytest
             assert main(["adopt", str(model), "--config", str(config), "--json"]) == 0
             answer = result(capsys)
             assert answer["service_reached"] and answer["model_sha256"] == new and answer["state_known"]
-            assert answer["comparison"]["verdict"] == "not_judged" and "not judged: " in answer["text"]
+            assert answer["comparison"]["verdict"] == "not_judged" and "no verdict: " in answer["text"]
             receiver.until(lambda offsets: offsets[-1]["model_sha256"] == new)
             process.send_signal(signal.SIGTERM)
             assert process.wait(timeout=20) == 0

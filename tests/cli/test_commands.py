@@ -387,6 +387,23 @@ def test_wrong_usage_is_one_line_that_leads_to_the_help(words: list[str], capsys
     assert START_NS % 60_000_000_000 == 0
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["completion"], "required: shell (one of bash, zsh, fish);"),
+        (["completion", "bsh"], "did you mean bash"),
+        (["bridge"], "required: protocol (one of opcua, probes), --config;"),
+        (["explain", "--cod"], "unrecognized arguments: --cod"),
+    ],
+)
+def test_wrong_usage_names_what_can_be_chosen(
+    words: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(words)
+    assert expected in capsys.readouterr().err
+
+
 def test_every_command_is_there_and_its_example_parses(capsys: pytest.CaptureFixture[str]) -> None:
     for command in COMMANDS:
         assert callable(load(command))

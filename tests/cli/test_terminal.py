@@ -74,6 +74,18 @@ def test_a_table_of_two_columns_wraps_its_second() -> None:
     assert lines[:2] == ["model", "  quill"] and lines[2] == "what" and max(map(len, lines)) <= 40
 
 
+def test_the_overview_of_commands_fits_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for columns in (66, 80):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        with pytest.raises(SystemExit):
+            main(["--help"])
+        text = capsys.readouterr().out
+        assert max(map(len, text.splitlines())) <= columns
+        assert "identify   fit a model to measured runs\n" in text and "completion print" in text
+
+
 def test_the_style_changes_no_letter_and_marks_the_verdict() -> None:
     text = "✓ Proven: 3 samples.\n\nErrors of\nall\ndata  rms\na      1\n\nWarnings:\n- one\npage: a.html"
     found = styled(text)

@@ -72,7 +72,46 @@ def test_a_column_of_words_is_left_out(run: Path, tmp_path: Path) -> None:
     lines = run.read_text(encoding="utf-8").splitlines()
     table = [f"{lines[0]},program", *(f"{line},{'O1234' if i % 3 else 7}" for i, line in enumerate(lines[1:]))]
     (tmp_path / "run.csv").write_text("\n".join(table), encoding="utf-8")
-    assert "program" not in tc.read(tmp_path / "run.csv").table.columns
+    found = tc.read(tmp_path / "run.csv")
+    assert "program" not in found.table.columns
+    (remark,) = found.remarks
+    assert remark.code == "column_left_out" and "row 3: program = 'O1234' (480 like it): no number" in remark
+
+
+def test_a_value_marked_bad_is_not_used(run: Path, tmp_path: Path) -> None:
+    lines = run.read_text(encoding="utf-8").splitlines()
+    marks = {100: "stuck", 101: "Over_Range", 300: ""}
+    rows = [f"{lines[0]},at_degc_quality", *(f"{line},{marks.get(i, 'good')}" for i, line in enumerate(lines[1:]))]
+    (tmp_path / "run.csv").write_text("\n".join(rows), encoding="utf-8")
+    wanted, found = tc.read(run).table.columns["at_degc"].copy(), tc.read(tmp_path / "run.csv")
+    wanted[[100, 101]] = np.nan
+    np.testing.assert_array_equal(found.table.columns["at_degc"], wanted)
+    (remark,) = found.remarks
+    assert remark.code == "marked_bad" and "row 102: at_degc is marked 'stuck'; 2 value(s)" in remark
+    named = tc.read(tmp_path / "run.csv", columns={"t_q_degc": "at_degc"}).table.columns["t_q_degc"]
+    np.testing.assert_array_equal(named, wanted)
+
+
+@pytest.mark.parametrize(
+    ("column", "code"),
+    [("t_q_degc", 850.0), ("at_degc", 999.0), ("y_um", -9999.0), ("heat_w", 65535.0), ("spindle_rpm", -999.0)],
+)
+def test_a_fault_code_is_refused_before_it_is_averaged(run: Path, column: str, code: float) -> None:
+    table = arrays(run)
+    table["spindle_rpm"] = np.linspace(0.0, 9000.0, table["t_s"].size) % 400.0
+    table[column] = table[column].copy()
+    table[column][[50, 51, 400]] = code
+    words = f"data: row 50: {column} = {code:g}, 3 row.s. like it: a fault's code"
+    with pytest.raises(DataError, match=words):
+        tc.read(table).at_period(120.0)
+
+
+def test_a_large_number_among_others_is_no_fault_code(run: Path) -> None:
+    table = arrays(run)
+    table["spindle_rpm"] = np.where(np.arange(table["t_s"].size) % 2, 9999.0, 0.0)
+    table["program"] = np.where(np.arange(table["t_s"].size) % 90, 12.0, 9999.0)
+    table["furnace_degc"] = np.linspace(20.0, 850.0, table["t_s"].size)
+    assert tc.read(table).at_period(60.0).records[0].columns["furnace_degc"].max() == 850.0
 
 
 @pytest.mark.parametrize(("factor", "words"), [(3600.0, "hours"), (60.0, "minutes")])
@@ -81,9 +120,15 @@ def test_a_time_in_hours_or_minutes_is_asked_about(run: Path, factor: float, wor
     # A day of work: T_Q goes up and down by many kelvins within hours.
     hours = np.arange(table["t_s"].size) / 60.0
     table["t_q_degc"] = table["at_degc"] + 12.0 * (1.0 - np.cos(hours))
-    table["t_s"] = table["t_s"] / factor
-    with pytest.raises(DataError, match=rf"{words}\? expected seconds"):
+    wanted = tc.simulate("quill", table)["y_pred_um"]
+    table["t_s"] = np.round(table["t_s"] / factor, 4)
+    named = f"time_{'h' if factor == 3600.0 else 'min'}"
+    with pytest.raises(DataError, match=rf"{words}\? expected seconds; .* --column {named}=NAME"):
         tc.simulate("quill", table)
+    answered = tc.read(table, columns={named: "t_s"})
+    np.testing.assert_array_equal(tc.simulate("quill", answered)["y_pred_um"], wanted)
+    renamed = {named if name == "t_s" else name: values for name, values in table.items()}
+    np.testing.assert_array_equal(tc.simulate("quill", renamed)["y_pred_um"], wanted)
     table["t_s"] = table["t_s"] * factor
     assert np.isfinite(tc.simulate("quill", table)["y_pred_um"]).all()
 

@@ -22,7 +22,7 @@ import pytest
 from compensator.cli import main
 from compensator.clock import NS
 from compensator.config import load_config
-from compensator.demo.live import STUCK_AFTER_MIN, _noticing, apply_fault, run_live
+from compensator.demo.live import STUCK_AFTER_MIN, _noticing, _read_commands, apply_fault, run_live
 from compensator.demo.machine import CapaNcdt, configuration, hardware
 from compensator.messages import Offset
 from compensator.recording.reading import read_messages, recordings
@@ -176,3 +176,34 @@ def test_a_machine_runs_on_with_its_past_on_record(tmp_path: Path, capfd: pytest
     steps = {b.time_utc_ns - a.time_utc_ns for a, b in itertools.pairwise(offsets)}
     assert steps == {60 * NS}, "no gap where the past ends and real time begins"
     assert main(["replay", str(folder)]) == 0
+
+
+class Endless(io.TextIOBase):
+    """An input that never ends, as /dev/zero, and counts what is read of it."""
+
+    def __init__(self, text: str) -> None:
+        self.text, self.read_chars = text, 0
+
+    def readline(self, size: int = -1) -> str:
+        assert size > 0, "an endless line must not be read whole"
+        self.read_chars += size
+        assert self.read_chars < 10_000, "the input must not be read without an end"
+        return self.text * size
+
+
+class NoText(io.TextIOBase):
+    def readline(self, size: int = -1) -> str:
+        raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
+
+
+@pytest.mark.parametrize("typed", [Endless("\0"), Endless("x"), NoText()], ids=["zeros", "one line", "no text"])
+def test_an_input_without_an_end_is_left_alone(typed: io.TextIOBase, capsys: pytest.CaptureFixture[str]) -> None:
+    _read_commands(typed, {})
+    assert capsys.readouterr().err == "The input is no text: typed commands are not read any more.\n"
+
+
+def test_a_closed_input_is_no_error(capsys: pytest.CaptureFixture[str]) -> None:
+    _read_commands(None, {})
+    _read_commands(io.StringIO(""), {})
+    _read_commands(io.StringIO("hello"), {})
+    assert capsys.readouterr().err.startswith("'hello': expected one of break")

@@ -8,12 +8,13 @@ import pytest
 from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
-from compensator.diagnose.fit import fit_terms
+from compensator.diagnose.fit import Term, fit_terms
 from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.points import Points
 from compensator.diagnose.search import Search
 from compensator.diagnose.standard_errors import deviations, standard_errors
 from compensator.diagnose.summary import figures, verdict
+from compensator.display import is_determined
 from compensator.identify.calibration import predict
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_model
@@ -117,6 +118,26 @@ def test_standard_errors_are_what_scatters():
         values.append(fit.terms[0].amplitudes[0])
         stds.append(standard_errors(fit)[0]["change"])
     assert 0.5 * np.std(values) < np.mean(stds) < 2.0 * np.std(values)
+
+
+def test_of_two_equal_lags_the_sum_is_stated():
+    """Each gain by itself is anything; what the channel does at rest is known, and comes first."""
+    columns, _, _ = record([draw("input", 3, 4.0)], 70, 24.0)
+    evidence = evidence_of(QUILL, runs_from(columns))
+    one = Search(evidence).run().fit.terms[0]
+    of_channel = [h for h in proposals(evidence.context) if h.place == one.hypothesis.place]
+    two = next(h for h in of_channel if h.form == "two lags")
+    (tau,) = one.values
+    term = Term(
+        hypothesis=two, values=(tau, 1.001 * tau), amplitudes=(3.0 * one.amplitudes[0], -2.0 * one.amplitudes[0])
+    )
+    points = Points(evidence)
+    fit = fit_terms(Likelihood(points, points.typical_rest()), [one.start])
+    (error,) = standard_errors(dataclasses.replace(fit, terms=(term,)))
+    gain, first, second = (name for name in term.named if name.startswith("gain_"))
+    assert next(iter(term.named)) == gain and term.named[gain] == pytest.approx(one.amplitudes[0])
+    assert not is_determined(term.named[first], error[first]) and not is_determined(term.named[second], error[second])
+    assert error[gain] < 0.1 * abs(term.named[gain])
 
 
 def test_what_makes_data_worse_that_was_not_seen_is_no_explanation(monkeypatch):

@@ -20,7 +20,7 @@ from compensator.report.page import Page, Section, Table, write_page
 
 TOP = Path(__file__).resolve().parents[2]
 #: Files with words of users that are not Python.
-PLAIN = ("compensator/watch/live.html", "compensator/watch/live.js")
+PLAIN = ("compensator/watch/live.html", "compensator/watch/live.js", "compensator/watch/live_plots.js")
 _WORDS = 3
 #: What has three words but is read by programs: schemas, styles, paths.
 _CODE = re.compile(r"[{}<>;]|^\s*[A-Z ]+\s*$|--\w+=|\w+\(|https?:")

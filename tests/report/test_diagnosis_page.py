@@ -310,6 +310,8 @@ def test_the_remainder_is_named_as_what_it_is(found: Diagnosis) -> None:
     ]
     worse = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, rms_after_um=1.5))
     assert "corrects some of the rest" not in text(worse) and "does not lower the error" in text(worse)
+    assert "removes nothing that can be measured" in text(worse)
+    assert "removes nothing that can be measured" not in text(with_it)
     idle = dataclasses.replace(with_it, remainder=dataclasses.replace(REMAINDER, deployed=False))
     assert "Not deployed in the extended model." in text(idle)
 

@@ -1,12 +1,15 @@
 """Curves keep their peaks and their gaps, pictures their own names."""
 
+import dataclasses
+import html
+import json
 import re
 
 import numpy as np
 import pytest
 
 from compensator.report.drawing import svg
-from compensator.report.figure import Figure, Line, thinned
+from compensator.report.figure import Bar, Figure, Line, thinned
 from compensator.report.page import Page, Table, write_page
 
 
@@ -73,3 +76,24 @@ def test_every_variable_the_page_uses_is_defined_in_light_dark_and_print(tmp_pat
     ids = re.findall(r'\bid="([^"]+)"', text)
     assert len(ids) == len(set(ids)) > 10
     assert "✗ Failed" in text
+
+
+def test_figures_below_each_other_line_up():
+    """Whatever the numbers at their y axes are."""
+    lefts = []
+    for size in (1.0, 0.09, 400.0):
+        x = np.linspace(0.0, 24.0, 50)
+        figure = Figure(title="t", x_label="time, h", y_label="µm", lines=(Line("a", x, size * np.sin(x)),))
+        plot = json.loads(html.unescape(re.search(r'data-plot="([^"]*)"', svg(figure, "f"))[1]))
+        lefts.append(plot["panels"][0]["box"][0])
+    assert max(lefts) - min(lefts) < 1.0
+
+
+def test_only_a_waterfall_joins_its_bars():
+    bars = (Bar("a", "1", 0.0, 1.0), Bar("b", "2", 0.0, 2.0))
+    alone = tuple(dataclasses.replace(bar, joined=False) for bar in bars)
+    joined, apart = (
+        svg(Figure(title="t", x_label="min", y_label="", bars=some), "f").count("LineCollection")
+        for some in (bars, alone)
+    )
+    assert (joined, apart) == (1, 0)

@@ -54,7 +54,9 @@ def test_hashes_warnings_and_remarks_are_there(page, calibration):
     assert "ab" * 32 in page and "cd" * 32 in page
     assert "gap of 3 sample(s)" in page
     for warning in criticise(calibration).warnings:
-        assert f'<li>{html.escape(warning)} <a href="#word-{warning.code}">' in page
+        # A command is shown as the code that it is.
+        words = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(warning))
+        assert f'<li>{words} <a href="#word-{warning.code}">' in page
         assert f'<div id="word-{warning.code}">' in page
 
 

@@ -118,7 +118,7 @@ async def test_without_measured_y_a_model_is_taken_and_that_is_said(tmp_path: Pa
     machine = Machine(tmp_path, msgspec.structs.replace(settings(), channel=channels))
     asked = machine.at_sample[600] = Asked(machine, "adopt", payload(STRONGER))
     await machine.run(900, adopted(STRONGER, then=1))
-    assert asked.answer["ok"] and "not judged: no measured Y in the last 24 h" in asked.answer["text"]
+    assert asked.answer["ok"] and "no verdict: no measured Y in the last 24 h" in asked.answer["text"]
     found = asked.answer["comparison"]
     assert (found["verdict"], found["why"]) == ("not_judged", "no_y") and found["offset_change_um"] != 0.0
 

@@ -69,7 +69,11 @@ def test_the_standard_deviation_stands_beside_what_may_be_cut() -> None:
 
 
 def test_warnings_of_a_machine_that_is_ok_ask_for_care() -> None:
-    assert of("ok", tone="warn").cut == "care"
+    options: dict[str, Any] = {"reasons": (), "channels": {}, "until_ns": None, "now_ns": NOW_NS}
+    found = headline(shown="ok", tone="warn", warnings=["Two services publish.", "A message is missing."], **options)
+    assert (found.cut, found.text) == ("care", "Two services publish.")
+    # Nothing is pointed at that is not there.
+    assert "below" not in of("degraded").text and of("degraded").text != ""
 
 
 def test_several_suspects_send_nobody_to_a_healthy_sensor() -> None:

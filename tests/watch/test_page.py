@@ -115,7 +115,13 @@ def test_bound_to_another_address_it_answers_below_its_token_only(tmp_path: Path
             assert code_of(f"/{token}/{path}") == 200
             for wrong in ("", f"{token[:-1]}/", f"{token}x/", "%5A/"):
                 assert code_of(f"/{wrong}{path}") == 404, wrong
-        assert code_of(f"/{token}") == 404
+        # Typed without the last slash it leads to the page, and to nowhere else.
+        connection = http.client.HTTPConnection("127.0.0.2", port, timeout=30)
+        connection.request("GET", f"/{token}")
+        answer = connection.getresponse()
+        assert (answer.status, answer.headers["Location"]) == (308, f"/{token}/")
+        connection.close()
+        assert code_of(f"/{token}x") == 404
         assert code_of(f"/{token}/shop.json", "POST") == 405
         text, console = drawn(f"{served.address}#m=shop%2Fvmc-07", tmp_path, 390)
         assert console == "" and "✓ May cut</b>" in text
@@ -132,6 +138,28 @@ def test_a_token_is_made_once_and_kept_for_its_owner_only(tmp_path: Path) -> Non
     made = _token(path)
     assert _token(path) == made and path.stat().st_mode & 0o077 == 0
     assert _token(None) != _token(None)
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "words"),
+    [
+        ("", 0o600, "token: empty, expected 16 to 128"),
+        ("short\n", 0o600, "token: 5 characters, expected 16 to 128"),
+        ("Zm9vYmFyYmF6cXV4MDEyMw\n", 0o644, "token: mode 0644, expected 0600"),
+    ],
+)
+def test_a_token_file_that_protects_nothing_is_refused(tmp_path: Path, text: str, mode: int, words: str) -> None:
+    path = tmp_path / "token"
+    path.write_text(text)
+    path.chmod(mode)
+    with pytest.raises(UsageError, match=words):
+        _token(path)
+
+
+@pytest.mark.parametrize("host", ["192.0.2.7", "10.0.0.1:8710", "no such name"])
+def test_an_address_that_is_not_of_this_computer_says_what_is_expected(host: str) -> None:
+    with pytest.raises(ServiceError, match=f"--bind {host} --port 0: .* expected --bind with an address of this comp"):
+        PageServer(Shop(Clock()), lambda: STATUS, 0, host=host, token="Zm9vYmFyYmF6cXV4MDEyMw").__enter__()
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE"])

@@ -111,3 +111,45 @@ def test_nothing_sticks_out(
         assert said in one["verdict"]
         assert one["out"] == [] and one["wide"] <= int(one["width"]), one
         assert one["unreachable"] == 0 and one["paper"] == ("rgb(255, 255, 255)" if scheme else "rgb(22, 24, 28)")
+
+
+#: Zooms with the mouse and with keys, reads a value, and writes down what the first and the last plot then show.
+ZOOM = """addEventListener("load", () => setTimeout(() => {
+  const plots = () => [...document.querySelectorAll("#pictures svg[tabindex]")];
+  const label = (i) => plots().at(i).getAttribute("aria-label").replace(/.*; /, ""), seen = [label(0)];
+  const drag = (share) => {
+    const box = plots()[0].getBoundingClientRect(), x = box.left + share * box.width;
+    return {clientX: x, clientY: box.top + 50, button: 0, pointerId: 1, bubbles: true};
+  };
+  const send = (kind, share) => plots()[0].dispatchEvent(new PointerEvent(kind, drag(share)));
+  SVGElement.prototype.setPointerCapture = () => {};
+  send("pointerdown", 0.5); send("pointermove", 0.6); send("pointermove", 0.75);
+  seen.push(document.querySelectorAll(".stretch").length);
+  send("pointerup", 0.75);
+  seen.push(label(0), label(-1), document.querySelectorAll(".stretch").length);
+  const key = (name) => document.activeElement.dispatchEvent(new KeyboardEvent("keydown", {key: name}));
+  plots()[1].focus();
+  key("ArrowRight");
+  seen.push(plots()[1].parentNode.querySelector("output").textContent);
+  key("-"); key("-"); key("-");
+  seen.push(label(0), plots().indexOf(document.activeElement));
+  document.body.dataset.seen = JSON.stringify(seen);
+}, 2500));"""
+
+
+def test_plots_are_zoomed_together_and_read_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    body, policy = page()
+    known = base64.b64encode(hashlib.sha256(ZOOM.encode()).digest()).decode()
+    probed = body.replace(b"</body>", f"<script>{ZOOM}</script></body>".encode())
+    allowed = policy.replace("script-src ", f"script-src 'sha256-{known}' ")
+    monkeypatch.setattr(server_module, "page", lambda: (probed, allowed))
+    with PageServer(shop_in_trouble(), lambda: STATUS, 0) as served:
+        text, console = drawn(f"{served.address}#m=shop%2Fok", tmp_path, 1000)
+    assert console == ""
+    found = re.search(r'data-seen="([^"]*)"', text)
+    assert found is not None
+    whole, boxes, zoomed, other, left, value, again, focused = json.loads(html.unescape(found[1]))
+    assert whole == again == "in the last 1.5 h." and (boxes, left, focused) == (1, 0, 1)
+    first, last = (int(hour) * 60 + int(minute) for hour, minute in re.findall(r"(\d\d):(\d\d)", zoomed))
+    assert zoomed == other and 20 <= last - first <= 26
+    assert re.fullmatch(r"\d\d:\d\d:\d\d · DTF \(heat\) [+−][\d.]+ µm · TDTF \(air\) .*", value)

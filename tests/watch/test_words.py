@@ -13,3 +13,15 @@ def test_a_changed_recording_is_no_matter_of_the_disk() -> None:
 
     assert "public key" in said("not_as_written") and "disk" not in said("not_as_written")
     assert "disk" in said("head_not_kept")
+
+
+def test_an_event_with_several_suspects_sends_nobody_to_a_healthy_sensor() -> None:
+    def state(*reasons: str) -> str:
+        data = {"state": "degraded", "reasons": list(reasons)}
+        return to_do(Event(schema=SCHEMA, machine="m", seq=1, time_utc_ns=1, kind="state", text="", data=data))
+
+    assert "Compare AT" in state("implausible:at_degc") and "Compare AT" not in state(
+        "implausible:at_degc", "implausible:model"
+    )
+    both = state("implausible:at_degc", "implausible:t_q_degc", "t_q_missing")
+    assert both.startswith("Measure the part;") and both.count("Measure the part") == 1 and "thermocouple" in both

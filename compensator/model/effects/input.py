@@ -60,6 +60,16 @@ class Input(BankEffect, Effect):
             f"{self.lag_words()}{delay}; the extended model needs the channel."
         )
 
+    def named(self, given: dict[str, float]) -> dict[str, float]:
+        """Return the gain at rest first where there are several lags: near each other, only their sum is determined."""
+        if len(self.gain) == 1:
+            return given
+        return {self._gain_name: math.fsum(self.gain), **given}
+
+    @property
+    def _gain_name(self) -> str:
+        return f"gain_um_per_{unit_of(self.channel)}{_POWERS[self.curve]}"
+
     def lag_words(self) -> str:
         """Return the lags in words."""
         lags = " and ".join(map(digits, self.tau_min))
@@ -97,8 +107,7 @@ class InputBank(Input):
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the gain at rest of all lags together, and the time to half of a step's response."""
-        name = f"gain_um_per_{unit_of(self.channel)}{_POWERS[self.curve]}"
-        return {name: math.fsum(self.gain), "half_time_min": self.half_time_min()}
+        return {self._gain_name: math.fsum(self.gain), "half_time_min": self.half_time_min()}
 
     def lag_words(self) -> str:
         return "several lags"

@@ -47,7 +47,7 @@ def resume_loop(loaded: LoadedConfig, resumed: Resumed) -> ModelLoop | None:
     try:
         last = _replayed(config, loaded.resolve(config.recording.folder))
     except CompensatorError as error:
-        resumed.note(f"the loop begins anew: {error}")
+        resumed.note(f"the loop starts again without its state: {error}")
         last = None
     if last is None:
         return ModelLoop(config, present.model, {})

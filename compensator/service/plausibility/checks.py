@@ -345,7 +345,7 @@ class PlausibilityCheck:
     def _describe_alarm(self, block: ResidualBlock, named: list[FaultFit], misfit: bool) -> str:
         words = [f"{fit.words} since {self._ago(fit)}" if fit.suspect != "model" else fit.words for fit in named]
         if misfit:
-            words.append("none of this fits well: something acts that the model does not know")
+            words.append("none of these fits well: something acts that the model does not know")
         return (
             f"measured − predicted Y is {block.residual_um:+.2f} µm where ±{block.std_um:.2f} µm is stated: "
             + ", or ".join(words)

@@ -1,4 +1,4 @@
-"""Jumps of T_Q and AT: a channel that has jumped is not used until evidence speaks for it.
+"""Jumps of T_Q and AT: a channel that has jumped is not used until its new value is confirmed.
 
 From the jump on, two more engines run beside the one that predicts without the channel:
 
@@ -355,7 +355,7 @@ class JumpWatch:
             self._end()
         return Judgement()
 
-    def _jump_note(self, name: str, then: str = "and is not used until evidence speaks for it") -> Note:
+    def _jump_note(self, name: str, then: str = "and is not used until its new value is confirmed") -> Note:
         shift = self._state.shifts_k[name]
         return Note(
             EventKind.PLAUSIBILITY,

@@ -86,18 +86,18 @@ def described(found: ComparisonData) -> str:
     move = found.offset_change_um
     moves = f"the offset would move by {round(move, 1) + 0.0:+.1f} µm" if move is not None else ""
     if found.present_rms_um is None or found.candidate_rms_um is None:
-        return "; ".join(filter(None, (f"not judged: {_why(found)}", moves)))
+        return "; ".join(filter(None, (f"no verdict: {_why(found)}", moves)))
     probes = f", {found.probes} probe(s)" if found.measured_by == "probe" else ""
     text = (
         f"last {found.hours:.3g} h{probes}: present {found.present_rms_um:.1f} µm rms, "
         f"this one {found.candidate_rms_um:.1f}"
     )
     if found.why is not None:
-        text += f" (not judged: {_why(found)})"
+        text += f" (no verdict: {_why(found)})"
     elif found.verdict == ComparisonVerdict.ALIKE or found.deviations is None:
         text += " (no clear difference)"
     else:
-        moved = "measured Y has moved by itself, by its changes this one is " if found.y_moved else ""
+        moved = "measured Y has moved by itself; by its changes, this one is " if found.y_moved else ""
         text += f" ({moved}{found.verdict} by {abs(found.deviations):.0f} standard deviations of the difference)"
     return "; ".join(filter(None, (text, moves)))
 
