@@ -24,6 +24,10 @@ log = logging.getLogger("compensator")
 PENDING = 1000
 #: How long a connection may be silent before it is authenticated, ms.
 ACCEPT_TIMEOUT_MS = 3000
+#: Most opening brackets in a configuration file of Zenoh: its parser ends the process if some 28,000 are nested.
+BRACKETS = 15_000
+#: Longest text of an error of Zenoh, characters.
+LONGEST_ERROR = 400
 #: Time between two attempts to open a session, s.
 RETRY_S = 1.0
 #: Liveliness token of a service, below its prefix.
@@ -44,8 +48,9 @@ def get(config: zenoh.Config, key: str) -> Any:
 
 
 def error_text(error: zenoh.ZError) -> str:
-    """Return the text of an error without the place in Zenoh's source."""
-    return re.sub(r"\s+", " ", re.sub(r" at /\S+\.rs:\d+\.", "", str(error))).strip()
+    """Return the text of an error without the place in Zenoh's source; it may cite a whole line of a file."""
+    text = re.sub(r"\s+", " ", re.sub(r" at /\S+\.rs:\d+\.", "", str(error))).strip()
+    return text if len(text) <= LONGEST_ERROR else f"{text[: LONGEST_ERROR // 2]} … {text[-LONGEST_ERROR // 2 :]}"
 
 
 def session_config(settings: Zenoh) -> zenoh.Config:
@@ -165,10 +170,12 @@ def read_config_file(path: Path) -> ConfigFile:
         If the file cannot be used; the message names the file and the error.
     """
     try:
-        read_file(path, SETTINGS_BYTES)  # of a device Zenoh would never come back
+        data = read_file(path, SETTINGS_BYTES)  # of a device Zenoh would never come back
     except OSError as error:
         words = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
         raise ConfigError(f"{path}: {words}, expected a Zenoh configuration") from error
+    if data.count(b"[") + data.count(b"{") > BRACKETS:
+        raise ConfigError(f"{path}: more than {BRACKETS} brackets, expected a Zenoh configuration")
     try:
         config = zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:
