@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import ParamSpec, TypeVar
 
 P = ParamSpec("P")
@@ -16,9 +17,20 @@ def one_thread_from_start() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+@contextlib.contextmanager
+def _same_environment() -> Iterator[None]:
+    """Take away what an import sets: threadpoolctl lets two copies of Intel's OpenMP run side by side."""
+    name = "KMP_DUPLICATE_LIB_OK"
+    was_set = name in os.environ
+    yield
+    if not was_set:
+        os.environ.pop(name, None)
+
+
 def in_one_thread(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Call a function while BLAS is limited to one thread, in any process."""
-    from threadpoolctl import threadpool_limits
+    with _same_environment():
+        from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1, user_api="blas"):
         return function(*args, **kwargs)

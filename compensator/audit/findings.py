@@ -64,6 +64,7 @@ class Fault(Enum):
     INDEX = AuditFinding.INDEX, "{what}"
     # Several files.
     RENAMED = AuditFinding.REORDERED, "it has the name of another file: it was created as {original}"
+    COPIED = AuditFinding.INSERTED, "is a copy of {other}: both were created as {original}"
     NOT_SIGNED = (
         AuditFinding.UNSIGNED,
         "no valid signature covers the last {records} record(s): {samples} sample(s), {minutes:.0f} min",

@@ -212,7 +212,8 @@ def combine(
         series.check_link(before if before is not None and before.machine == after.machine else None, after)
     if files and newest:
         series.check_head(files, newest, heads)
-    findings = [finding for file in files for finding in (*series.own[file.file].findings, *file.findings)]
+    own = {name: whole.findings for name, whole in series.own.items()}  # of two files of one name once
+    findings = [finding for file in files for finding in (*own.pop(file.file, ()), *file.findings)]
     return Audit(
         files=tuple(files),
         findings=tuple(findings),
@@ -239,6 +240,7 @@ class _Series:
 
     def __init__(self, files: Sequence[RecordingAudit], signed: bool, newest: str) -> None:
         self._names = {file.original: file for file in files}
+        self._first_of: dict[tuple[str, str], str] = {}
         self._removed = {name for file in files for name in file.removed}
         self._newest = {file.machine: file.file for file in files}
         #: Only the file that was started last may still be without its next seal; a head states which one that is.
@@ -256,6 +258,10 @@ class _Series:
         name, remark = file.file, self.remarks.append
         if file.original != name and _NAME.match(name):
             self._find(Fault.RENAMED, file, original=file.original)
+        created = file.machine, file.original
+        if created in self._first_of:
+            self._find(Fault.COPIED, file, other=self._first_of[created], original=file.original)
+        self._first_of.setdefault(created, name)
         if file.not_replayed:
             remark(Remark(AuditRemark.NOT_REPLAYED, f"{name}: not all samples were replayed: {file.not_replayed}."))
         if not file.last and file.end in (RecordingEnd.OPEN, RecordingEnd.TORN):

@@ -16,7 +16,7 @@ from compensator.codes import Remark, ServiceWarning
 from compensator.commands import Answer, log_warnings
 from compensator.commands.stopping import on_stop
 from compensator.errors import ConfigError, ServiceError
-from compensator.service.session import ConfigFile, error_text, files_of, get, read_config_file, set_key
+from compensator.service.session import ConfigFile, bound_silent, error_text, files_of, get, read_config_file, set_key
 
 log = logging.getLogger("compensator")
 
@@ -51,6 +51,7 @@ def checked(path: Path, file: ConfigFile) -> zenoh.Config:
     if get(config, "mode") not in (None, "router"):
         raise ConfigError(f"{path}: mode = {get(config, 'mode')!r}, expected router")
     set_key(config, "mode", "router")
+    bound_silent(config)
     endpoints = get(config, "listen/endpoints")
     if not isinstance(endpoints, list) or not endpoints:
         raise ConfigError(f'{path}: listen/endpoints: missing, expected a list, such as ["tls/0.0.0.0:7447"]')

@@ -20,6 +20,8 @@ T = TypeVar("T")
 _LARGEST = 1e30
 #: Largest files, bytes: settings, a Zenoh configuration, the state.
 SETTINGS_MAX_BYTES, ZENOH_MAX_BYTES, STATE_MAX_BYTES = 1_000_000, 1_000_000, 10_000
+#: Most opening brackets in a configuration file of Zenoh: its parser ends the process if some 28,000 are nested.
+ZENOH_BRACKETS = 15_000
 _PREFIX = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")
 
 

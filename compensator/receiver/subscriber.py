@@ -24,13 +24,15 @@ from .errors import ReceiverError
 from .follower import Applied, Follower
 from .message import PAYLOAD_MAX_BYTES, SEQ_MAX, ProbeWanted, Rejected, parse_status
 from .reasons import Reason
-from .settings import STATE_MAX_BYTES, ZENOH_MAX_BYTES, Settings, read_file
+from .settings import STATE_MAX_BYTES, ZENOH_BRACKETS, ZENOH_MAX_BYTES, Settings, read_file
 
 #: One attempt to reach the router, ms, and the pause before the next, s.
 CONNECT_TIMEOUT_MS = 1000
 CONNECT_PAUSE_S = 0.5
 #: How long to wait for the answer to the query of the latest offset, s.
 ANSWER_TIMEOUT_S = 5.0
+#: Longest text of an error of Zenoh, characters.
+LONGEST_ERROR = 400
 _BUFFER = 32
 _CONNECTING = Reason("not_connected")
 
@@ -50,13 +52,21 @@ def client_config(settings: Settings) -> Any:
     """
     if settings.zenoh_config:
         try:
-            read_file(Path(settings.zenoh_config), ZENOH_MAX_BYTES)  # of a device Zenoh would never come back
+            data = read_file(Path(settings.zenoh_config), ZENOH_MAX_BYTES)  # of a device Zenoh would never come back
         except OSError as error:
             raise ReceiverError(f"{settings.zenoh_config}: {error.strerror}; expected a Zenoh configuration") from error
+        if data.count(b"[") + data.count(b"{") > ZENOH_BRACKETS:
+            raise ReceiverError(
+                f"{settings.zenoh_config}: more than {ZENOH_BRACKETS} brackets; expected a Zenoh configuration"
+            )
         try:
             config = zenoh.Config.from_file(settings.zenoh_config)
         except zenoh.ZError as error:
-            raise ReceiverError(f"{settings.zenoh_config}: {error}; expected a Zenoh configuration") from error
+            text = " ".join(str(error).split())  # it may cite a whole line of the file
+            text = (
+                text if len(text) <= LONGEST_ERROR else f"{text[: LONGEST_ERROR // 2]} … {text[-LONGEST_ERROR // 2 :]}"
+            )
+            raise ReceiverError(f"{settings.zenoh_config}: {text}; expected a Zenoh configuration") from error
         # A router forwards nothing between two peers, and reports no error.
         if json.loads(config.get_json("mode") or "null") != "client":
             raise ReceiverError(f"{settings.zenoh_config}: mode = {config.get_json('mode')}: expected 'client'")

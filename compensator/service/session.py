@@ -20,10 +20,14 @@ from compensator.input_file import SETTINGS_BYTES, read_file, resolved
 
 log = logging.getLogger("compensator")
 
-#: Number of connections that a router accepts at a time.
-PENDING = 1000
+#: Number of connections that a router accepts at a time; as in the files of `deploy/zenoh/access_list.py`.
+PENDING = 4000
 #: How long a connection may be silent before it is authenticated, ms.
 ACCEPT_TIMEOUT_MS = 3000
+#: Most opening brackets in a configuration file of Zenoh: its parser ends the process if some 28,000 are nested.
+BRACKETS = 15_000
+#: Longest text of an error of Zenoh, characters.
+LONGEST_ERROR = 400
 #: Time between two attempts to open a session, s.
 RETRY_S = 1.0
 #: Liveliness token of a service, below its prefix.
@@ -44,8 +48,9 @@ def get(config: zenoh.Config, key: str) -> Any:
 
 
 def error_text(error: zenoh.ZError) -> str:
-    """Return the text of an error without the place in Zenoh's source."""
-    return re.sub(r"\s+", " ", re.sub(r" at /\S+\.rs:\d+\.", "", str(error))).strip()
+    """Return the text of an error without the place in Zenoh's source; it may cite a whole line of a file."""
+    text = re.sub(r"\s+", " ", re.sub(r" at /\S+\.rs:\d+\.", "", str(error))).strip()
+    return text if len(text) <= LONGEST_ERROR else f"{text[: LONGEST_ERROR // 2]} … {text[-LONGEST_ERROR // 2 :]}"
 
 
 def session_config(settings: Zenoh) -> zenoh.Config:
@@ -117,6 +122,17 @@ def services_text(alive: Collection[str]) -> str:
     return f"services there: {', '.join(sorted(alive))}" if alive else "no service is running there"
 
 
+def bound_silent(config: zenoh.Config) -> None:
+    """Let a router bear connections that are silent before they authenticate.
+
+    With Zenoh's own 100 places of 10 s, 200 of them keep a newcomer out for 10 s.
+    """
+    pending = get(config, "transport/unicast/accept_pending") or 0
+    timeout_ms = get(config, "transport/unicast/accept_timeout") or ACCEPT_TIMEOUT_MS
+    set_key(config, "transport/unicast/accept_pending", max(pending, PENDING))
+    set_key(config, "transport/unicast/accept_timeout", min(timeout_ms, ACCEPT_TIMEOUT_MS))
+
+
 def enlarge_queues(config: zenoh.Config) -> None:
     """Enlarge a router's queues for a whole shop that publishes at the same instant.
 
@@ -124,8 +140,7 @@ def enlarge_queues(config: zenoh.Config) -> None:
     dropped. A queue has at most 16 packets of 64 KiB. After a power cut all services connect at once, with two sessions
     each; by default Zenoh accepts 100 at a time.
     """
-    set_key(config, "transport/unicast/accept_pending", PENDING)
-    set_key(config, "transport/unicast/accept_timeout", ACCEPT_TIMEOUT_MS)
+    bound_silent(config)
     for priority in ("interactive_high", "data"):
         set_key(config, f"transport/link/tx/queue/size/{priority}", 16)
 
@@ -165,10 +180,12 @@ def read_config_file(path: Path) -> ConfigFile:
         If the file cannot be used; the message names the file and the error.
     """
     try:
-        read_file(path, SETTINGS_BYTES)  # of a device Zenoh would never come back
+        data = read_file(path, SETTINGS_BYTES)  # of a device Zenoh would never come back
     except OSError as error:
         words = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
         raise ConfigError(f"{path}: {words}, expected a Zenoh configuration") from error
+    if data.count(b"[") + data.count(b"{") > BRACKETS:
+        raise ConfigError(f"{path}: more than {BRACKETS} brackets, expected a Zenoh configuration")
     try:
         config = zenoh.Config.from_file(str(path))
     except zenoh.ZError as error:

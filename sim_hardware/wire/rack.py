@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -74,6 +74,11 @@ class Rack:
     Sources are called in that thread. Errors in it (such as an exception in a source) are stored and raised on
     exit.
 
+    Parameters
+    ----------
+    new_loop : callable
+        Makes the thread's event loop: one with a clock of its own, for example.
+
     Examples
     --------
     >>> from sim_hardware.wire import Adam, ModbusTcpServer
@@ -84,14 +89,15 @@ class Rack:
     '127.0.0.1'
     """
 
-    def __init__(self) -> None:
+    def __init__(self, new_loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop) -> None:
+        self._new_loop = new_loop
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self._servers: list[Server] = []
         self.errors: list[BaseException] = []
 
     def __enter__(self) -> Rack:
-        self._loop = asyncio.new_event_loop()
+        self._loop = self._new_loop()
         self._loop.set_exception_handler(self._failed)
         self._thread = threading.Thread(target=self._run, name="sim-hardware", daemon=True)
         self._thread.start()

@@ -47,14 +47,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def said(*words: object) -> str:
+    """Run a command; return what it printed."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main([*map(str, words)]) == 0
+    return out.getvalue()
+
+
+def printed_by(*words: object) -> dict[str, Any]:
+    """Run a command; return its JSON."""
+    return json.loads(said(*words, "--json"))
+
+
 def command(*words: object) -> tuple[dict[str, Any], str]:
-    """Run a command; return its JSON and its text."""
-    said = []
-    for more in (["--json"], []):
-        with contextlib.redirect_stdout(io.StringIO()) as out:
-            assert main([*map(str, words), *more]) == 0
-        said.append(out.getvalue())
-    return json.loads(said[0]), said[1]
+    """Run a command twice; return its JSON and its text."""
+    return printed_by(*words), said(*words)
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +144,7 @@ def test_identify(tmp_path: Path, folder: Path, form: str, identified: tuple[dic
 )
 def test_options_of_identify(tmp_path: Path, folder: Path, words: list[object], options: dict[str, Any]) -> None:
     etve = ["--etve", folder / "other.csv"] if "III" in words else []
-    printed, _ = command(
+    printed = printed_by(
         "identify", folder / "run.csv", "--out", tmp_path / "model.toml", "--order", 2, 2, 1, *etve, *words
     )
     found = tc.identify(folder / "run.csv", order=(2, 2, 1), etve=etve[1:], **options)
@@ -194,7 +201,7 @@ def test_a_model_handed_over_in_python_is_diagnosed_as_its_file_is(tmp_path: Pat
     # The calibration's own error decides what a diagnosis looks for: it comes along without a file.
     found = tc.identify(folder / "run.csv", order=(2, 2, 2))
     found.save(tmp_path / "model.toml")
-    printed, _ = command("diagnose", folder / "effect.csv", "--model", tmp_path / "model.toml", "--out", tmp_path / "d")
+    printed = printed_by("diagnose", folder / "effect.csv", "--model", tmp_path / "model.toml", "--out", tmp_path / "d")
     with ThreadPoolExecutor(2) as executor:
         why = tc.diagnose(found.model, frame(folder / "effect.csv"), executor=executor)
     assert without_names(as_json(why.to_dict())).items() <= without_names(printed).items()
@@ -207,7 +214,7 @@ def test_recordings_and_export(tmp_path: Path) -> None:
     Service(tmp_path / "rec").run(20).stop()
     Service(tmp_path / "rec", seq=20).run(10).stop()
     recordings = sorted((tmp_path / "rec").glob("*.mcap"))
-    printed, _ = command("export", *recordings, "--out", tmp_path / "command.csv")
+    printed = printed_by("export", *recordings, "--out", tmp_path / "command.csv")
     assert tc.export(recordings, tmp_path / "verb.csv") == printed["samples"] == 30
     assert (tmp_path / "verb.csv").read_bytes() == (tmp_path / "command.csv").read_bytes()
     assert tc.export(str(recordings[0]), str(tmp_path / "one.csv")) == 20

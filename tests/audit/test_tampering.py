@@ -332,6 +332,19 @@ def test_swapped_files_are_named(folder: Path) -> None:
     }
 
 
+@pytest.mark.parametrize("name", ["{}x.mcap", "again/{}.mcap"])
+def test_a_copy_of_the_first_file_beside_it_is_named(folder: Path, name: str) -> None:
+    """It begins a chain as the first one does, and the next file continues from it as well."""
+    first, *others = recordings(folder, MACHINE)
+    copy = folder / name.format(first.stem)
+    copy.parent.mkdir(exist_ok=True)
+    shutil.copy(first, copy)
+    for paths in ([first, copy, *others], [copy, first]):
+        finding = only(audit(paths))
+        assert finding.kind == "inserted"
+        assert "is a copy of" in finding.text and first.name in finding.text
+
+
 def test_a_file_that_is_missing_between_others_is_named(folder: Path) -> None:
     first, gone, last = recordings(folder, MACHINE)
     gone.unlink()

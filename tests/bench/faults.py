@@ -3,7 +3,6 @@
 No pass or fail by speed; what must not happen (a wrong value, a jump, a false alarm) is asserted all the same.
 """
 
-import asyncio
 import tempfile
 from pathlib import Path
 
@@ -101,7 +100,7 @@ def drifts(name, plant, model, **more):
 
 def episodes(title, courses):
     with tempfile.TemporaryDirectory() as folder:
-        found = asyncio.run(run_all(Path(folder), courses))
+        found = run_all(Path(folder), courses)
     far = [seen.distance_um for seen in found]
     held = sum("hold" in seen.states for seen in found)
     yield told(

@@ -75,6 +75,18 @@ def test_toml_that_takes_long(text: bytes, words: str) -> None:
             parse(text, source="x.toml")
 
 
+@pytest.mark.parametrize("nested", ["[", '{"a":'])
+def test_a_configuration_of_zenoh_that_is_nested_deeply(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], nested: str
+) -> None:
+    """Zenoh's parser ends the process at some 28,000 levels."""
+    path = tmp_path / "z.json5"
+    for count, words in ((100_000, "more than 15000 brackets"), (15_000, "z.json5")):
+        path.write_text(nested * count)
+        assert words in refused(capsys, "zero", "--zenoh", path, "--prefix", "shop/vmc-07")
+        assert words in refused(capsys, "router", "--config", path, "--check")
+
+
 def test_words_with_dots_are_no_deep_key() -> None:
     assert parse_toml(b'a = "1. 2. 3."\nb = "' + b"two words. " * 100 + b'"')["a"] == "1. 2. 3."
 

@@ -8,15 +8,21 @@ from pathlib import Path
 
 import pytest
 
+from tests.shared_folder import made_once
+
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built from a copy so that nothing is left behind in the sources."""
+    """The wheel."""
+    return next(made_once(tmp_path_factory, "wheel", _build).glob("quill_compensator-*.whl"))
+
+
+def _build(folder: Path) -> None:
+    """Build the wheel from a copy, so that nothing is left behind in the sources."""
     import shutil
 
-    folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".*", "tests", "*.egg-info", "build", "demo-out*"))
     command = [
@@ -34,4 +40,3 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return next(folder.glob("quill_compensator-*.whl"))

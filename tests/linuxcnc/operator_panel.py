@@ -30,15 +30,21 @@ if __name__ == "__main__":
             state.poll()
 
     def states(name):
-        command.state(getattr(linuxcnc, f"STATE_{name}"))
-        command.wait_complete(10.0)
         done = {
             "ESTOP": lambda: state.task_state == linuxcnc.STATE_ESTOP,
             "ESTOP_RESET": lambda: state.task_state != linuxcnc.STATE_ESTOP,
             "ON": lambda: state.task_state == linuxcnc.STATE_ON,
             "OFF": lambda: state.task_state != linuxcnc.STATE_ON,
         }
-        until(done[name], name)
+
+        def reached():
+            # LinuxCNC drops a command that its motion controller does not take in time, on a busy computer.
+            command.state(getattr(linuxcnc, f"STATE_{name}"))
+            command.wait_complete(5.0)
+            state.poll()
+            return done[name]()
+
+        until(reached, name)
 
     def home():
         command.mode(linuxcnc.MODE_MANUAL)

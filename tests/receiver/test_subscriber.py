@@ -148,7 +148,12 @@ def test_a_zenoh_configuration_of_ones_own(tmp_path: Path) -> None:
         until(lambda: receiver.poll() and receiver.follower.alive, "the token")
         service.put(1, 5.0)
         at(receiver, 5.0)
-    for text, expected in (("{mode: 'peer'}", "expected 'client'"), ("{mod: 1}", "expected a Zenoh configuration")):
+    for text, expected in (
+        ("{mode: 'peer'}", "expected 'client'"),
+        ("{mod: 1}", "expected a Zenoh configuration"),
+        ("{a:" * 100_000, "more than 15000 brackets"),  # Zenoh's parser would end the process
+        ("{a:" * 15_000, "expected a Zenoh configuration"),
+    ):
         path.write_text(text)
         with pytest.raises(ReceiverError, match=expected):
             Receiver(settings(port, connect=(), zenoh_config=str(path)))

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from tests.report import gallery
+from tests.shared_folder import made_once
 
 
 @pytest.fixture(scope="session")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return gallery.make(tmp_path_factory.mktemp("pages"))
+    return gallery.paths(made_once(tmp_path_factory, "pages", gallery.make))

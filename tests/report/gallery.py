@@ -34,10 +34,16 @@ NAMES = (
 )
 
 
-def make(folder: Path) -> dict[str, Path]:
-    """Make the pages; their names stand for the commands."""
+def paths(folder: Path) -> dict[str, Path]:
+    """Where the pages are; their names stand for the commands."""
     pages = {name: folder / name / "report.html" for name in NAMES}
     pages["identify"] = folder / "identify" / "model-calibration.html"
+    return pages
+
+
+def make(folder: Path) -> dict[str, Path]:
+    """Make the pages."""
+    pages = paths(folder)
     for path in pages.values():
         path.parent.mkdir()
     rec = _recordings(folder)

@@ -20,7 +20,7 @@ from compensator.cli import main
 from compensator.commands.router import checked
 from compensator.config import Zenoh
 from compensator.service.command_client import operator_of_file
-from compensator.service.session import read_config_file, tls_files
+from compensator.service.session import get, read_config_file, tls_files
 from tests.security.shop import DEPLOY, Shop, script
 
 
@@ -176,3 +176,18 @@ def test_the_trial_on_one_computer_works_as_written(tmp_path: Path) -> None:
 def _zenoh(path: Path) -> dict[str, Any]:
     table = tomllib.loads(path.read_text(encoding="utf-8"))["zenoh"]
     return {key: str(path.parent / value) if key.startswith("tls_") else value for key, value in table.items()}
+
+
+def test_a_router_bears_silent_connections_also_with_a_file_of_ones_own(tmp_path: Path) -> None:
+    path = tmp_path / "router.json5"
+    for unicast, pending, timeout_ms in (
+        ("{}", 4000, 3000),
+        ("{accept_pending: 100, accept_timeout: 10000}", 4000, 3000),
+        ("{accept_pending: 6000, accept_timeout: 1000}", 6000, 1000),
+    ):
+        path.write_text(
+            f"{{mode: 'router', listen: {{endpoints: ['tcp/127.0.0.1:1']}}, transport: {{unicast: {unicast}}}}}"
+        )
+        config = checked(path, read_config_file(path))
+        assert get(config, "transport/unicast/accept_pending") == pending
+        assert get(config, "transport/unicast/accept_timeout") == timeout_ms

@@ -95,6 +95,8 @@ WILD = {"t_q_degc": 300.0, "at_degc": 200.0, "y_um": 495.0}
 #: How far a reading may be from the simulated machine's truth: the step of the coarsest module.
 TOLERANCE = {"t_q_degc": 0.11, "at_degc": 0.11, "y_um": 0.1}
 
+#: A minute by the clock of the loop, s: the latest reply arrives in it, and the controller is not taken for silent.
+MINUTE_S = 3.0
 HOUR = 60
 PREDICTED = 10
 RATE = float(TABLE["limits"]["offset_rate_max_um_per_min"])
@@ -175,6 +177,7 @@ async def run_course(rack: Rack, receiver: Receiver, folder: Path, name: str, co
         Naming episode, sample and what is wrong.
     """
     machine = WiredMachine(rack, folder, make_world(), name=name, layout=course.layout, receiver=receiver)
+    machine.minute_s = MINUTE_S
     truth: list[dict[str, float]] = []
     begins, ends = _timetable(course)
 
@@ -189,11 +192,8 @@ async def run_course(rack: Rack, receiver: Receiver, folder: Path, name: str, co
             # Test machines may be slow: simulated time waits for them, but never within a fault.
             machine.waits_for = set(ROLES)
         if done in ends:
-            for channel, kind in ends[done].places:
+            for channel, _ in ends[done].places:
                 machine.faults[channel][0].clear()
-                if kind == "late":
-                    # No device answers a later request before an earlier one.
-                    machine.pause_s = 1.2 * PARAMETERS["late"]["delay_s"]
             # Devices on the line of a fault are asked again, too.
             machine.waits_for = set(ROLES)
 

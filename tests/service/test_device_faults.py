@@ -13,23 +13,30 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.reading import Quality
+from sim_hardware.wire import Rack
 from sim_hardware.wire.faults import DEVICE_FAULTS, INPUT_FAULTS
 from tests.service.device_faults import EXPECTED, HOUR, SUPPORTED, Course, Seen, alone, pairs, run_course, without
-from tests.service.wired import workshop
+from tests.service.shared_time import SharedTime, TimedRack
+from tests.service.wired import Receiver
 
 #: Machines that run at the same time: one waits for a silent device while others work.
 SIDE_BY_SIDE = 12
 
 
-async def run_all(folder: Path, courses: list[Course]) -> list[Seen]:
+def run_all(folder: Path, courses: list[Course]) -> list[Seen]:
+    shared = SharedTime()
+    with TimedRack(shared) as rack, Receiver() as receiver:
+        return shared.run(_run_all(rack, receiver, folder, courses))
+
+
+async def _run_all(rack: Rack, receiver: Receiver, folder: Path, courses: list[Course]) -> list[Seen]:
     free = asyncio.Semaphore(SIDE_BY_SIDE)
-    with workshop() as (rack, receiver):
 
-        async def one(i: int, course: Course) -> list[Seen]:
-            async with free:
-                return await run_course(rack, receiver, folder / str(i), f"machine-{i}", course)
+    async def one(i: int, course: Course) -> list[Seen]:
+        async with free:
+            return await run_course(rack, receiver, folder / str(i), f"machine-{i}", course)
 
-        found = await asyncio.gather(*(one(i, c) for i, c in enumerate(courses)), return_exceptions=True)
+    found = await asyncio.gather(*(one(i, c) for i, c in enumerate(courses)), return_exceptions=True)
     for result in found:
         if isinstance(result, BaseException):
             raise result
@@ -53,8 +60,8 @@ def test_every_pair_of_kinds_is_placed() -> None:
     assert every - placed == set(itertools.combinations_with_replacement(only, 2))
 
 
-async def test_alone_for_one_sample(tmp_path: Path) -> None:
-    found = await run_all(tmp_path, alone(1))
+def test_alone_for_one_sample(tmp_path: Path) -> None:
+    found = run_all(tmp_path, alone(1))
     shown = {code for seen in found for codes in seen.codes.values() for code in codes}
     drivers_know = {str(quality) for quality in Quality} | {error.code for error in DriverError.__subclasses__()}
     # A configuration that cannot be used is refused before anything runs.
@@ -62,19 +69,19 @@ async def test_alone_for_one_sample(tmp_path: Path) -> None:
     assert {seen.states[0] for seen in found} == {"ok", "degraded"}
 
 
-async def test_alone_for_an_hour(tmp_path: Path) -> None:
+def test_alone_for_an_hour(tmp_path: Path) -> None:
     """`make bench` runs every kind on every carrier."""
-    found = await run_all(tmp_path, alone(HOUR, every_carrier=False))
+    found = run_all(tmp_path, alone(HOUR, every_carrier=False))
     assert {"ok", "degraded", "hold"} <= {state for seen in found for state in seen.states}
     lost = [seen for seen in found if "hold" in seen.states]
     assert all(seen.std_most_um > seen.std_before_um + 1.0 for seen in lost)
 
 
-async def test_pairs_for_one_sample(tmp_path: Path) -> None:
-    await run_all(tmp_path, pairs(1, seed=5))
+def test_pairs_for_one_sample(tmp_path: Path) -> None:
+    run_all(tmp_path, pairs(1, seed=5))
 
 
 @pytest.mark.parametrize("seed", [7])
-async def test_some_pairs_for_an_hour(tmp_path: Path, seed: int) -> None:
+def test_some_pairs_for_an_hour(tmp_path: Path, seed: int) -> None:
     """`make bench` runs all of them."""
-    await run_all(tmp_path, without(pairs(HOUR, seed), 3, seed))
+    run_all(tmp_path, without(pairs(HOUR, seed), 3, seed))

@@ -120,8 +120,8 @@ class WiredMachine:
         self.outcomes: list[Outcome] = []
         self.after: Callable[[Outcome], None] = lambda outcome: None
         self.waits_for: set[str] = set()
-        #: Real seconds before the next sample: replies under way arrive in their own minute.
-        self.pause_s = 0.0
+        #: What a minute takes by the clock of the loop, s. Where that clock jumps, replies arrive in their own minute.
+        self.minute_s = 0.0
         self.receiver = receiver
         self.publisher: Publisher | None = None
         if receiver is not None:
@@ -237,9 +237,9 @@ class WiredMachine:
         return config(**{**table, **changes})
 
     async def _advance(self, t_s: float) -> None:
-        pause_s, self.pause_s = self.pause_s, 0.0
-        if pause_s:
-            await asyncio.sleep(pause_s)
+        if self.minute_s:
+            # All machines wait for the same time, so that it jumps once for all.
+            await asyncio.sleep(self.minute_s - asyncio.get_running_loop().time() % self.minute_s)
         self.world.advance_to(t_s)
         self.capa.push(1)
         # A device that is asked again after a few seconds is back long before the minute is over.
