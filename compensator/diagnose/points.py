@@ -23,6 +23,8 @@ from compensator.model.effects.hypothesis import Context, Hypothesis
 POINTS = 700
 #: Averaged columns that are kept.
 MOST_KNOWN = 3000
+#: Last minutes of a run that are compared with nothing, and at most this share of it.
+ENDS_MIN, ENDS_SHARE = 10.0, 0.05
 #: Lags of the paths' own error, and which of them are fast, min.
 OWN_LAGS, FAST_MIN = 8, 25.0
 #: Combinations of lagged inputs that differ less than this from others are left out.
@@ -123,7 +125,8 @@ class Points:
         stride = max(1, math.ceil(int(np.isfinite(evidence.y_um).sum()) / POINTS))
         edges = _edges(evidence, stride)
         first = np.concatenate(edges)
-        counts = np.add.reduceat(evidence.used.astype(float), first)
+        used = evidence.used & ~_ends(evidence)
+        counts = np.add.reduceat(used.astype(float), first)
         is_value, run = (np.repeat(each, [e.size for e in edges]) for each in (evidence.sparse, range(len(edges))))
         kept = counts >= np.where(is_value, 1.0, max(1.0, stride / 2.0))
         self.count, self.first = int(kept.sum()), first[kept]
@@ -134,7 +137,7 @@ class Points:
             self.period_min = max(self.period_min, float(np.median(minutes[:-1])))
         self._lengths = np.unique(minutes, return_inverse=True)
         self.relative_variance = stride / counts[kept]
-        self._mean = _means(evidence.used, first, kept)
+        self._mean = _means(used, first, kept)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
         self.spread_um = max(evidence.spread_um, 1e-9)
         self.own_um = self._own_um()
@@ -269,6 +272,21 @@ class Points:
 def raw_columns(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[float]) -> Matrix:
     """Return the columns of a hypothesis on every sample."""
     return np.concatenate([hypothesis.columns(record, values) for record in evidence.signals])
+
+
+def _ends(evidence: Evidence) -> Mask:
+    """Return the last minutes of each run: of a late T_Q only what comes after them says what acted in them.
+
+    They take part in no comparison, so that every explanation is compared on the same samples. A value that was measured
+    now and then is not given up, and where the model corrects a late T_Q already the engine uses no future.
+    """
+    ends, first = np.zeros(evidence.used.size, dtype=bool), 0
+    for record, is_sparse in zip(evidence.signals, evidence.sparse, strict=True):
+        minutes = min(ENDS_MIN, ENDS_SHARE * record.size * record.period_min)
+        if not is_sparse and evidence.model.late_t_q is None:
+            ends[first + record.size - round(minutes / record.period_min) : first + record.size] = True
+        first += record.size
+    return ends
 
 
 def _edges(evidence: Evidence, stride: int) -> list[Indices]:

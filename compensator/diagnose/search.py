@@ -213,7 +213,7 @@ class Search:
         return sorted(found, key=self.criterion.score, reverse=True)
 
     def _exchanged(self, fit: Fit, count: int | None = None) -> Fit:
-        """Exchange effects one at a time where that helps: what was found first may have absorbed two.
+        """Exchange effects, or their forms, one at a time where it helps: what was found first may have absorbed two.
 
         Parameters
         ----------
@@ -224,10 +224,11 @@ class Search:
         """
         for i in range(min(len(fit.terms), len(fit.terms) - 1 if count is None else count)):
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
-            for candidate in self._proposed(others, unobserved=False)[:2]:
-                if candidate.places != fit.places:
-                    better = settled(candidate)
-                    fit = better if self.criterion.score(better) > self.criterion.score(fit) else fit
+            proposed = self._proposed(others, unobserved=False)
+            forms = [one for one in proposed if one.places == fit.places and not _has_forms_of(one, fit)]
+            for candidate in (*forms[:1], *[one for one in proposed[:2] if one.places != fit.places]):
+                better = settled(candidate)
+                fit = better if self.criterion.score(better) > self.criterion.score(fit) else fit
         return fit
 
     def _pruned(self, fit: Fit) -> Fit:
@@ -281,6 +282,11 @@ class Search:
                 other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
                 found[hypothesis.place] = Candidate(term=other.terms[-1], fit=other, rms_um=self.criterion.rms(other))
         return tuple(sorted(found.values(), key=lambda item: item.rms_um))
+
+
+def _has_forms_of(one: Fit, other: Fit) -> bool:
+    """Return whether two fits have the same hypotheses, in whatever order."""
+    return {id(term.hypothesis) for term in one.terms} == {id(term.hypothesis) for term in other.terms}
 
 
 def _above(hypothesis: Hypothesis, shortest_min: float) -> Hypothesis:
