@@ -277,8 +277,8 @@ def raw_columns(evidence: Evidence, hypothesis: Hypothesis, values: Sequence[flo
 def _ends(evidence: Evidence) -> Mask:
     """Return the last minutes of each run: of a late T_Q only what comes after them says what acted in them.
 
-    They take part in no comparison, so that every explanation is compared on the same samples. A value that was measured
-    now and then is not given up, and where the model corrects a late T_Q already the engine uses no future.
+    They take part in no comparison, so that every explanation is compared on the same samples. A value that was
+    measured now and then is not given up, and where the model corrects a late T_Q already the engine uses no future.
     """
     ends, first = np.zeros(evidence.used.size, dtype=bool), 0
     for record, is_sparse in zip(evidence.signals, evidence.sparse, strict=True):
