@@ -26,10 +26,13 @@ from tests.identify.quill_runs import runs_from
 QUILL = load_model("quill")
 
 
-def named(scenarios, seed, hours=36.0, **noise):
+def search(scenarios, seed, hours=36.0, **noise):
     columns, _, _ = record(scenarios, seed, hours, **noise)
-    found = Search(evidence_of(QUILL, runs_from(columns))).run()
-    return sorted(term.hypothesis.place for term in found.fit.terms)
+    return Search(evidence_of(QUILL, runs_from(columns))).run().fit.terms
+
+
+def named(scenarios, seed, hours=36.0, **noise):
+    return sorted(term.hypothesis.place for term in search(scenarios, seed, hours, **noise))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -201,3 +204,17 @@ def test_two_effects_that_are_known_only_together_are_not_known_apart():
     [(size, std)] = deviations(one)
     assert std < 0.2 * size
     assert all(std > 3.0 * deviations(one)[0][1] for _, std in deviations(both))
+
+
+def test_the_end_of_a_record_is_no_second_effect():
+    """The heat is switched minutes before the end: T_Q, which is late, does not show it any more."""
+    terms = search([draw("late sensor", 3)], 1003, 24.0, noise_k=0.0126, noise_um=0.233)
+    assert [term.hypothesis.place for term in terms] == [("delay", "TTF", "")]
+
+
+def test_an_effect_is_exchanged_for_another_form_of_itself():
+    """A lag alone comes first, and what it leaves would have another name; with its dead time nothing is left."""
+    terms = search([draw("input delay", 2)], 1002, 36.0, noise_k=0.0178, noise_um=0.254)
+    assert [(term.hypothesis.place, term.hypothesis.form) for term in terms] == [
+        (("input", "", "fan_rpm"), "lag and delay")
+    ]
