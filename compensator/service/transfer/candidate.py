@@ -16,8 +16,8 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Config
 from compensator.errors import DataError
-from compensator.events import EventKind
-from compensator.messages import EstimateMessage
+from compensator.events import CommandName, EventKind, command_of
+from compensator.messages import EstimateMessage, Event
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import decode, read_messages, recordings
 from compensator.service.compensation import Compensation, Outcome, slowest_min
@@ -171,7 +171,10 @@ class RecordedRun:
             if step.zero is not None:
                 self.compensation.zero(step.zero)
             channels = {name: channel for name, channel in step.sample.channels.items() if name in self._names}
-            # The zero is set above; of the other events only the pauses concern another model.
+            # The zero is set above; of the other events only the pauses concern another model, and that a person has
+            # seen to exchanged couples: it must not wait for this again.
+            if self.compensation.plausibility.exchanged and any(map(_is_resume, step.events)):
+                self.compensation.resume()
             events = [event for event in step.events if event.kind == EventKind.RESTART]
             sample = msgspec.structs.replace(step.sample, channels=channels)
             step = replace(step, sample=sample, events=events)
@@ -181,6 +184,10 @@ class RecordedRun:
         self._first_ns, self.samples = self._first_ns or self._free.time_ns, self.samples + 1
         self.zero = Zero.of_estimate(result.estimate)
         return result
+
+
+def _is_resume(event: Event) -> bool:
+    return event.kind == EventKind.COMMAND and command_of(event) == CommandName.RESUME
 
 
 @dataclass(slots=True)
