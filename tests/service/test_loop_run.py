@@ -342,6 +342,17 @@ def test_from_probes_alone_a_false_candidate_is_not_adopted() -> None:
     assert "adopt" not in [step for _, step, _ in decisions(steps)]
 
 
+def test_a_probe_mount_that_creeps_does_not_make_a_better_model() -> None:
+    """From the night on the feature creeps by 1 µm/h; the candidate explains it by the coolant, which does not act."""
+    creep = lambda i: max(i - NIGHT, 0) / 60.0  # noqa: E731
+    tables = {"loop": {"policy": "adopt", "shadow_h": 6.0}}
+    for gain in (1.0, -1.0):
+        loop = LoopRun(without_sensor(**tables), QUILL, Night(shown(extended(gain))))
+        steps = probed(loop, machine(2 * DAY, noise_um=0.0, acts=lambda i: 0.0, more=creep), 30)
+        assert sum(probe.taken for step in steps[NIGHT:] for probe in step.outcome.probes) > 20
+        assert "adopt" not in [step for _, step, _ in decisions(steps)]
+
+
 def test_a_loop_without_measured_y_is_refused() -> None:
     data = CONFIG[:SENSOR] + CONFIG[COOLANT:] + b'\n[loop]\npolicy = "adopt"\n'
     with pytest.raises(ConfigError, match=r"loop.policy = 'adopt': nothing measures Y, expected a channel 'y_um' or"):

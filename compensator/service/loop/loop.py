@@ -19,8 +19,11 @@ from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
 from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
+from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
+from compensator.service.loop.level import ErrorBlocks, level_um
+from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import Avoided, Compared, Exchange, LoopState, Running, fresh
+from compensator.service.loop.state import Compared, Exchange, LoopState, fresh
 from compensator.service.loop.trust import both_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
 from compensator.service.loop.words import ended, nothing_follows
 from compensator.service.outcome import Outcome
@@ -31,9 +34,8 @@ from compensator.service.transfer.second_opinion import described, is_unusable
 DIFFERS = 4.0
 #: A candidate must be wrong by less than this part of the present model's changes.
 BETTER_PART = 0.95
-#: Least time between two adoptions, which is that after going back from a model, too; and between two diagnoses for a
-#: misfit, h.
-ADOPTION_H, MISFIT_AGAIN_H = 24.0, 12.0
+#: Least time between two adoptions, which is that after going back from a model, too, h.
+ADOPTION_H = 24.0
 #: What is compared counts for so long, in `shadow_h`, and the least of it, h; a candidate that is better so far has as
 #: long before the next diagnosis.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
@@ -117,8 +119,10 @@ class Loop:
         disturbed = suspected or is_disturbed(reasons) or is_unusable(present)
         state.clean_min = 0.0 if disturbed else state.clean_min + minutes
         state.misfit_min = state.misfit_min + minutes if is_alarmed(reasons) else 0.0
+        state.error.update(present)
         notes: list[Note] = []
         if other is not None and state.shadow is not None:
+            state.other_error.update(other)
             may_have_changed = self._compare(present, other, suspected=suspected)
             if not state.exchange:
                 notes += self._decide(now_ns, present, other, judge=may_have_changed)
@@ -182,14 +186,23 @@ class Loop:
             return found.probes >= settings.probes and found.hours >= settings.shadow_h
         return self.judged_h >= settings.shadow_h
 
-    def _may_adopt(self, now_ns: int) -> bool:
-        """Return whether a candidate that is better is adopted without a person.
+    def _level_um(self) -> float | None:
+        """Return by how much a candidate's level is raised at its adoption, µm; None if its level is not known.
 
-        It must be better about the zero, too. Where its level contradicts measured Y, it counts from a zero that was
-        set before its effect acted, or measured Y has moved: which of them is seen at the next zero.
+        A model is judged by changes of Y. Its level is what measured Y shows since the effect began, if it does
+        (`level`). Otherwise it must be better about the zero, too: a level that contradicts measured Y counts from a
+        zero that was set before its effect acted, or measured Y has moved; which of them is seen at the next zero.
         """
         state = self.state
-        if self._settings.policy != "adopt" or not _is_better_about_zero(state.verdict):
+        shown_um = level_um(state.error.blocks, state.other_error.blocks)
+        if shown_um is None and _is_better_about_zero(state.verdict):
+            return self._comparison.level_um if state.verdict.y_moved else 0.0
+        return shown_um
+
+    def _may_adopt(self, now_ns: int) -> bool:
+        """Return whether a candidate that is better is adopted without a person."""
+        state = self.state
+        if self._settings.policy != "adopt" or self._level_um() is None:
             return False
         return not state.adopted_utc_ns or now_ns - state.adopted_utc_ns >= ADOPTION_H * _HOUR_NS
 
@@ -200,11 +213,11 @@ class Loop:
             self._exchange("adopt")
             text = f"a better model is adopted: {self._named()}; {described(state.verdict)}"
             return [self._note(LoopAction.ADOPT, text)]
-        if not by_hand and _is_better_about_zero(state.verdict):
+        if not by_hand and self._level_um() is not None:
             return []  # the last adoption is too short a time ago
         state.phase = "proposed"
         text = f"a better model is proposed: {self._named()}; {described(state.verdict)}"
-        if not _is_better_about_zero(state.verdict):
+        if self._level_um() is None:
             text += "; its level is not confirmed: set a zero, and adopt it then"
         return [self._note(LoopAction.PROPOSE, text)]
 
@@ -214,13 +227,11 @@ class Loop:
         return [self._note(LoopAction.BACK, text)]
 
     def _exchange(self, action: Exchange) -> None:
-        """Decide an exchange, and the level of the other model.
-
-        A model is judged by changes of Y. If its level contradicts measured Y, it counts from a zero that was set
-        before its effect acted, or measured Y has moved: then the level stays as it is and only its changes are new.
-        """
+        """Decide an exchange, and the level of the other model: where it is not known, only its changes are new."""
         state = self.state
-        state.exchange, state.level_um = action, self._comparison.level_um if state.verdict.y_moved else 0.0
+        unknown_um = self._comparison.level_um if state.verdict.y_moved else 0.0
+        known_um = self._level_um() if action == "adopt" else None
+        state.exchange, state.level_um = action, known_um if known_um is not None else unknown_um
 
     def _end(self, why: str, text: str = "") -> list[Note]:
         """End the shadow."""
@@ -252,24 +263,12 @@ class Loop:
     # ------------------------------------------------------------------ diagnoses
 
     def _schedule(self, now_ns: int) -> list[Note]:
-        """Begin a diagnosis if it is time."""
-        state, settings = self.state, self._settings
-        at_ns, every_ns = 60 * settings.at_min * NS, settings.every_h * _HOUR_NS
-        planned_ns = (now_ns - at_ns) // every_ns * every_ns + at_ns
-        state.planned_utc_ns = state.planned_utc_ns or planned_ns
+        """Begin a diagnosis if it is time, and nothing speaks against it."""
+        state = self.state
+        planned_ns = pass_planned(state, self._settings, now_ns)
         if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN or self._is_leading(now_ns):
             return []
-        since_last_h = (now_ns - state.diagnosed_utc_ns) / _HOUR_NS
-        if planned_ns > state.planned_utc_ns:
-            why = "planned"
-        elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_h >= MISFIT_AGAIN_H:
-            why = "misfit"
-        else:
-            return []
-        state.planned_utc_ns, state.diagnosed_utc_ns = planned_ns, now_ns
-        from_ns = now_ns - round(settings.record_h * _HOUR_NS)
-        state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
-        return [self._diagnosis_begins()]
+        return begin_if_due(state, self._settings, now_ns, planned_ns)
 
     def _is_leading(self, now_ns: int) -> bool:
         """Return whether a candidate is better so far: it may be what is missing, and gets time to show it."""
@@ -278,19 +277,6 @@ class Loop:
             return False
         is_new = now_ns - shadow.since_utc_ns < self._remembered_h * _HOUR_NS
         return is_new and found.deviations > 0.0 and found.ratio <= BETTER_PART
-
-    def _diagnosis_begins(self) -> Note:
-        running = self.state.diagnosis
-        assert running is not None
-        text = f"a diagnosis of the last {(running.to_utc_ns - running.from_utc_ns) / _HOUR_NS:g} h begins"
-        data = LoopData(
-            step=LoopAction.DIAGNOSE, why=running.why, from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns
-        )
-        return Note(
-            EventKind.LOOP,
-            text + (": measured and predicted Y have diverged" if running.why == "misfit" else ""),
-            data.table(),
-        )
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis; a candidate is then warmed up (`shadow_begins`)."""
@@ -325,15 +311,24 @@ class Loop:
             return "unchanged"
         if found.in_shadow and self.state.shadow is not None and self.state.shadow.role == role_of(found):
             return "in_shadow"
-        if not found.calibrated and any(one.until_utc_ns > now_ns for one in self._avoided(found.effects)):
+        if not found.calibrated and is_avoided(self.state, found.effects, now_ns):
             return "avoided"
         return ""
 
     # ------------------------------------------------------------------ between two samples
 
-    def shadow_begins(self, sha256: str, effects: Sequence[str], now_ns: int, role: Role = "candidate") -> None:
-        """Begin to compare another model."""
+    def shadow_begins(
+        self,
+        sha256: str,
+        effects: Sequence[str],
+        now_ns: int,
+        role: Role = "candidate",
+        *,
+        error: ErrorBlocks | None = None,
+    ) -> None:
+        """Begin to compare another model, whose error on the record is given where it is known."""
         state = self.state
+        state.other_error = error if error is not None else ErrorBlocks()
         state.diagnosis = None
         state.phase = "shadow" if role == "candidate" else "watching"
         state.shadow = Compared(sha256=sha256, effects=list(effects), role=role, since_utc_ns=now_ns)
@@ -345,8 +340,10 @@ class Loop:
         state, back = self.state, self.state.exchange == "back"
         assert state.shadow is not None
         before, state.effects = state.effects, state.shadow.effects
+        state.error.clear()
         if back:
-            self._avoid_after_back(before, now_ns)
+            longest_h = self._settings.watch_h
+            avoid_after_back(state, before, now_ns, first_h=ADOPTION_H, longest_h=longest_h)
             state.phase, state.shadow, state.exchange = "idle", None, ""
             self._begin_comparison()
             return
@@ -377,15 +374,16 @@ class Loop:
         shadow = self.state.shadow
         if shadow is None or shadow.role != "candidate" or self.state.exchange:
             return []
-        self._avoid(shadow.effects, now_ns)
+        avoid(self.state, shadow.effects, now_ns, self._settings.watch_h)
         return self._end("dismissed")
 
     def model_changed(self, effects: Sequence[str], now_ns: int, *, back: bool = False) -> list[Note]:
         """Begin anew: an operator has changed the model; a diagnosis under way is of no use."""
         state = self.state
         if back:
-            self._avoid(state.effects, now_ns)
+            avoid(state, state.effects, now_ns, self._settings.watch_h)
         state.effects, state.diagnosis = list(effects), None
+        state.error.clear()
         words = "a person has changed the model or the configuration"
         return self.give_up("by_hand", words) if state.shadow is not None else []
 
@@ -396,40 +394,7 @@ class Loop:
 
     def restarted(self) -> list[Note]:
         """Go on after the service was away: a diagnosis that was interrupted is begun once more."""
-        state, running = self.state, self.state.diagnosis
-        if running is None:
-            return []
-        if running.attempts > 1:
-            state.diagnosis = None
-            data = LoopData(step=LoopAction.END, why="interrupted")
-            return [
-                Note(
-                    EventKind.LOOP,
-                    "a diagnosis was interrupted twice: the next one is made when it is planned",
-                    data.table(),
-                )
-            ]
-        again = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="", why="again")
-        state.diagnosis = again
-        return [self._diagnosis_begins()]
-
-    def _avoided(self, effects: Sequence[str]) -> list[Avoided]:
-        return [one for one in self.state.avoided if sorted(one.effects) == sorted(effects)]
-
-    def _avoid(self, effects: Sequence[str], now_ns: int) -> None:
-        """Avoid effects that a person did not want."""
-        self._avoid_for(self._settings.watch_h, effects, now_ns)
-
-    def _avoid_after_back(self, effects: Sequence[str], now_ns: int) -> None:
-        """Avoid effects that were gone back from: an effect may come again, so twice as long each time."""
-        oldest_ns = now_ns - round(self._settings.watch_h * _HOUR_NS)
-        self.state.avoided = [one for one in self.state.avoided if one.until_utc_ns > oldest_ns]
-        hours = ADOPTION_H * 2 ** len(self._avoided(effects))
-        self._avoid_for(min(hours, self._settings.watch_h), effects, now_ns)
-
-    def _avoid_for(self, hours: float, effects: Sequence[str], now_ns: int) -> None:
-        until_ns = now_ns + round(hours * _HOUR_NS)
-        self.state.avoided = [*self.state.avoided, Avoided(effects=list(effects), until_utc_ns=until_ns)]
+        return begin_again(self.state)
 
 
 def role_of(found: DiagnosisData) -> Role:

@@ -77,6 +77,7 @@ def warm_up(
     *,
     between_samples: Callable[[], None] = lambda: None,
     probes: bool = False,
+    seen: Callable[[Outcome], None] = lambda _: None,
 ) -> ModelCandidate:
     """Run a new compensation up to the end of the recordings, with the zero that is current there.
 
@@ -95,6 +96,8 @@ def warm_up(
         Called after each sample, so that a thread can yield to the service.
     probes : bool
         Whether recorded probes correct its prediction.
+    seen : callable
+        Called with each outcome.
 
     Raises
     ------
@@ -115,7 +118,9 @@ def warm_up(
         for step in steps_of(path):
             sample = step.sample
             if sample is None or (sample.seq > run.seq and sample.time_utc_ns >= window.from_ns):
-                run.process(step)
+                outcome = run.process(step)
+                if outcome is not None:
+                    seen(outcome)
             between_samples()
     if not run.samples:
         raise DataError(f"{folder}: no recorded samples for a warm-up")
