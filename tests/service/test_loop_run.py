@@ -153,11 +153,10 @@ def test_an_alarm_under_the_present_model_alone_is_a_reason_to_diagnose_and_no_f
     steps = run(loop, machine(NIGHT + 60))
     alarmed = [step for step in steps if sensor_suspected(step.outcome.offset.reasons)]
     assert len(alarmed) > 240
-    assert [decision[1:] for decision in decisions(steps)][:3] == [
-        ("diagnose", "misfit"),
-        ("shadow", ""),
-        ("adopt", ""),
-    ]
+    found = [decision[1:] for decision in decisions(steps)]
+    assert found[:2] == [("diagnose", "misfit"), ("shadow", "")]
+    # What is found again meanwhile begins no other comparison.
+    assert [step for step, _ in found].count("shadow") == 1 and ("adopt", "") in found
     assert not any(is_alarmed(step.outcome.offset.reasons) for step in steps[-30:])
 
 
