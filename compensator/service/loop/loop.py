@@ -18,9 +18,10 @@ from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
+from compensator.events import ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
 from compensator.service.loop.level import ErrorBlocks, level_um
+from compensator.service.loop.proof import BETTER_PART, is_better_about_zero, is_clearly_better, is_enough, is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Compared, Exchange, LoopState, fresh
@@ -32,8 +33,6 @@ from compensator.service.transfer.second_opinion import described, is_unusable
 
 #: A candidate with the effects of the present model must differ from it by so many standard deviations.
 DIFFERS = 4.0
-#: A candidate must be wrong by less than this part of the present model's changes.
-BETTER_PART = 0.95
 #: Least time between two adoptions, which is that after going back from a model, too, h.
 ADOPTION_H = 24.0
 #: What is compared counts for so long, in `shadow_h`, and the least of it, h; a candidate that is better so far has as
@@ -42,7 +41,6 @@ _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
 _HOUR_NS = 3600 * NS
-_LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +156,7 @@ class Loop:
     def _decide(self, now_ns: int, present: Outcome, other: Outcome, *, judge: bool) -> list[Note]:
         state, shadow = self.state, self.state.shadow
         assert shadow is not None
-        if shadow.role == "candidate" and _is_limited(other) and not _is_limited(present):
+        if shadow.role == "candidate" and is_limited(other) and not is_limited(present):
             return self._end("limits")
         if now_ns - shadow.since_utc_ns >= self._settings.watch_h * _HOUR_NS:
             return self._end("watched" if shadow.role == "before" else "no_difference")
@@ -169,22 +167,16 @@ class Loop:
             return self._go_back() if verdict == ComparisonVerdict.BETTER else []
         if verdict == ComparisonVerdict.WORSE:
             return self._end("worse")
-        is_better = self._is_enough(now_ns - shadow.since_utc_ns) and _is_clearly_better(state.verdict)
+        compared_h = (now_ns - shadow.since_utc_ns) / _HOUR_NS
+        is_better = is_clearly_better(state.verdict) and is_enough(
+            state.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h
+        )
         if state.phase == "proposed" and verdict != ComparisonVerdict.BETTER:
             state.phase = "shadow"
             return [self._note(LoopAction.WITHDRAW, f"the proposal is withdrawn: {described(state.verdict)}")]
         if is_better and (state.phase == "shadow" or self._may_adopt(now_ns)):
             return self._accept(now_ns)
         return []
-
-    def _is_enough(self, since_ns: int) -> bool:
-        """Return whether there is enough to judge a candidate by that has been compared for so long, ns."""
-        found, settings = self.state.verdict, self._settings
-        if since_ns < settings.shadow_h * _HOUR_NS:
-            return False
-        if found.measured_by == "probe":
-            return found.probes >= settings.probes and found.hours >= settings.shadow_h
-        return self.judged_h >= settings.shadow_h
 
     def _level_um(self) -> float | None:
         """Return by how much a candidate's level is raised at its adoption, µm; None if its level is not known.
@@ -195,7 +187,7 @@ class Loop:
         """
         state = self.state
         shown_um = level_um(state.error.blocks, state.other_error.blocks)
-        if shown_um is None and _is_better_about_zero(state.verdict):
+        if shown_um is None and is_better_about_zero(state.verdict):
             return self._comparison.level_um if state.verdict.y_moved else 0.0
         return shown_um
 
@@ -212,6 +204,8 @@ class Loop:
         if self._may_adopt(now_ns):
             self._exchange("adopt")
             text = f"a better model is adopted: {self._named()}; {described(state.verdict)}"
+            if state.level_um:
+                text += f"; its level is raised by {state.level_um:+.1f} µm to that of measured Y"
             return [self._note(LoopAction.ADOPT, text)]
         if not by_hand and self._level_um() is not None:
             return []  # the last adoption is too short a time ago
@@ -400,19 +394,3 @@ class Loop:
 def role_of(found: DiagnosisData) -> Role:
     """Return the role of a candidate: the calibrated model is one from before, and the service goes back to it."""
     return "before" if found.calibrated else "candidate"
-
-
-def _is_limited(outcome: Outcome) -> bool:
-    return any(reason.startswith(_LIMITS) for reason in outcome.offset.reasons)
-
-
-def _is_better_about_zero(found: ComparisonData) -> bool:
-    if found.present_rms_um is None or found.candidate_rms_um is None:
-        return False
-    return found.candidate_rms_um <= BETTER_PART * found.present_rms_um
-
-
-def _is_clearly_better(found: ComparisonData) -> bool:
-    if found.verdict != ComparisonVerdict.BETTER or found.present_rms_um is None or found.candidate_rms_um is None:
-        return False
-    return found.ratio is not None and found.ratio <= BETTER_PART
