@@ -35,8 +35,10 @@ from compensator.service.transfer.second_opinion import described, is_unusable
 DIFFERS = 4.0
 #: Least time between two adoptions, which is that after going back from a model, too, h.
 ADOPTION_H = 24.0
-#: What is compared counts for so long, in `shadow_h`, and the least of it, h; a candidate that is better so far has as
-#: long before the next diagnosis.
+#: A candidate is better so far if it has shown this part of the deviations that it must show.
+LEADS = 0.5
+#: What is compared counts for so long, in `shadow_h`, and the least of it, h; of a candidate as long as the record that
+#: is diagnosed. A candidate that is better so far has as long before the next diagnosis.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
@@ -142,7 +144,9 @@ class Loop:
             return False
         if not found.add(present, other, suspected=False):
             return False
-        oldest_ns = present.sample.time_utc_ns - round(self._remembered_h * _HOUR_NS)
+        is_candidate = state.shadow is not None and state.shadow.role == "candidate"
+        hours = max(self._settings.record_h, self._remembered_h) if is_candidate else self._remembered_h
+        oldest_ns = present.sample.time_utc_ns - round(hours * _HOUR_NS)
         found.forget_before(oldest_ns, 2 * self._settings.probes)
         state.verdict = found.verdict(deviations=self._settings.deviations)
         return True
@@ -270,7 +274,8 @@ class Loop:
         if shadow is None or shadow.role != "candidate" or found.deviations is None or found.ratio is None:
             return False
         is_new = now_ns - shadow.since_utc_ns < self._remembered_h * _HOUR_NS
-        return is_new and found.deviations > 0.0 and found.ratio <= BETTER_PART
+        leads = found.deviations >= LEADS * self._settings.deviations and found.ratio <= BETTER_PART
+        return is_new and leads
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis; a candidate is then warmed up (`shadow_begins`)."""
