@@ -39,6 +39,8 @@ def test_the_level_is_what_measured_y_shows_since_the_effect_began():
     adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
     assert len(adopted) == 1 and adopted[0] < 2 * DAY
     after = errors(steps)[adopted[0] + 60 :]
+    (event,) = [note for step in steps for note in step.events if note.kind == "adopt"]
+    assert "y_moved" not in event.data["comparison"] and abs(event.data["level_um"]) == pytest.approx(12.0, abs=1.0)
     # Counted from the zero, when the coolant was 4 K warmer, it would be wrong by 12 µm.
     assert abs(np.mean(after)) < 1.0 and np.std(after) < 1.0
 

@@ -182,17 +182,20 @@ class Loop:
             return self._accept(now_ns)
         return []
 
+    def _shown_level_um(self) -> float | None:
+        """Return the level of the other model that measured Y shows, µm; None if it shows none (`level`)."""
+        return level_um(self.state.error.blocks, self.state.other_error.blocks)
+
     def _level_um(self) -> float | None:
         """Return by how much a candidate's level is raised at its adoption, µm; None if its level is not known.
 
-        A model is judged by changes of Y. Its level is what measured Y shows since the effect began, if it does
-        (`level`). Otherwise it must be better about the zero, too: a level that contradicts measured Y counts from a
-        zero that was set before its effect acted, or measured Y has moved; which of them is seen at the next zero.
+        Where measured Y does not show it, the candidate must be better about the zero, too: a level that contradicts
+        measured Y counts from a zero that was set before its effect acted, or measured Y has moved; which of them is
+        seen at the next zero.
         """
-        state = self.state
-        shown_um = level_um(state.error.blocks, state.other_error.blocks)
-        if shown_um is None and is_better_about_zero(state.verdict):
-            return self._comparison.level_um if state.verdict.y_moved else 0.0
+        shown_um, verdict = self._shown_level_um(), self.state.verdict
+        if shown_um is None and is_better_about_zero(verdict):
+            return self._comparison.level_um if verdict.y_moved else 0.0
         return shown_um
 
     def _may_adopt(self, now_ns: int) -> bool:
@@ -227,9 +230,11 @@ class Loop:
     def _exchange(self, action: Exchange) -> None:
         """Decide an exchange, and the level of the other model: where it is not known, only its changes are new."""
         state = self.state
-        unknown_um = self._comparison.level_um if state.verdict.y_moved else 0.0
         known_um = self._level_um() if action == "adopt" else None
+        unknown_um = self._comparison.level_um if state.verdict.y_moved else 0.0
         state.exchange, state.level_um = action, known_um if known_um is not None else unknown_um
+        if action == "adopt" and self._shown_level_um() is not None:
+            state.verdict = msgspec.structs.replace(state.verdict, y_moved=False)  # the effect has moved it
 
     def _end(self, why: str, text: str = "") -> list[Note]:
         """End the shadow."""
