@@ -2,8 +2,8 @@
 
 A candidate is judged by changes of Y. Where an effect began after the zero its level is not known: the candidate counts
 its channel from the zero, when the effect did not act. Measured Y shows it if nothing else can have moved Y. Until some
-time the present model was right about this zero, and more so than the candidate: the effect did not act yet. A mount
-that slips beside an effect that has acted all the time makes the candidate the better one before. Since then what the
+time the present model was right about this zero, and about changes more so than the candidate: the effect did not act
+yet. Where it has acted all the time, and a mount slips, the candidate is the better one before. Since then what the
 candidate leaves neither grows nor shrinks, as it would with a mount that creeps.
 """
 
@@ -23,8 +23,8 @@ from compensator.service.outcome import Outcome
 from compensator.service.transfer.comparison import BLOCK_MIN, BLOCK_NS
 from compensator.service.transfer.evidence import FLOOR_UM
 
-#: The present model was right before if it erred by less than this part of what it errs by since then, and by less
-#: than this part of what the candidate erred by before.
+#: The present model was right before if it erred by less than this part of what it errs by since then, and its error
+#: changed by less than this part of what the candidate's changed by.
 WAS_RIGHT, RIGHTER = 0.5, 0.8
 #: The candidate's residual stays if its first and second half differ by less than this part of the present one's error,
 #: and the median of its deviations is less than that part.
@@ -83,12 +83,12 @@ def level_um(present: Sequence[tuple[int, float]], other: Sequence[tuple[int, fl
 
     Examples
     --------
-    >>> began = [(n, 0.3 if n < 12 else 7.0 + n % 2) for n in range(40)]
-    >>> level_um(began, [(n, 1.5 if n < 12 else 6.0) for n in range(40)])
+    >>> began = [(n, 0.1 * (n % 2) if n < 12 else 7.0 + n % 2) for n in range(40)]
+    >>> level_um(began, [(n, 1.0 * (n % 2) if n < 12 else 6.0) for n in range(40)])
     6.0
     >>> level_um(began, [(n, 0.1 if n < 12 else 6.0) for n in range(40)]) is None  # the effect acted before: a slip
     True
-    >>> level_um(began, [(n, 1.5 if n < 12 else 0.3 * n) for n in range(40)]) is None  # a mount that creeps
+    >>> level_um(began, [(n, 1.0 * (n % 2) if n < 12 else 0.3 * n) for n in range(40)]) is None  # a mount that creeps
     True
     """
     others = dict(other)
@@ -101,7 +101,7 @@ def level_um(present: Sequence[tuple[int, float]], other: Sequence[tuple[int, fl
         return None
     since = numbers >= round(at_s / (60.0 * BLOCK_MIN))
     left_um, error_um = rest[since], _rms(own[since])
-    was_right = _rms(own[~since]) < min(WAS_RIGHT * error_um, RIGHTER * _rms(rest[~since]))
+    was_right = _rms(own[~since]) < WAS_RIGHT * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])
     # Medians: while the effect begins, its lag is seen.
     middle_um = float(np.median(left_um))
     halves = np.median(left_um[: left_um.size // 2]), np.median(left_um[left_um.size // 2 :])
