@@ -190,19 +190,20 @@ class Loop(_Table, frozen=True, kw_only=True):
     """`[loop]`: the service looks for what its model lacks; without this table it does not.
 
     `policy`: `propose` asks a person before a better model is adopted, `adopt` adopts it. `at_utc`, `every_h`: a
-    diagnosis is made at this time of the day, UTC, and then every so many hours; `misfit_h`: one is made at once after
-    measured and predicted Y have diverged for so long. `record_h`: how much is diagnosed. `shadow_h`, `probes`,
-    `deviations`: what a candidate must show beside the present model, on data after the diagnosis: hours of measured Y
-    or the number of probes, and by how many standard deviations it is better. `watch_h`: how long the model before is
-    compared after an adoption. `memory_mb`, `time_limit_min`: limits of a diagnosis.
+    diagnosis is made at this time of the day, UTC, and then every so many hours; `misfit_h`: one is made at once
+    after measured and predicted Y have diverged for so long, and again each time this has lasted twice as long.
+    `record_h`: how much is diagnosed. `shadow_h`, `probes`, `deviations`: what a candidate must show beside the
+    present model, on data after the diagnosis: hours of measured Y or the number of probes, and by how many
+    standard deviations it is better. `watch_h`: how long the model before is compared after an adoption.
+    `memory_mb`, `time_limit_min`: limits of a diagnosis.
     """
 
     policy: Literal["off", "propose", "adopt"] = "off"
     at_utc: Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$")] = "02:00"
     every_h: Literal[4, 6, 8, 12, 24] = 12
-    misfit_h: Annotated[float, Meta(ge=1, le=10_000)] = 6.0
+    misfit_h: Annotated[float, Meta(ge=1, le=10_000)] = 3.0
     record_h: Annotated[float, Meta(ge=6, le=336)] = 36.0
-    shadow_h: Annotated[float, Meta(ge=6, le=168)] = 12.0
+    shadow_h: Annotated[float, Meta(ge=6, le=168)] = 6.0
     probes: Annotated[int, Meta(ge=8, le=100)] = 8
     deviations: Annotated[float, Meta(ge=3, le=20)] = 4.0
     watch_h: Annotated[float, Meta(ge=24, le=1000)] = 168.0

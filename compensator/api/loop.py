@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -26,8 +27,8 @@ from compensator.service.outcome import Outcome
 #: A record is explained well if no more than this part of its error is left on held-out data.
 WELL_EXPLAINED = 0.25
 #: A shorter end is not diagnosed, h, nor one with fewer probes: they name nothing.
-SHORTEST_H, FEWEST_PROBES = 7.0, 20
-#: The end must leave less than this part of what the whole does.
+SHORTEST_H, FEWEST_PROBES = 7.0, 12
+#: An end must leave less than this part of what a longer part does.
 END_IS_BETTER = 0.7
 
 
@@ -59,10 +60,11 @@ def diagnosis_of_record(record: Sequence[Outcome], model: bytes, *, probe_std_um
 def diagnoses_of_table(
     table: Table, model: bytes, *, probe_std_um: float | None = None
 ) -> tuple[DiagnosisResult, DiagnosisResult]:
-    """Diagnose a table of `service.loop.record`: all of it, and the end of it if that explains itself better.
+    """Diagnose a table of `service.loop.record`: all of it, and ends of it if they explain themselves better.
 
-    An effect that began or ended within the record explains no whole of it: where the whole is not explained, what is
-    after the change of its residual is diagnosed, too.
+    An effect that began or ended within the record explains no whole of it. Where a part is not explained well, its end
+    is diagnosed, too: what is after the change of its residual, or its second half where none shows; and so on until an
+    end is explained or is too short.
 
     Returns
     -------
@@ -77,46 +79,67 @@ def diagnoses_of_table(
     if not np.isfinite(table.columns["y_um"]).any():
         raise DataError(f"{table.name}: no measured Y that may be used")
     base = parse_model(model, source="calibrated model")
-    whole = _diagnosed(table, base, probe_std_um)
-    changed_s = _changed_at(whole, table) if _left(whole, base) > WELL_EXPLAINED else None
-    end = _end_of(table, changed_s) if changed_s is not None else None
-    if changed_s is None or end is None:
-        return whole, whole
-    try:
-        found = _diagnosed(end, base, probe_std_um)
-    except CompensatorError:  # too little data in so short an end
-        return whole, whole
-    if found.verdict == "adequate":
-        # An end in which little moves shows no effect either: it has ended only if the model is better without it.
-        return (whole, whole) if _holds_after(whole, table, base, changed_s) else (found, whole)
-    return (found if _left(found, base) < END_IS_BETTER * _left(whole, base) else whole), whole
+    whole = best = last = _Part.of(table, base, probe_std_um)
+    while last.left > WELL_EXPLAINED:
+        from_s = last.ends_from_s()
+        end = _end_of(last.table, from_s)
+        if end is None:
+            break
+        try:
+            last = _Part.of(end, base, probe_std_um)
+        except CompensatorError:  # too little data in so short an end
+            break
+        if last.found.verdict == "adequate":
+            # An end in which little moves shows no effect either: it has ended only if the model is better without it.
+            best = best if best.holds_after(from_s) else last
+        elif last.left < END_IS_BETTER * best.left:
+            best = last
+    return best.found, whole.found
 
 
-def _changed_at(found: DiagnosisResult, table: Table) -> float | None:
-    """Return when the base model's residual in a diagnosis has changed, s; None if it has not."""
-    return changed_at(_times(found, table), found.diagnosis.residual_before, found.diagnosis.noise_floor_um)
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A part of a record, what its diagnosis found, and which part of its error on held-out data that leaves."""
 
+    table: Table
+    found: DiagnosisResult
+    left: float
 
-def _holds_after(found: DiagnosisResult, table: Table, base: ThermalModel, from_s: float) -> bool:
-    """Return whether what can be deployed makes the residual after a time smaller."""
-    if len(found.model.effects) == len(base.effects):
-        return False
-    after = _times(found, table) >= from_s
-    before_um, left_um = found.diagnosis.residual_before[after], found.diagnosis.residual_after[after]
-    return bool(np.nanstd(left_um) < np.nanstd(before_um))
+    @classmethod
+    def of(cls, table: Table, base: ThermalModel, probe_std_um: float | None) -> _Part:
+        found = _diagnosed(table, base, probe_std_um)
+        return cls(table, found, _left(found, base))
 
+    def ends_from_s(self) -> float:
+        """Return from when on its end is diagnosed, too, s."""
+        diagnosis = self.found.diagnosis
+        changed_s = changed_at(self._times_s, diagnosis.residual_before, diagnosis.noise_floor_um)
+        middle_s = float(self.table.t_s.min() + self.table.t_s.max()) / 2.0
+        return changed_s if changed_s is not None else middle_s
 
-def _times(found: DiagnosisResult, table: Table) -> Vector:
-    """Return the times of the residuals of a diagnosis, s, as in its table."""
-    return np.asarray(table.t_s.min() + np.concatenate([run.t_s for run in found.diagnosis.evidence.runs]))
+    def holds_after(self, from_s: float) -> bool:
+        """Return whether what can be deployed makes the residual after a time smaller."""
+        if not math.isfinite(self.left):
+            return False
+        diagnosis, after = self.found.diagnosis, self._times_s >= from_s
+        left_um, before_um = diagnosis.residual_after[after], diagnosis.residual_before[after]
+        return bool(np.nanstd(left_um) < np.nanstd(before_um))
+
+    @property
+    def _times_s(self) -> Vector:
+        """Times of the residuals of the diagnosis, s, as in the table."""
+        runs = self.found.diagnosis.evidence.runs
+        return np.asarray(self.table.t_s.min() + np.concatenate([run.t_s for run in runs]))
 
 
 def _left(found: DiagnosisResult, base: ThermalModel) -> float:
-    """Return which part of the error on held-out data a diagnosis leaves; 1 if nothing can be deployed."""
+    """Return which part of the error on held-out data a diagnosis leaves; infinite if nothing can be deployed."""
     if found.verdict == "adequate":
         return 0.0
     before, after, floor = found.diagnosis.before.rms_um, found.diagnosis.after.rms_um, found.diagnosis.noise_floor_um
-    if len(found.model.effects) == len(base.effects) or not before > floor:
+    if len(found.model.effects) == len(base.effects):
+        return math.inf
+    if not before > floor:
         return 1.0
     return math.sqrt(max(after**2 - floor**2, 0.0) / (before**2 - floor**2))
 

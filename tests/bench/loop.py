@@ -199,7 +199,7 @@ def advance(run, last, sample, probe, is_visit):
     if last is not None and sample.seq > last + 1:
         run.pause(sample.seq - last - 1)
     if is_visit:
-        run.compensation.resume()
+        run.resume()
         run.compensation.zero("warm")
     return run.process(sample, [probe] if probe is not None else [])
 

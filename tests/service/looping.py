@@ -31,8 +31,8 @@ LIMITS = {
 
 
 def settings(**changes: Any) -> Config:
-    """The usual configuration, with a loop that adopts, and looks for a model once a day."""
-    loop = {"policy": "adopt", "every_h": 24} | changes.pop("loop", {})
+    """The usual configuration, with a loop that adopts, looks for a model once a day, and compares for twelve hours."""
+    loop = {"policy": "adopt", "every_h": 24, "shadow_h": 12.0} | changes.pop("loop", {})
     return config(**{"loop": loop, "limits": LIMITS, **changes})
 
 
@@ -107,6 +107,11 @@ def decisions(steps: Sequence[LoopStep]) -> list[tuple[int, str, str]]:
     """Return each decision: number of the sample, step and reason."""
     notes: list[tuple[int, Note]] = [(step.outcome.sample.seq, note) for step in steps for note in step.events]
     return [(seq, note.data["step"], note.data.get("why", "")) for seq, note in notes if note.kind == "loop"]
+
+
+def crept(i: int) -> float:
+    """A mount that creeps by 10 µm in the first hours: measured Y shows no level then, before the effect and after."""
+    return 10.0 * min(i / 200.0, 1.0)
 
 
 def errors(steps: Sequence[LoopStep]) -> np.ndarray:

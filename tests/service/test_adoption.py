@@ -406,3 +406,24 @@ def test_the_store_keeps_the_history_and_the_configuration_has_the_last_word(tmp
     (store.folder / "adopted.json").write_bytes(b"{")
     with pytest.raises(ServiceError, match="remove it to use the configured model"):
         store.in_use()
+
+
+async def test_couples_that_a_person_has_put_right_are_no_fault_of_a_model_adopted_afterwards(tmp_path: Path) -> None:
+    checked = settings(plausibility={"t_q_below_at_after_min": 10.0}, guards={"t_q_below_at_max_k": 1.0})
+    machine = Machine(tmp_path, checked)
+    sources = machine.device.sources
+    t_q, at = sources[0], sources[1]
+
+    def wire(first: Any, second: Any) -> Callable[[], None]:
+        def act() -> None:
+            sources[0], sources[1] = first, second
+
+        return act
+
+    machine.at_sample[100], machine.at_sample[130] = wire(at, t_q), wire(t_q, at)
+    machine.at_sample[140] = lambda: machine.command("resume")
+    machine.at_sample[160] = Asked(machine, "adopt", payload(STRONGER))
+    await machine.run(400, adopted(STRONGER, then=5))
+    assert "t_q_at_exchanged" in machine.outcomes[135].offset.reasons
+    assert "t_q_at_exchanged" not in machine.outcomes[150].offset.reasons
+    assert "t_q_at_exchanged" not in machine.outcomes[-1].offset.reasons

@@ -31,7 +31,9 @@ def test_a_mount_that_was_knocked_is_named_to_a_person_and_gives_no_candidate() 
     assert found.model is None and found.effects == () and "step" in found.needs
 
 
-def test_only_what_is_after_the_change_of_the_residual_is_diagnosed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_after_the_change_of_the_residual_is_diagnosed_again_and_ends_of_it_until_they_are_too_short(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     loop = LoopRun(settings(), QUILL, Night(shown(None, "adequate")))
     begins, spans = 1200, list[float]()
     table = usable_table([step.outcome for step in run(loop, machine(2160, acts=lambda i: float(i > begins)))])
@@ -43,5 +45,5 @@ def test_only_what_is_after_the_change_of_the_residual_is_diagnosed_again(monkey
     monkeypatch.setattr(api, "_diagnosed", counted)
     monkeypatch.setattr(api, "WELL_EXPLAINED", 0.0)
     diagnoses_of_table(table, QUILL)
-    assert len(spans) == 2
     assert spans[1] == pytest.approx(2160 - begins, abs=120)
+    assert spans == sorted(spans, reverse=True) and spans[-1] == 60.0 * api.SHORTEST_H

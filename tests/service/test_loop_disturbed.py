@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from typing import Any
+
 import msgspec
 import pytest
 
+from compensator.config import Loop
 from compensator.errors import CompensatorError, ServiceError
 from compensator.messages import Sample
 from compensator.service.compensation import Compensation
+from compensator.service.loop.avoided import avoid_after_back, is_avoided
 from compensator.service.loop.core import LOOP_STATE, SHADOW_MODEL, SHADOW_STATE, ModelLoop
 from compensator.service.loop.run import LoopRun
+from compensator.service.loop.schedule import begin_if_due, pass_planned
+from compensator.service.loop.state import LoopState
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.looping import Night, decisions, extended, machine, run, settings, shown
 from tests.service.test_restart import QUILL
@@ -84,12 +92,48 @@ def test_a_shadow_whose_model_or_state_is_damaged_is_refused() -> None:
 
 
 def test_effects_that_were_gone_back_from_wait_a_day_and_then_twice_as_long() -> None:
-    loop = LoopRun(settings(), QUILL, Night(shown(extended())))
-    found, effects = loop._core.loop, ["input:coolant_degc"]
-    waits = []
+    state, effects, waits = LoopState(), ["input:coolant_degc"], []
     for now_h in (0, 30, 100):
-        found._avoid_after_back(effects, now_h * HOUR_NS)
-        waits.append((found.state.avoided[-1].until_utc_ns - now_h * HOUR_NS) / HOUR_NS)
+        avoid_after_back(state, effects, now_h * HOUR_NS, first_h=24.0, longest_h=168.0)
+        waits.append((state.avoided[-1].until_utc_ns - now_h * HOUR_NS) / HOUR_NS)
     assert waits == [24.0, 48.0, 96.0]
-    found._avoid_after_back(effects, 1000 * HOUR_NS)  # after a week without it counts anew
-    assert found.state.avoided[-1].until_utc_ns == 1024 * HOUR_NS
+    assert is_avoided(state, effects, 195 * HOUR_NS) and not is_avoided(state, effects, 197 * HOUR_NS)
+    # After a week without it counts anew.
+    avoid_after_back(state, effects, 1000 * HOUR_NS, first_h=24.0, longest_h=168.0)
+    assert state.avoided[-1].until_utc_ns == 1024 * HOUR_NS
+
+
+def test_a_misfit_is_diagnosed_each_time_that_it_has_lasted_twice_as_long() -> None:
+    tables, state, began = Loop(policy="adopt", misfit_h=3.0, every_h=24, at_utc="00:00"), LoopState(), []
+    for minute in range(1, 23 * 60):
+        state.misfit_min, now_ns = float(minute), minute * HOUR_NS // 60
+        if begin_if_due(state, tables, now_ns, pass_planned(state, tables, now_ns)):
+            began.append(minute / 60.0)
+            state.diagnosis = None
+    assert began == [3.0, 6.0, 12.0]
+
+
+def broken(values: dict[str, float]) -> None:
+    values["t_q_degc"] = math.nan
+
+
+def jumped(values: dict[str, float]) -> None:
+    values["at_degc"] += 4.0
+
+
+def stuck(values: dict[str, float]) -> None:
+    values["t_q_degc"] = 31.0
+
+
+@pytest.mark.parametrize("fault", [broken, jumped, stuck])
+def test_a_fault_of_a_couple_that_begins_in_a_shadow_makes_no_better_model(fault: Callable[[Any], None]) -> None:
+    """The candidate explains by the coolant, which does not act, and from the fourth hour on Y is predicted wrong."""
+
+    def change(i: int, values: dict[str, float]) -> None:
+        if i >= FIRST + 240:
+            fault(values)
+
+    loop = LoopRun(settings(), QUILL, Night(shown(extended(1.0))))
+    steps = run(loop, machine(FIRST + 1440, acts=lambda i: 0.0, change=change))
+    found = [step for _, step, _ in decisions(steps)]
+    assert "shadow" in found and "adopt" not in found and loop.effects == ()

@@ -1,4 +1,8 @@
-"""A candidate that is right about every change of Y and wrong in its level: proposed, and adopted after a zero."""
+"""A candidate that is right about every change of Y and wrong in its level.
+
+Measured Y shows the level if the present model was right until the effect began; else it is proposed, and adopted after
+a zero.
+"""
 
 import asyncio
 import dataclasses
@@ -15,7 +19,7 @@ from compensator.service.loop.run import LoopRun
 from compensator.service.replay import opening_of
 from compensator.service.transfer.model_store import sha256_of
 from tests.service.living import MACHINE
-from tests.service.looping import DAY, Night, decisions, errors, extended, machine, run, settings, shown
+from tests.service.looping import DAY, Night, crept, decisions, errors, extended, machine, run, settings, shown
 from tests.service.test_loop_service import Asked, Looping, changed, checked, in_phase, replayed
 from tests.service.test_restart import QUILL as QUILL_FILE
 
@@ -25,9 +29,35 @@ def warm_at_first(i: int, values: dict[str, float]) -> None:
     values["coolant_degc"] += 4.0 if i < DAY // 2 else 0.0
 
 
+def begun(i: int) -> float:
+    return float(i >= DAY // 2)
+
+
+def test_the_level_is_what_measured_y_shows_since_the_effect_began():
+    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    steps = run(loop, machine(3 * DAY, begun, change=warm_at_first))
+    adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
+    assert len(adopted) == 1 and adopted[0] < 2 * DAY
+    after = errors(steps)[adopted[0] + 60 :]
+    (event,) = [note for step in steps for note in step.events if note.kind == "adopt"]
+    assert "y_moved" not in event.data["comparison"] and abs(event.data["level_um"]) == pytest.approx(12.0, abs=1.0)
+    # Counted from the zero, when the coolant was 4 K warmer, it would be wrong by 12 µm.
+    assert abs(np.mean(after)) < 1.0 and np.std(after) < 1.0
+
+
+@pytest.mark.parametrize("slip_min", [60, 300])
+def test_a_mount_that_slips_beside_an_effect_that_acts_is_no_level_of_it(slip_min):
+    """The effect acts all the time, and the mount slips by 8 µm: the level of the candidate is right, that of Y not."""
+    slip = DAY // 2 + slip_min
+    loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
+    steps = run(loop, machine(2 * DAY, more=lambda i: 8.0 * (i >= slip)))
+    error = errors(steps)[-300:] - 8.0
+    assert abs(np.mean(error)) < 4.0
+
+
 def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it_is():
     loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
-    samples = machine(3 * DAY, lambda i: 1.0 if i >= DAY // 2 else 0.0, change=warm_at_first)
+    samples = machine(3 * DAY, begun, more=crept, change=warm_at_first)
     steps = run(loop, samples, 2 * DAY)
     assert loop.phase == "proposed" and "adopt" not in [step for _, step, _ in decisions(steps)]
     loop.accept()
@@ -43,7 +73,7 @@ def test_a_level_that_contradicts_measured_y_is_left_to_a_person_and_stays_as_it
 
 def test_such_a_candidate_is_adopted_after_a_zero():
     loop = LoopRun(settings(), QUILL_FILE, Night(shown(extended())))
-    samples = machine(4 * DAY, lambda i: 1.0 if i >= DAY // 2 else 0.0, change=warm_at_first)
+    samples = machine(4 * DAY, begun, more=crept, change=warm_at_first)
     steps = run(loop, samples, 2 * DAY)
     assert loop.phase == "proposed"
     loop.compensation.zero("warm")
@@ -56,20 +86,20 @@ def test_such_a_candidate_is_adopted_after_a_zero():
 
 
 class WarmAtFirst(Looping):
-    """A machine whose coolant is 4 K warmer at the zero, while it does not act yet, than later."""
+    """A machine whose coolant is 4 K warmer at the zero, while it does not act, than later; and its mount creeps."""
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         acted_from = self.device.sources[3]
         self.device.sources[3] = lambda: acted_from() + (4.0 if self.minute() < DAY else 0.0)
+        measured = self.device.sources[2]
+        self.device.sources[2] = lambda: measured() + crept(self.minute() // 2)
 
 
 @pytest.fixture(scope="module")
 def adopted(tmp_path_factory):
     """A service in which a person has adopted a candidate whose level contradicts measured Y."""
-    service = WarmAtFirst(
-        tmp_path_factory.mktemp("level"), shown(extended()), acts=lambda i: 1.0 if i >= DAY // 2 else 0.0
-    )
+    service = WarmAtFirst(tmp_path_factory.mktemp("level"), shown(extended()), acts=begun)
 
     async def adopts():
         await service.run(2400, until=in_phase(service, "proposed"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import math
 import shutil
@@ -27,6 +28,7 @@ from compensator.service.loop.shadow import Shadow
 from compensator.service.loop.weighing import Diagnosed
 from compensator.service.outcome import Outcome
 from compensator.service.replay import opening_of
+from compensator.service.transfer import model_store
 from compensator.service.transfer.model_store import sha256_of
 from tests.audit.made import CONFIG
 from tests.service.living import MACHINE, Machine, largest_step
@@ -57,6 +59,10 @@ class Looping(Machine):
         self.device.sources[3] = self.coolant_degc
         self.device.sources[2] = lambda: self.world.truth("y_um") + self.effect_um() + 0.4 * float(rng.normal())
         self.lag: dict[int, float] = {}
+
+    def use(self, data: bytes) -> None:
+        """Let the next start read another configuration."""
+        self.config, self.config_bytes = parse_config(data, source="test"), data
 
     def minute(self) -> int:
         return round((self.clock.utc_ns() - self.began_ns) / 30e9)
@@ -300,6 +306,45 @@ async def test_a_kill_between_the_stored_model_and_its_first_sample_completes_th
     assert largest_step(machine.outcomes) <= 8.0 + 1e-9
     assert {one.role for one in machine.candidates()[-30:]} == {"before"}
     assert machine.events("adopt")[-1].data["by"] == "loop"
+    checked(machine)
+
+
+async def test_a_disk_that_is_full_at_an_adoption_leaves_the_present_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine, works, refused = Looping(tmp_path, shown(extended())), model_store.replace_file, list[Path]()
+
+    def full(path: Path, data: bytes) -> None:
+        refused.append(path)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(model_store, "replace_file", full)
+    await machine.run(1800, until=lambda _: bool(refused))
+    monkeypatch.setattr(model_store, "replace_file", works)
+    await machine.run(30)
+    assert machine.steps() == [("diagnose", "planned"), ("shadow", ""), ("adopt", ""), ("end", "failed")]
+    assert "No space left on device" in machine.events("loop")[-1].text
+    assert machine.store.in_use() == QUILL and machine.outcomes[-1].offset.model_sha256 == sha256_of(QUILL)
+    # As if nothing had happened: the restart finds no model half stored, and the next night makes another candidate.
+    await machine.run(1440, until=in_phase(machine, "shadow"))
+    assert machine.steps()[4:] == [("diagnose", "planned"), ("shadow", "")]
+    checked(machine)
+
+
+async def test_another_policy_ends_the_shadow_at_the_restart_and_holds_from_then_on(tmp_path: Path) -> None:
+    machine = Looping(tmp_path, shown(extended()))
+    await machine.run(1500)
+    assert machine.steps()[-1] == ("shadow", "")
+    machine.use(machine.config_bytes.replace(b'policy = "adopt"', b'policy = "propose"'))
+    await machine.run(5)
+    assert machine.steps()[-1] == ("end", "by_hand")
+    await machine.run(1800, until=in_phase(machine, "proposed"))
+    await machine.run(60)
+    assert machine.steps()[3:] == [("diagnose", "planned"), ("shadow", ""), ("propose", "")]
+    assert machine.store.in_use() == QUILL
+    machine.use(machine.config_bytes.replace(b'policy = "propose"', b'policy = "off"'))
+    await machine.run(5)
+    assert "loop.json" not in opening_of(recordings(machine.recordings, MACHINE)[-1])
     checked(machine)
 
 

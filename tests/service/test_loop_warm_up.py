@@ -7,9 +7,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from compensator.codes import Reason
 from compensator.model.model_file import parse_model
 from compensator.service.compensation import Compensation
 from compensator.service.loop.core import is_rest, warmed_on
+from compensator.service.loop.shadow import Shadow
 from compensator.service.outcome import Outcome
 from tests.service.looping import extended, machine, settings
 
@@ -67,3 +69,26 @@ def _moved(sample: Any, i: int) -> Any:
     """The sample as if no other one were missing before it."""
     start_ns = sample.time_utc_ns - sample.seq * 60_000_000_000
     return msgspec.structs.replace(sample, time_utc_ns=start_ns + i * 60_000_000_000)
+
+
+def test_what_a_person_has_seen_to_before_the_candidate_is_no_fault_of_it() -> None:
+    """T_Q and AT were exchanged, and put right: the present model goes on, and so does a candidate on that record."""
+    guarded = settings(plausibility={"t_q_below_at_after_min": 30.0}, guards={"t_q_below_at_max_k": 2.0})
+
+    def exchanged(i: int, values: dict[str, float]) -> None:
+        if 400 <= i < 600:
+            values["t_q_degc"], values["at_degc"] = values["at_degc"], values["t_q_degc"]
+
+    present = Compensation(guarded, parse_model(extended(0.5), source="present"))
+    record = list[Outcome]()
+    for one in machine(1200, change=exchanged):
+        if one.seq == 620:
+            present.resume()
+        record.append(present.process(one))
+    assert Reason.T_Q_AT_EXCHANGED in record[610].offset.reasons
+    assert Reason.T_Q_AT_EXCHANGED not in record[-1].offset.reasons
+    shadow = Shadow(warmed_on(guarded, parse_model(extended(3.0), source="candidate"), record[:-1]), b"")
+    assert Reason.T_Q_AT_EXCHANGED not in shadow.process(record[-1])[1].offset.reasons
+    # While the present one waits for a person, the candidate does, too.
+    early = Shadow(warmed_on(guarded, parse_model(extended(3.0), source="candidate"), record[:610]), b"")
+    assert Reason.T_Q_AT_EXCHANGED in early.process(record[610])[1].offset.reasons

@@ -15,6 +15,7 @@ from compensator.events import ComparisonData, DiagnosisData, EventKind, Note
 from compensator.messages import Candidate
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.compensation import Compensation, Outcome
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import Loop
 from compensator.service.loop.shadow import Role, Shadow, candidate_message
 from compensator.service.loop.state import LoopState, decode_loop
@@ -125,11 +126,14 @@ class ModelLoop:
         """Decide what follows from a diagnosis."""
         return self.loop.receive(found, now_ns)
 
-    def begin_shadow(self, compensation: Compensation, data: bytes, now_ns: int, role: Role) -> None:
-        """Begin to compare another model that is in its state after the last sample."""
+    def begin_shadow(
+        self, compensation: Compensation, data: bytes, now_ns: int, role: Role, error: ErrorBlocks
+    ) -> None:
+        """Begin to compare another model that is in its state after the last sample, with its error on the record."""
         if self.shadow is None or self.shadow.compensation.model.sha256 != compensation.model.sha256:
             self.shadow = Shadow(compensation, data)
-        self.loop.shadow_begins(compensation.model.sha256, effect_names(compensation.model), now_ns, role)
+        model = compensation.model
+        self.loop.shadow_begins(model.sha256, effect_names(model), now_ns, role, error=error)
 
     def exchange(self, present: Compensation, data: bytes, now_ns: int) -> tuple[Compensation, bytes]:
         """Let the shadow continue from the present compensation; that one becomes the shadow, or ends after a way back.
@@ -191,7 +195,11 @@ def exchange_note(action: str, old: Compensation, new: Compensation, verdict: Co
 
 
 def warmed_on(
-    config: Config, model: ThermalModel, record: Sequence[Outcome], at_rest: Outcome | None = None
+    config: Config,
+    model: ThermalModel,
+    record: Sequence[Outcome],
+    at_rest: Outcome | None = None,
+    error: ErrorBlocks | None = None,
 ) -> Compensation:
     """Return a compensation of another model in its state after recorded samples, with their zeros and probes.
 
@@ -203,6 +211,8 @@ def warmed_on(
         Outcomes in order; what is missing between two of them is a pause.
     at_rest : Outcome, optional
         That of the last zero at rest before the record.
+    error : ErrorBlocks, optional
+        Gets its error on the record.
     """
     compensation = Compensation(config, model)
     compensation.begin(None)
@@ -219,7 +229,9 @@ def warmed_on(
         if last is not None:
             apart = (outcome.sample.time_utc_ns - last.sample.time_utc_ns) / (outcome.sample.period_s * NS)
             compensation.pause(round(apart) - 1)
-        shadow.process(outcome)
+        _, other = shadow.process(outcome)
+        if error is not None:
+            error.update(other)
         last = outcome
     return compensation
 

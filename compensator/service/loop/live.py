@@ -21,6 +21,7 @@ from compensator.service.compensation import Compensation, Outcome, model_of
 from compensator.service.event_log import EventLog
 from compensator.service.journal import Journal
 from compensator.service.loop.core import Followed, ModelLoop, exchange_note
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.loop import role_of
 from compensator.service.loop.process import Diagnose, failed
 from compensator.service.loop.replaying import FAILED_OUTSIDE
@@ -36,11 +37,12 @@ log = logging.getLogger("compensator")
 
 @dataclass(slots=True)
 class _Found:
-    """A diagnosis that has ended, and its candidate's compensation once it is warmed up."""
+    """A diagnosis that has ended; and its candidate's compensation once it is warmed up, with its error meanwhile."""
 
     weighed: Weighed
     text: str
     compensation: Compensation | None = None
+    error: ErrorBlocks = field(default_factory=ErrorBlocks)
     since: list[Outcome] = field(default_factory=list)
     why: str = ""
 
@@ -150,9 +152,9 @@ class LiveLoop:
                 continue
             if compensation.status.seq >= 0:
                 compensation.pause(missing)
-            shadow.process(outcome)
-        role = role_of(warmed.weighed.data)
-        core.begin_shadow(compensation, warmed.weighed.candidate, compensation.status.time_utc_ns, role)
+            warmed.error.update(shadow.process(outcome)[1])
+        role, now_ns = role_of(warmed.weighed.data), compensation.status.time_utc_ns
+        core.begin_shadow(compensation, warmed.weighed.candidate, now_ns, role, warmed.error)
         self._journal.start_new_file()
 
     def hand_over(self, present: Compensation) -> None:
@@ -322,7 +324,10 @@ class LiveLoop:
     async def _warm_up(self, found: _Found, data: bytes) -> None:
         def warmed() -> Compensation:
             model = model_of(self._config, data, source="candidate")
-            return warm_up(self._recordings, self._config, model, between_samples=give_way(), probes=True).compensation
+            way, seen = give_way(), found.error.update
+            return warm_up(
+                self._recordings, self._config, model, between_samples=way, probes=True, seen=seen
+            ).compensation
 
         try:
             found.compensation = await asyncio.to_thread(warmed)

@@ -18,9 +18,13 @@ from compensator.clock import NS
 from compensator.codes import Reason
 from compensator.config import Loop as LoopSettings
 from compensator.errors import ServiceError
-from compensator.events import ComparisonData, ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
+from compensator.events import ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
+from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
+from compensator.service.loop.level import ErrorBlocks, level_um
+from compensator.service.loop.proof import BETTER_PART, is_better_about_zero, is_clearly_better, is_enough, is_limited
+from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
-from compensator.service.loop.state import Avoided, Compared, Exchange, LoopState, Running, fresh
+from compensator.service.loop.state import Compared, Exchange, LoopState, fresh
 from compensator.service.loop.trust import both_suspect_a_sensor, is_alarmed, is_contradicted, is_disturbed
 from compensator.service.loop.words import ended, nothing_follows
 from compensator.service.outcome import Outcome
@@ -29,18 +33,16 @@ from compensator.service.transfer.second_opinion import described, is_unusable
 
 #: A candidate with the effects of the present model must differ from it by so many standard deviations.
 DIFFERS = 4.0
-#: A candidate must be wrong by less than this part of the present model's changes.
-BETTER_PART = 0.95
-#: Least time between two adoptions, which is that after going back from a model, too; and between two diagnoses for a
-#: misfit, h.
-ADOPTION_H, MISFIT_AGAIN_H = 24.0, 12.0
-#: What is compared counts for so long, in `shadow_h`, and the least of it, h; a candidate that is better so far has as
-#: long before the next diagnosis.
+#: Least time between two adoptions, which is that after going back from a model, too, h.
+ADOPTION_H = 24.0
+#: A candidate is better so far if it has shown this part of the deviations that it must show.
+LEADS = 0.5
+#: What is compared counts for so long, in `shadow_h`, and the least of it, h; of a candidate as long as the record that
+#: is diagnosed. A candidate that is better so far has as long before the next diagnosis.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
 #: No decision before no sensor has been suspected for so long, min.
 CLEAN_MIN = BLOCK_MIN
 _HOUR_NS = 3600 * NS
-_LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,8 +119,10 @@ class Loop:
         disturbed = suspected or is_disturbed(reasons) or is_unusable(present)
         state.clean_min = 0.0 if disturbed else state.clean_min + minutes
         state.misfit_min = state.misfit_min + minutes if is_alarmed(reasons) else 0.0
+        state.error.update(present)
         notes: list[Note] = []
         if other is not None and state.shadow is not None:
+            state.other_error.update(other)
             may_have_changed = self._compare(present, other, suspected=suspected)
             if not state.exchange:
                 notes += self._decide(now_ns, present, other, judge=may_have_changed)
@@ -140,7 +144,9 @@ class Loop:
             return False
         if not found.add(present, other, suspected=False):
             return False
-        oldest_ns = present.sample.time_utc_ns - round(self._remembered_h * _HOUR_NS)
+        is_candidate = state.shadow is not None and state.shadow.role == "candidate"
+        hours = max(self._settings.record_h, self._remembered_h) if is_candidate else self._remembered_h
+        oldest_ns = present.sample.time_utc_ns - round(hours * _HOUR_NS)
         found.forget_before(oldest_ns, 2 * self._settings.probes)
         state.verdict = found.verdict(deviations=self._settings.deviations)
         return True
@@ -154,7 +160,7 @@ class Loop:
     def _decide(self, now_ns: int, present: Outcome, other: Outcome, *, judge: bool) -> list[Note]:
         state, shadow = self.state, self.state.shadow
         assert shadow is not None
-        if shadow.role == "candidate" and _is_limited(other) and not _is_limited(present):
+        if shadow.role == "candidate" and is_limited(other) and not is_limited(present):
             return self._end("limits")
         if now_ns - shadow.since_utc_ns >= self._settings.watch_h * _HOUR_NS:
             return self._end("watched" if shadow.role == "before" else "no_difference")
@@ -165,7 +171,10 @@ class Loop:
             return self._go_back() if verdict == ComparisonVerdict.BETTER else []
         if verdict == ComparisonVerdict.WORSE:
             return self._end("worse")
-        is_better = self._is_enough(now_ns - shadow.since_utc_ns) and _is_clearly_better(state.verdict)
+        compared_h = (now_ns - shadow.since_utc_ns) / _HOUR_NS
+        is_better = is_clearly_better(state.verdict) and is_enough(
+            state.verdict, self._settings, judged_h=self.judged_h, compared_h=compared_h
+        )
         if state.phase == "proposed" and verdict != ComparisonVerdict.BETTER:
             state.phase = "shadow"
             return [self._note(LoopAction.WITHDRAW, f"the proposal is withdrawn: {described(state.verdict)}")]
@@ -173,23 +182,26 @@ class Loop:
             return self._accept(now_ns)
         return []
 
-    def _is_enough(self, since_ns: int) -> bool:
-        """Return whether there is enough to judge a candidate by that has been compared for so long, ns."""
-        found, settings = self.state.verdict, self._settings
-        if since_ns < settings.shadow_h * _HOUR_NS:
-            return False
-        if found.measured_by == "probe":
-            return found.probes >= settings.probes and found.hours >= settings.shadow_h
-        return self.judged_h >= settings.shadow_h
+    def _shown_level_um(self) -> float | None:
+        """Return the level of the other model that measured Y shows, µm; None if it shows none (`level`)."""
+        return level_um(self.state.error.blocks, self.state.other_error.blocks)
+
+    def _level_um(self) -> float | None:
+        """Return by how much a candidate's level is raised at its adoption, µm; None if its level is not known.
+
+        Where measured Y does not show it, the candidate must be better about the zero, too: a level that contradicts
+        measured Y counts from a zero that was set before its effect acted, or measured Y has moved; which of them is
+        seen at the next zero.
+        """
+        shown_um, verdict = self._shown_level_um(), self.state.verdict
+        if shown_um is None and is_better_about_zero(verdict):
+            return self._comparison.level_um if verdict.y_moved else 0.0
+        return shown_um
 
     def _may_adopt(self, now_ns: int) -> bool:
-        """Return whether a candidate that is better is adopted without a person.
-
-        It must be better about the zero, too. Where its level contradicts measured Y, it counts from a zero that was
-        set before its effect acted, or measured Y has moved: which of them is seen at the next zero.
-        """
+        """Return whether a candidate that is better is adopted without a person."""
         state = self.state
-        if self._settings.policy != "adopt" or not _is_better_about_zero(state.verdict):
+        if self._settings.policy != "adopt" or self._level_um() is None:
             return False
         return not state.adopted_utc_ns or now_ns - state.adopted_utc_ns >= ADOPTION_H * _HOUR_NS
 
@@ -199,12 +211,14 @@ class Loop:
         if self._may_adopt(now_ns):
             self._exchange("adopt")
             text = f"a better model is adopted: {self._named()}; {described(state.verdict)}"
+            if state.level_um:
+                text += f"; its level is raised by {state.level_um:+.1f} µm to that of measured Y"
             return [self._note(LoopAction.ADOPT, text)]
-        if not by_hand and _is_better_about_zero(state.verdict):
+        if not by_hand and self._level_um() is not None:
             return []  # the last adoption is too short a time ago
         state.phase = "proposed"
         text = f"a better model is proposed: {self._named()}; {described(state.verdict)}"
-        if not _is_better_about_zero(state.verdict):
+        if self._level_um() is None:
             text += "; its level is not confirmed: set a zero, and adopt it then"
         return [self._note(LoopAction.PROPOSE, text)]
 
@@ -214,13 +228,13 @@ class Loop:
         return [self._note(LoopAction.BACK, text)]
 
     def _exchange(self, action: Exchange) -> None:
-        """Decide an exchange, and the level of the other model.
-
-        A model is judged by changes of Y. If its level contradicts measured Y, it counts from a zero that was set
-        before its effect acted, or measured Y has moved: then the level stays as it is and only its changes are new.
-        """
+        """Decide an exchange, and the level of the other model: where it is not known, only its changes are new."""
         state = self.state
-        state.exchange, state.level_um = action, self._comparison.level_um if state.verdict.y_moved else 0.0
+        known_um = self._level_um() if action == "adopt" else None
+        unknown_um = self._comparison.level_um if state.verdict.y_moved else 0.0
+        state.exchange, state.level_um = action, known_um if known_um is not None else unknown_um
+        if action == "adopt" and self._shown_level_um() is not None:
+            state.verdict = msgspec.structs.replace(state.verdict, y_moved=False)  # the effect has moved it
 
     def _end(self, why: str, text: str = "") -> list[Note]:
         """End the shadow."""
@@ -252,24 +266,12 @@ class Loop:
     # ------------------------------------------------------------------ diagnoses
 
     def _schedule(self, now_ns: int) -> list[Note]:
-        """Begin a diagnosis if it is time."""
-        state, settings = self.state, self._settings
-        at_ns, every_ns = 60 * settings.at_min * NS, settings.every_h * _HOUR_NS
-        planned_ns = (now_ns - at_ns) // every_ns * every_ns + at_ns
-        state.planned_utc_ns = state.planned_utc_ns or planned_ns
+        """Begin a diagnosis if it is time, and nothing speaks against it."""
+        state = self.state
+        planned_ns = pass_planned(state, self._settings, now_ns)
         if state.diagnosis is not None or state.exchange or state.clean_min < CLEAN_MIN or self._is_leading(now_ns):
             return []
-        since_last_h = (now_ns - state.diagnosed_utc_ns) / _HOUR_NS
-        if planned_ns > state.planned_utc_ns:
-            why = "planned"
-        elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_h >= MISFIT_AGAIN_H:
-            why = "misfit"
-        else:
-            return []
-        state.planned_utc_ns, state.diagnosed_utc_ns = planned_ns, now_ns
-        from_ns = now_ns - round(settings.record_h * _HOUR_NS)
-        state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
-        return [self._diagnosis_begins()]
+        return begin_if_due(state, self._settings, now_ns, planned_ns)
 
     def _is_leading(self, now_ns: int) -> bool:
         """Return whether a candidate is better so far: it may be what is missing, and gets time to show it."""
@@ -277,20 +279,8 @@ class Loop:
         if shadow is None or shadow.role != "candidate" or found.deviations is None or found.ratio is None:
             return False
         is_new = now_ns - shadow.since_utc_ns < self._remembered_h * _HOUR_NS
-        return is_new and found.deviations > 0.0 and found.ratio <= BETTER_PART
-
-    def _diagnosis_begins(self) -> Note:
-        running = self.state.diagnosis
-        assert running is not None
-        text = f"a diagnosis of the last {(running.to_utc_ns - running.from_utc_ns) / _HOUR_NS:g} h begins"
-        data = LoopData(
-            step=LoopAction.DIAGNOSE, why=running.why, from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns
-        )
-        return Note(
-            EventKind.LOOP,
-            text + (": measured and predicted Y have diverged" if running.why == "misfit" else ""),
-            data.table(),
-        )
+        leads = found.deviations >= LEADS * self._settings.deviations and found.ratio <= BETTER_PART
+        return is_new and leads
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis; a candidate is then warmed up (`shadow_begins`)."""
@@ -325,15 +315,24 @@ class Loop:
             return "unchanged"
         if found.in_shadow and self.state.shadow is not None and self.state.shadow.role == role_of(found):
             return "in_shadow"
-        if not found.calibrated and any(one.until_utc_ns > now_ns for one in self._avoided(found.effects)):
+        if not found.calibrated and is_avoided(self.state, found.effects, now_ns):
             return "avoided"
         return ""
 
     # ------------------------------------------------------------------ between two samples
 
-    def shadow_begins(self, sha256: str, effects: Sequence[str], now_ns: int, role: Role = "candidate") -> None:
-        """Begin to compare another model."""
+    def shadow_begins(
+        self,
+        sha256: str,
+        effects: Sequence[str],
+        now_ns: int,
+        role: Role = "candidate",
+        *,
+        error: ErrorBlocks | None = None,
+    ) -> None:
+        """Begin to compare another model, whose error on the record is given where it is known."""
         state = self.state
+        state.other_error = error if error is not None else ErrorBlocks()
         state.diagnosis = None
         state.phase = "shadow" if role == "candidate" else "watching"
         state.shadow = Compared(sha256=sha256, effects=list(effects), role=role, since_utc_ns=now_ns)
@@ -345,8 +344,10 @@ class Loop:
         state, back = self.state, self.state.exchange == "back"
         assert state.shadow is not None
         before, state.effects = state.effects, state.shadow.effects
+        state.error.clear()
         if back:
-            self._avoid_after_back(before, now_ns)
+            longest_h = self._settings.watch_h
+            avoid_after_back(state, before, now_ns, first_h=ADOPTION_H, longest_h=longest_h)
             state.phase, state.shadow, state.exchange = "idle", None, ""
             self._begin_comparison()
             return
@@ -377,15 +378,16 @@ class Loop:
         shadow = self.state.shadow
         if shadow is None or shadow.role != "candidate" or self.state.exchange:
             return []
-        self._avoid(shadow.effects, now_ns)
+        avoid(self.state, shadow.effects, now_ns, self._settings.watch_h)
         return self._end("dismissed")
 
     def model_changed(self, effects: Sequence[str], now_ns: int, *, back: bool = False) -> list[Note]:
         """Begin anew: an operator has changed the model; a diagnosis under way is of no use."""
         state = self.state
         if back:
-            self._avoid(state.effects, now_ns)
+            avoid(state, state.effects, now_ns, self._settings.watch_h)
         state.effects, state.diagnosis = list(effects), None
+        state.error.clear()
         words = "a person has changed the model or the configuration"
         return self.give_up("by_hand", words) if state.shadow is not None else []
 
@@ -396,58 +398,9 @@ class Loop:
 
     def restarted(self) -> list[Note]:
         """Go on after the service was away: a diagnosis that was interrupted is begun once more."""
-        state, running = self.state, self.state.diagnosis
-        if running is None:
-            return []
-        if running.attempts > 1:
-            state.diagnosis = None
-            data = LoopData(step=LoopAction.END, why="interrupted")
-            return [
-                Note(
-                    EventKind.LOOP,
-                    "a diagnosis was interrupted twice: the next one is made when it is planned",
-                    data.table(),
-                )
-            ]
-        again = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="", why="again")
-        state.diagnosis = again
-        return [self._diagnosis_begins()]
-
-    def _avoided(self, effects: Sequence[str]) -> list[Avoided]:
-        return [one for one in self.state.avoided if sorted(one.effects) == sorted(effects)]
-
-    def _avoid(self, effects: Sequence[str], now_ns: int) -> None:
-        """Avoid effects that a person did not want."""
-        self._avoid_for(self._settings.watch_h, effects, now_ns)
-
-    def _avoid_after_back(self, effects: Sequence[str], now_ns: int) -> None:
-        """Avoid effects that were gone back from: an effect may come again, so twice as long each time."""
-        oldest_ns = now_ns - round(self._settings.watch_h * _HOUR_NS)
-        self.state.avoided = [one for one in self.state.avoided if one.until_utc_ns > oldest_ns]
-        hours = ADOPTION_H * 2 ** len(self._avoided(effects))
-        self._avoid_for(min(hours, self._settings.watch_h), effects, now_ns)
-
-    def _avoid_for(self, hours: float, effects: Sequence[str], now_ns: int) -> None:
-        until_ns = now_ns + round(hours * _HOUR_NS)
-        self.state.avoided = [*self.state.avoided, Avoided(effects=list(effects), until_utc_ns=until_ns)]
+        return begin_again(self.state)
 
 
 def role_of(found: DiagnosisData) -> Role:
     """Return the role of a candidate: the calibrated model is one from before, and the service goes back to it."""
     return "before" if found.calibrated else "candidate"
-
-
-def _is_limited(outcome: Outcome) -> bool:
-    return any(reason.startswith(_LIMITS) for reason in outcome.offset.reasons)
-
-
-def _is_better_about_zero(found: ComparisonData) -> bool:
-    if found.present_rms_um is None or found.candidate_rms_um is None:
-        return False
-    return found.candidate_rms_um <= BETTER_PART * found.present_rms_um
-
-
-def _is_clearly_better(found: ComparisonData) -> bool:
-    if found.verdict != ComparisonVerdict.BETTER or found.present_rms_um is None or found.candidate_rms_um is None:
-        return False
-    return found.ratio is not None and found.ratio <= BETTER_PART

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from compensator.codes import ProbeCode
+from compensator.codes import ProbeCode, Reason
 from compensator.config import Config
 from compensator.events import ComparisonData, EventKind
 from compensator.messages import SCHEMA, Candidate, Probe
@@ -57,6 +57,9 @@ class Shadow:
         for note in outcome.notes:
             if note.kind == EventKind.ZERO:
                 self.compensation.zero(note.data["mode"])
+        if self.compensation.plausibility.exchanged and Reason.T_Q_AT_EXCHANGED not in outcome.offset.reasons:
+            # A person has seen to the couples: a warm-up passes samples, zeros and probes, and no commands.
+            self.compensation.resume()
         probes = tuple(probe for probe in outcome.probes if _is_compared(probe))
         received = [ReceivedProbe.of(probe, is_checked=True) for probe in probes]
         self.compensation.receive_probes([probe for probe in received if probe is not None])

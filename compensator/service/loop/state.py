@@ -8,6 +8,7 @@ import msgspec
 
 from compensator.errors import DataError
 from compensator.events import ComparisonData, ComparisonVerdict, NotJudged
+from compensator.service.loop.level import ErrorBlocks
 from compensator.service.loop.shadow import Role
 from compensator.service.transfer.comparison import ComparisonState
 
@@ -74,6 +75,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
         Time of the last adoption; 0 before.
     effects : list of str
         Effects of the present model.
+    error, other_error : ErrorBlocks
+        Errors of the present model and of the one in shadow since the last zero, on the record before it, too.
     avoided : list of Avoided
         Models that were gone back from or dismissed.
     """
@@ -92,6 +95,8 @@ class LoopState(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     verdict: ComparisonData = _NOTHING_YET
     adopted_utc_ns: int = 0
     effects: list[str] = []
+    error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
+    other_error: ErrorBlocks = msgspec.field(default_factory=ErrorBlocks)
     avoided: list[Avoided] = []
 
 

@@ -16,8 +16,8 @@ import msgspec
 from compensator.clock import NS
 from compensator.config import Config
 from compensator.errors import DataError
-from compensator.events import EventKind
-from compensator.messages import EstimateMessage
+from compensator.events import CommandName, EventKind, command_of
+from compensator.messages import EstimateMessage, Event
 from compensator.model.thermal_model import ThermalModel
 from compensator.recording.reading import decode, read_messages, recordings
 from compensator.service.compensation import Compensation, Outcome, slowest_min
@@ -77,6 +77,7 @@ def warm_up(
     *,
     between_samples: Callable[[], None] = lambda: None,
     probes: bool = False,
+    seen: Callable[[Outcome], None] = lambda _: None,
 ) -> ModelCandidate:
     """Run a new compensation up to the end of the recordings, with the zero that is current there.
 
@@ -95,6 +96,8 @@ def warm_up(
         Called after each sample, so that a thread can yield to the service.
     probes : bool
         Whether recorded probes correct its prediction.
+    seen : callable
+        Called with each outcome.
 
     Raises
     ------
@@ -115,7 +118,9 @@ def warm_up(
         for step in steps_of(path):
             sample = step.sample
             if sample is None or (sample.seq > run.seq and sample.time_utc_ns >= window.from_ns):
-                run.process(step)
+                outcome = run.process(step)
+                if outcome is not None:
+                    seen(outcome)
             between_samples()
     if not run.samples:
         raise DataError(f"{folder}: no recorded samples for a warm-up")
@@ -171,7 +176,10 @@ class RecordedRun:
             if step.zero is not None:
                 self.compensation.zero(step.zero)
             channels = {name: channel for name, channel in step.sample.channels.items() if name in self._names}
-            # The zero is set above; of the other events only the pauses concern another model.
+            # The zero is set above; of the other events only the pauses concern another model, and that a person has
+            # seen to exchanged couples: it must not wait for this again.
+            if self.compensation.plausibility.exchanged and any(map(_is_resume, step.events)):
+                self.compensation.resume()
             events = [event for event in step.events if event.kind == EventKind.RESTART]
             sample = msgspec.structs.replace(step.sample, channels=channels)
             step = replace(step, sample=sample, events=events)
@@ -181,6 +189,10 @@ class RecordedRun:
         self._first_ns, self.samples = self._first_ns or self._free.time_ns, self.samples + 1
         self.zero = Zero.of_estimate(result.estimate)
         return result
+
+
+def _is_resume(event: Event) -> bool:
+    return event.kind == EventKind.COMMAND and command_of(event) == CommandName.RESUME
 
 
 @dataclass(slots=True)

@@ -164,12 +164,15 @@ class Comparison:
         return sum(block.means is not None for block in self.state.blocks) * BLOCK_MIN / 60.0
 
     @property
+    def residuals_um(self) -> list[tuple[int, float, float]]:
+        """Number of each usable block since the last zero, and mean residual of the present and the other model, µm."""
+        since = [block for block in self.state.blocks if block.zeros == self.state.zeros]
+        return [(block.number, *block.means[:2]) for block in since if block.means is not None]
+
+    @property
     def level_um(self) -> float:
         """Mean of the other model's residual less that of the present one since the last zero, µm; 0 if unknown."""
-        means = [
-            block.means for block in self.state.blocks if block.zeros == self.state.zeros and block.means is not None
-        ]
-        return float(np.mean([other - own for own, other, _ in means])) if means else 0.0
+        return float(np.mean([other - own for _, own, other in self.residuals_um] or [0.0]))
 
     def verdict(self, *, deviations: float = DEVIATIONS) -> ComparisonData:
         """Return the verdict on what was compared.

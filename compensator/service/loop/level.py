@@ -1,0 +1,114 @@
+"""At which level a candidate is adopted: what measured Y shows since its effect began, or none.
+
+A candidate is judged by changes of Y. Where an effect began after the zero its level is not known: the candidate counts
+its channel from the zero, when the effect did not act. Measured Y shows it if nothing else can have moved Y. Until some
+time the present model was right about this zero, and about changes more so than the candidate: the effect did not act
+yet. Where it has acted all the time, and a mount slips, the candidate is the better one before. Since then what the
+candidate leaves neither grows nor shrinks, as it would with a mount that creeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from compensator.arrays import Vector
+from compensator.events import EventKind
+from compensator.messages import number
+from compensator.service.loop.change import FEWEST, changed_at
+from compensator.service.loop.trust import is_disturbed
+from compensator.service.outcome import Outcome
+from compensator.service.transfer.comparison import BLOCK_MIN, BLOCK_NS
+from compensator.service.transfer.evidence import FLOOR_UM
+
+#: The present model was right before if it erred by less than this part of what it errs by since then, and its error
+#: changed by less than this part of what the candidate's changed by.
+WAS_RIGHT, RIGHTER = 0.5, 0.8
+#: The candidate's residual stays if its first and second half differ by less than this part of the present one's error,
+#: and the median of its deviations is less than that part.
+STAYS, SPREAD = 0.25, 0.3
+#: Blocks that are remembered.
+_MOST = 144
+
+
+class ErrorBlocks(msgspec.Struct, kw_only=True):
+    """Block means of a model's residual since the last zero, and the open block.
+
+    Parameters
+    ----------
+    blocks : list of (int, float)
+        Number since 1970, and mean, µm.
+    number, count : int
+        Number of the open block, and its usable samples.
+    sum_um : float
+        Their sum.
+    """
+
+    blocks: list[tuple[int, float]] = []
+    number: int = 0
+    count: int = 0
+    sum_um: float = 0.0
+
+    def update(self, outcome: Outcome) -> None:
+        """Add a sample of the model, unless it shows a fault by itself."""
+        if any(note.kind == EventKind.ZERO for note in outcome.notes):
+            self.clear()
+        residual_um, block = number(outcome.estimate.residual_um), outcome.sample.time_utc_ns // BLOCK_NS
+        if block != self.number:
+            if self.count:
+                self.blocks = [*self.blocks, (self.number, self.sum_um / self.count)][-_MOST:]
+            self.number, self.count, self.sum_um = block, 0, 0.0
+        if np.isfinite(residual_um) and not is_disturbed(outcome.offset.reasons):
+            self.count, self.sum_um = self.count + 1, self.sum_um + residual_um
+
+    def clear(self) -> None:
+        """Begin anew: at a zero, or with another model."""
+        self.blocks, self.count, self.sum_um = [], 0, 0.0
+
+
+def level_um(present: Sequence[tuple[int, float]], other: Sequence[tuple[int, float]]) -> float | None:
+    """Return the level of another model that measured Y shows; None if it shows none.
+
+    Parameters
+    ----------
+    present, other : sequence of (int, float)
+        Number and mean of each block of the residuals of the present and the other model, µm, about the last zero.
+
+    Returns
+    -------
+    float or None
+        Median of the other model's residual since the present one began to err, µm.
+
+    Examples
+    --------
+    >>> began = [(n, 0.1 * (n % 2) if n < 12 else 7.0 + n % 2) for n in range(40)]
+    >>> level_um(began, [(n, 1.0 * (n % 2) if n < 12 else 6.0) for n in range(40)])
+    6.0
+    >>> level_um(began, [(n, 0.1 if n < 12 else 6.0) for n in range(40)]) is None  # the effect acted before: a slip
+    True
+    >>> level_um(began, [(n, 1.0 * (n % 2) if n < 12 else 0.3 * n) for n in range(40)]) is None  # a mount that creeps
+    True
+    """
+    others = dict(other)
+    numbers = np.array([n for n, _ in present if n in others])
+    own, rest = np.array([(mean, others[n]) for n, mean in present if n in others]).reshape(-1, 2).T
+    if numbers.size < 2 * FEWEST:
+        return None
+    at_s = changed_at(60.0 * BLOCK_MIN * numbers, own, FLOOR_UM)
+    if at_s is None:
+        return None
+    since = numbers >= round(at_s / (60.0 * BLOCK_MIN))
+    left_um, error_um = rest[since], _rms(own[since])
+    was_right = _rms(own[~since]) < WAS_RIGHT * error_um and np.std(own[~since]) < RIGHTER * np.std(rest[~since])
+    # Medians: while the effect begins, its lag is seen.
+    middle_um = float(np.median(left_um))
+    halves = np.median(left_um[: left_um.size // 2]), np.median(left_um[left_um.size // 2 :])
+    spread_um = float(np.median(np.abs(left_um - middle_um)))
+    stays = abs(halves[1] - halves[0]) < STAYS * error_um and spread_um < SPREAD * error_um
+    return middle_um if was_right and stays else None
+
+
+def _rms(values: Vector) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,40 @@
+"""What a candidate must show beside the present model before it is proposed or adopted."""
+
+from __future__ import annotations
+
+from compensator.codes import Reason
+from compensator.config import Loop as LoopSettings
+from compensator.events import ComparisonData, ComparisonVerdict
+from compensator.service.outcome import Outcome
+
+#: A candidate must be wrong by less than this part of what the present model is wrong by.
+BETTER_PART = 0.95
+_LIMITS = (Reason.OUTSIDE_VALIDITY, Reason.OFFSET_LIMITED, Reason.CORRECTION_LIMITED)
+
+
+def is_enough(found: ComparisonData, settings: LoopSettings, *, judged_h: float, compared_h: float) -> bool:
+    """Return whether there is enough to judge a candidate by that has been compared for so long, h."""
+    if compared_h < settings.shadow_h:
+        return False
+    if found.measured_by == "probe":
+        return found.probes >= settings.probes and found.hours >= settings.shadow_h
+    return judged_h >= settings.shadow_h
+
+
+def is_clearly_better(found: ComparisonData) -> bool:
+    """Return whether measured Y changes clearly as the candidate predicts."""
+    if found.verdict != ComparisonVerdict.BETTER or found.present_rms_um is None or found.candidate_rms_um is None:
+        return False
+    return found.ratio is not None and found.ratio <= BETTER_PART
+
+
+def is_better_about_zero(found: ComparisonData) -> bool:
+    """Return whether the candidate is better about the zero, too: its level does not contradict measured Y."""
+    if found.present_rms_um is None or found.candidate_rms_um is None:
+        return False
+    return found.candidate_rms_um <= BETTER_PART * found.present_rms_um
+
+
+def is_limited(outcome: Outcome) -> bool:
+    """Return whether a model has reached a limit."""
+    return any(reason.startswith(_LIMITS) for reason in outcome.offset.reasons)

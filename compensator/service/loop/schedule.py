@@ -1,0 +1,63 @@
+"""When a diagnosis begins: at planned times, and while the model errs, each time that this has lasted twice as long."""
+
+from __future__ import annotations
+
+import msgspec
+
+from compensator.clock import NS
+from compensator.config import Loop as LoopSettings
+from compensator.events import EventKind, LoopAction, LoopData, Note
+from compensator.service.loop.state import LoopState, Running
+
+_HOUR_NS = 3600 * NS
+
+
+def pass_planned(state: LoopState, settings: LoopSettings, now_ns: int) -> int:
+    """Return the last planned time, ns since 1970 UTC; at the first sample it counts as done."""
+    at_ns, every_ns = 60 * settings.at_min * NS, settings.every_h * _HOUR_NS
+    planned_ns = (now_ns - at_ns) // every_ns * every_ns + at_ns
+    state.planned_utc_ns = state.planned_utc_ns or planned_ns
+    return planned_ns
+
+
+def begin_if_due(state: LoopState, settings: LoopSettings, now_ns: int, planned_ns: int) -> list[Note]:
+    """Begin a diagnosis if it is time.
+
+    Named is what has lasted long enough to be seen, which nobody knows before: so the first diagnosis of a misfit is
+    made after `misfit_h`, and the next one when there is twice as much of it on record.
+    """
+    since_last_min = (now_ns - state.diagnosed_utc_ns) / (60 * NS)
+    if planned_ns > state.planned_utc_ns:
+        why = "planned"
+    elif state.misfit_min >= 60.0 * settings.misfit_h and since_last_min >= state.misfit_min / 2.0:
+        why = "misfit"
+    else:
+        return []
+    state.planned_utc_ns, state.diagnosed_utc_ns = planned_ns, now_ns
+    from_ns = now_ns - round(settings.record_h * _HOUR_NS)
+    state.diagnosis = Running(from_utc_ns=from_ns, to_utc_ns=now_ns, why=why)
+    return [_begins(state.diagnosis)]
+
+
+def begin_again(state: LoopState) -> list[Note]:
+    """Begin a diagnosis once more that the end of the service has interrupted."""
+    running = state.diagnosis
+    if running is None:
+        return []
+    if running.attempts > 1:
+        state.diagnosis = None
+        data = LoopData(step=LoopAction.END, why="interrupted")
+        text = "a diagnosis was interrupted twice: the next one is made when it is planned"
+        return [Note(EventKind.LOOP, text, data.table())]
+    state.diagnosis = msgspec.structs.replace(running, attempts=running.attempts + 1, candidate_sha256="", why="again")
+    return [_begins(state.diagnosis)]
+
+
+def _begins(running: Running) -> Note:
+    text = f"a diagnosis of the last {(running.to_utc_ns - running.from_utc_ns) / _HOUR_NS:g} h begins"
+    if running.why == "misfit":
+        text += ": measured and predicted Y have diverged"
+    data = LoopData(
+        step=LoopAction.DIAGNOSE, why=running.why, from_utc_ns=running.from_utc_ns, to_utc_ns=running.to_utc_ns
+    )
+    return Note(EventKind.LOOP, text, data.table())
