@@ -935,6 +935,11 @@ class AuditFinding(Code):
         "A recording does not start with the state at the end of the previous one.",
         "Treat the offsets from there on as not proven, and report it.",
     )
+    EMPTY = (
+        "empty",
+        "No sample and no hash chain in any recording that was given: nothing is proven.",
+        "Audit it together with the recordings before and after it; use a copy from a backup.",
+    )
     UNREADABLE = (
         "unreadable",
         "A record is intact but does not match its schema.",

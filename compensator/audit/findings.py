@@ -71,6 +71,7 @@ class Fault(Enum):
     )
     NOTHING_SIGNED = AuditFinding.UNSIGNED, "has no hash chain, so nothing is signed"
     MORE_WAS_THERE = AuditFinding.TRUNCATED, "{next} continues from records that are missing here: the end was cut off"
+    NOTHING_PROVEN = AuditFinding.EMPTY, "{size} bytes without a sample and without a hash chain: nothing is proven"
     BEFORE_HEAD = (
         AuditFinding.TRUNCATED,
         "it does not contain the value that the head of the machine states: cut off or rewritten",

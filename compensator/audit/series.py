@@ -212,6 +212,8 @@ def combine(
         series.check_link(before if before is not None and before.machine == after.machine else None, after)
     if files and newest:
         series.check_head(files, newest, heads)
+    if not any(file.samples or file.last for file in files):
+        series.check_nothing(files)
     own = {name: whole.findings for name, whole in series.own.items()}  # of two files of one name once
     findings = [finding for file in files for finding in (*own.pop(file.file, ()), *file.findings)]
     return Audit(
@@ -321,6 +323,12 @@ class _Series:
         for file in files:
             if file.file in heads and not file.at_head:
                 self._find(Fault.BEFORE_HEAD, file)
+
+    def check_nothing(self, files: Sequence[RecordingAudit]) -> None:
+        """Find that the files prove nothing, where no other finding says so."""
+        for file in files:
+            if not file.findings_count and not self.own[file.file].findings_count:
+                self._find(Fault.NOTHING_PROVEN, file, size=file.size)
 
     def check_link(self, before: RecordingAudit | None, after: RecordingAudit) -> None:
         """Check the link of a file to the previous one."""

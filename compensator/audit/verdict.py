@@ -18,6 +18,8 @@ def verdict(found: Audit) -> str:
         if found.differing:
             wrong.append(f"{found.differing} sample(s) that differ in the replay")
         return f"Not proven: {' and '.join(wrong)} in {files} with {found.samples} samples."
+    if not found.samples:
+        return f"Proven in part: the records of {files} are unchanged; none of them is a sample."
     if partly(found):
         return f"Proven in part: the replay reproduces {found.samples} samples of {files}; see what was not checked."
     words = f"Proven: {found.samples} samples in {files} are unchanged, and the replay reproduces every offset"

@@ -507,7 +507,7 @@ class Container:
     def _torn(self, offset: int, rest: bytes = b"") -> Damaged:
         """Return the error for a file that ends inside a record: a file with a footer is damaged, not torn."""
         self._file.seek(max(0, self._size - len(MAGIC)))
-        if offset > 0 and self._file.read(len(MAGIC)) == MAGIC:
+        if self._size > len(MAGIC) and self._file.read(len(MAGIC)) == MAGIC:
             return Damaged(self.path, offset, "a record that exceeds the end of the file")
         return Torn(self.path, offset, rest)
 

@@ -233,6 +233,7 @@ class Daemon:
     async def _hold(self, label_ns: int) -> None:
         """Publish that the last offset is held, without the sample that could not be processed."""
         await self._await_pending()
+        self._sampler.close_sample()  # its readings belong to no later sample
         machine, sequence = self._config.machine.name, self._events.sequence
         held = self._compensation.held(machine, sequence, label_ns)
         probes, self._deciding = [undecided_probe(machine, sequence, probe) for probe in self._deciding], []

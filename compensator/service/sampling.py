@@ -10,7 +10,7 @@ import asyncio
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -157,12 +157,20 @@ def _most_frequent(errors: Mapping[str, int]) -> str:
 
 @dataclass(slots=True)
 class _DeviceState:
-    """A device with its current poll and its last error."""
+    """A device with its channels, its current poll and its last error."""
 
     device: Device
+    channels: list[tuple[int, ChannelCollector]] = field(default_factory=list)
     task: asyncio.Task[Mapping[int, Reading]] | None = None
+    #: Whether the sample in which the current poll began is still open.
+    counts: bool = False
     error: str = ""
     answered: bool = True
+
+    def add(self, readings: Mapping[int, Reading] | None, error: str | None = None) -> None:
+        """Add the result of one poll to every channel of the device."""
+        for number, collector in self.channels:
+            collector.add(readings.get(number) if readings else None, error)
 
 
 class Sampler:
@@ -187,27 +195,38 @@ class Sampler:
         clock: Clock,
         note: Callable[[EventKind, str, dict[str, object]], None],
     ) -> None:
-        self._channels = config.channel
         self._devices = {name: _DeviceState(device) for name, device in devices.items()}
         self._clock = clock
         self._note = note
         fraction = config.sampling.min_good_fraction
         self._collectors = {channel.name: ChannelCollector(fraction) for channel in config.channel}
+        for channel in config.channel:
+            self._devices[channel.device].channels.append((channel.input, self._collectors[channel.name]))
 
     async def poll(self, interval_s: float) -> None:
-        """Poll every device once; wait briefly for those that answered last time."""
+        """Poll every device once; wait briefly for those that answered last time.
+
+        An answer belongs to the poll that asked for it. A late one counts as long as the sample of this poll is open,
+        and is dropped afterwards: in the next sample it would be an old value with a new time.
+        """
         for state in self._devices.values():
+            self._collect(state)
             if state.task is None:
-                state.task = asyncio.create_task(_read(state.device))
+                state.task, state.counts = asyncio.create_task(_read(state.device)), True
+            else:
+                state.add(None, SampleQuality.DEVICE_TIMEOUT)
         awaited = [state.task for state in self._devices.values() if state.task is not None and state.answered]
         await self._clock.settle(awaited, WAIT_PART * interval_s)
-        results = {name: self._result(state) for name, state in self._devices.items()}
-        for channel in self._channels:
-            readings, error = results[channel.device]
-            self._collectors[channel.name].add(readings.get(channel.input) if readings else None, error)
+        for state in self._devices.values():
+            self._collect(state)
+            state.answered &= state.task is None
 
     def close_sample(self) -> dict[str, ChannelSample]:
-        """Return the sample of every channel and start the next one."""
+        """Return the sample of every channel and start the next one; polls without an answer count as missing."""
+        for state in self._devices.values():
+            if state.task is not None and state.counts:
+                state.add(None, SampleQuality.DEVICE_TIMEOUT)
+                state.counts = False
         return {name: collector.close() for name, collector in self._collectors.items()}
 
     def device_states(self) -> dict[str, str]:
@@ -221,22 +240,18 @@ class Sampler:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    def _result(self, state: _DeviceState) -> tuple[Mapping[int, Reading] | None, str | None]:
-        """Return readings or error code of a device's poll; a poll that is still running counts as missing."""
+    def _collect(self, state: _DeviceState) -> None:
+        """Add readings or error code of a finished poll, if its sample is open."""
         if state.task is None or not state.task.done():
-            state.answered = False
-            return None, SampleQuality.DEVICE_TIMEOUT
+            return
         task, state.task = state.task, None
-        state.answered = True
         error = task.exception()
-        if error is None:
-            self._note_change(state, "")
-            return task.result(), None
-        if not isinstance(error, DriverError):
+        if error is not None and not isinstance(error, DriverError):
             raise error
-        state.answered = error.code != SampleQuality.DEVICE_TIMEOUT
-        self._note_change(state, str(error))
-        return None, error.code
+        state.answered = error is None or error.code != SampleQuality.DEVICE_TIMEOUT
+        self._note_change(state, str(error) if error is not None else "")
+        if state.counts:
+            state.add(*((task.result(), None) if error is None else (None, error.code)))
 
     def _note_change(self, state: _DeviceState, error: str) -> None:
         """Note once when a device stops answering, and once when it answers again."""

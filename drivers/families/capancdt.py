@@ -9,7 +9,6 @@ Source: capaNCDT 6200 operating instructions.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 
@@ -85,30 +84,28 @@ class Capancdt:
         DriverError
             Naming the device, when nothing new came within `timeout_s` (twice as long at the first call).
         """
-        collected = await self._link.collect()
-        oldest_s = asyncio.get_running_loop().time() - self._config.window_s
-        return {number: _reading(channel, parts, oldest_s) for number, (channel, parts) in collected.items()}
+        collected = await self._link.collect(self._config.window_s)
+        return {number: _reading(channel, parts) for number, (channel, parts) in collected.items()}
 
     async def close(self) -> None:
         """Close both connections and end the background task."""
         await self._link.close()
 
 
-def _reading(channel: Channel, parts: Sequence[Sums], oldest_s: float) -> Reading:
-    """Combine the parts within the window."""
-    recent = [part for part in parts if part.time_s >= oldest_s] or [parts[-1]]
-    count = sum(part.count for part in recent)
-    over = sum(part.over for part in recent)
-    under = sum(part.under for part in recent)
+def _reading(channel: Channel, parts: Sequence[Sums]) -> Reading:
+    """Combine the parts."""
+    count = sum(part.count for part in parts)
+    over = sum(part.over for part in parts)
+    under = sum(part.under for part in parts)
     if over:
         return Reading.bad(Quality.OVER, f"{over} of {count} values at the top of {channel.range_um:g} µm")
     if under:
         return Reading.bad(Quality.UNDER, f"{under} of {count} values at 0 of {channel.range_um:g} µm")
     return Reading(
-        value=micrometres(sum(part.total for part in recent) / count, channel.range_um),
+        value=micrometres(sum(part.total for part in parts) / count, channel.range_um),
         quality=Quality.GOOD,
-        minimum=micrometres(min(part.minimum for part in recent), channel.range_um),
-        maximum=micrometres(max(part.maximum for part in recent), channel.range_um),
+        minimum=micrometres(min(part.minimum for part in parts), channel.range_um),
+        maximum=micrometres(max(part.maximum for part in parts), channel.range_um),
         count=count,
     )
 

@@ -59,8 +59,13 @@ class CapancdtLink:
         self._channels = tuple(channels)
         self._kept = {channel: deque(maxlen=_MOST_BLOCKS) for channel in channels}
 
-    async def collect(self) -> Mapping[int, tuple[Channel, list[Sums]]]:
+    async def collect(self, window_s: float) -> Mapping[int, tuple[Channel, list[Sums]]]:
         """Return the sums since the last call; wait for new blocks if there are none.
+
+        Parameters
+        ----------
+        window_s : float
+            What came longer before this call is dropped, s: a stream that has stopped has no present value.
 
         Raises
         ------
@@ -70,6 +75,7 @@ class CapancdtLink:
         if self._closed:
             raise DeviceDisconnected(self._name, "is closed")
         wait_s = self.timeout_s
+        self._drop_before(asyncio.get_running_loop().time() - window_s)
         if self._task is None or self._task.done():
             # The first call also waits for the connections and the ranges.
             wait_s = 2.0 * self.timeout_s
@@ -99,6 +105,11 @@ class CapancdtLink:
     def _complete(self) -> bool:
         """Return whether every channel has new values."""
         return all(self._kept[channel] and channel in self._infos for channel in self._channels)
+
+    def _drop_before(self, oldest_s: float) -> None:
+        for kept in self._kept.values():
+            while kept and kept[0].time_s < oldest_s:
+                kept.popleft()
 
     def _clear(self) -> None:
         for kept in self._kept.values():

@@ -128,6 +128,28 @@ def test_samples_that_cannot_be_worked_out_again_prove_nothing(rec: Path, capsys
     assert "unreadable: its samples cannot be replayed: attachment config.toml" in capsys.readouterr().out
 
 
+def test_empty_files_alone_prove_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a kill at the first write leaves them, or somebody who empties them."""
+    empty = tmp_path / "empty" / "vmc-07_20260105T060000Z.mcap"
+    other = empty.with_name("vmc-07_20260106T000000Z.mcap")
+    empty.parent.mkdir()
+    empty.touch()
+    other.touch()
+    for arguments in ([str(empty)], [str(empty.parent)]):
+        assert main(["replay", "--json", *arguments]) == 3
+        found = json.loads(capsys.readouterr().out)
+        assert not found["clean"] and {finding["kind"] for finding in found["findings"]} == {"empty"}
+    assert main(["replay", str(empty.parent)]) == 3
+    assert capsys.readouterr().out.startswith("✗ Not proven: 2 finding(s) in 2 recording(s) with 0 samples.")
+
+
+def test_a_run_without_samples_proves_its_records(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Service(tmp_path / "rec").run(0).stop()
+    assert main(["replay", str(tmp_path / "rec")]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("⚠ Proven in part: the records of 1 recording(s) are unchanged; none of them is a sample.")
+
+
 @pytest.mark.parametrize(
     ("topic", "expected"),
     [("/temperature", "not a recording of the service"), ("/shop/vmc-07/thermal/sample", "a shop's recording")],

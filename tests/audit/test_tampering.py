@@ -408,10 +408,12 @@ def test_a_live_file_cut_anywhere_is_what_a_kill_leaves(folder: Path, tmp_path: 
     data = path.read_bytes()
     service.kill()
     ends = set()
-    for cut in [*range(0, len(data), 101), len(data)]:
+    for cut in [*range(40), *range(40, len(data), 101), len(data)]:
         path.write_bytes(data[:cut])
         found = audit([path])
-        assert found.clean, (cut, found.findings)
+        # What ends before its first record is no sign of a change, but proves nothing.
+        kinds = [finding.kind for finding in found.findings]
+        assert kinds == ([] if found.files[0].last else ["empty"]), (cut, found.findings)
         assert found.files[0].end in ("open", "torn") and any(path.name in remark for remark in found.remarks)
         ends.add(found.files[0].end)
     assert ends == {"open", "torn"}

@@ -34,6 +34,9 @@ net y-clear axis.y.eoffset-clear
 
 #: What is waited for first; on a busy computer LinuxCNC itself hangs now and then while it starts.
 STARTS = "LinuxCNC is up"
+#: What LinuxCNC reports when the computer is so busy that its motion controller does not take a command in time; the
+#: command is lost, or comes later.
+STARVED = "USRMOT: ERROR: command timeout"
 #: Longest time that the panel takes for an answer, s; a block of a program may take a minute.
 ANSWER_S = 120.0
 
@@ -228,7 +231,8 @@ def linuxcnc(folder: Path, settings: str, *, hal: str = "", **ini: str) -> Itera
             control.quit()
             process.wait(timeout=60)
         except BaseException:
-            sys.stderr.write(log.read_text(errors="replace")[-6000:])
+            said = log.read_text(errors="replace")
+            sys.stderr.write(f"{STARVED}\n{said[-6000:]}" if STARVED in said else said[-6000:])
             raise
         finally:
             control.close()

@@ -24,6 +24,7 @@ from tests.service.simulated import TABLE, config
 CHANNELS = TABLE["channel"][:3]
 GUARDS = {"t_q_below_at_max_k": 2.0, "suspect_jumps": True, "jump_min_k": 1.0}
 BEGIN, END = 300, 480
+CHECKED = {"false_alarm_days": 30.0}
 Change = Callable[[int, dict[str, float]], None]
 
 
@@ -33,12 +34,12 @@ def day() -> dict[str, np.ndarray]:
     return World(PublishedQuill(), duty, usual_sensors(duty.extra_names), 3).record(60.0)
 
 
-def settings(**guards: Any) -> Any:
+def settings(checks: dict[str, float] | None = None, **guards: Any) -> Any:
     limits = TABLE["limits"] | {
         "offset_rate_max_um_per_min": 20.0,
         "validity": {"t_q_degc": [0, 90], "at_degc": [0, 60]},
     }
-    plausibility = {"t_q_below_at_after_min": 15.0, "residual_std_um": 0.3}
+    plausibility = {"t_q_below_at_after_min": 15.0, "residual_std_um": 0.3} | (checks or {})
     return config(channel=CHANNELS, guards=GUARDS | guards, limits=limits, plausibility=plausibility)
 
 
@@ -98,6 +99,30 @@ def test_a_jump_is_never_ok_and_its_mend_makes_the_offset_right_at_once(
     assert {o.offset.state for o in outcomes[END + 20 :]} == {"ok"}
     assert events(outcomes, "accepted") == [END + 2]
     assert np.max(np.abs(np.diff(offsets(outcomes)))) <= 20.0 + 1e-9
+
+
+@pytest.mark.parametrize("gap", [12, 40])
+@pytest.mark.parametrize(("channel", "size"), [("t_q_degc", 8.0), ("at_degc", -5.0)])
+def test_measured_y_ends_the_belief_in_a_jump_that_nobody_saw(
+    day: dict[str, np.ndarray], channel: str, size: float, gap: int
+) -> None:
+    """The couple was open meanwhile: what it shows now could also be heat, or the air, that has changed."""
+    jump = biased(channel, size, end=10_000)
+
+    def unseen(i: int, values: dict[str, float]) -> None:
+        jump(i, values)
+        if BEGIN - gap <= i < BEGIN:
+            values[channel] = math.nan
+
+    def opened(i: int, values: dict[str, float]) -> None:
+        if BEGIN - gap <= i < BEGIN:
+            values[channel] = math.nan
+
+    healthy, outcomes = run(day, opened, y=True, checks=CHECKED), run(day, unseen, y=True, checks=CHECKED)
+    assert {o.offset.state for o in healthy[BEGIN + 10 :]} == {"ok"}
+    wrong = np.abs(offsets(outcomes) - offsets(healthy)) > 5.0
+    assert not any(wrong[i] and o.offset.state == "ok" for i, o in enumerate(outcomes) if i >= BEGIN + 45)
+    assert np.any(wrong[BEGIN + 45 :])
 
 
 def test_without_the_key_the_permitted_change_grows_as_ever(day: dict[str, np.ndarray]) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from compensator.audit.series import audit, summary
 from compensator.config import parse_config
-from compensator.messages import Offset
+from compensator.messages import Offset, Sample
 from compensator.recording.reading import decode, read_messages, recordings
 from drivers.reading import Reading
 from tests.audit.made import CONFIG, QUILL
@@ -57,6 +57,26 @@ async def test_a_defect_holds_the_offset_until_resume(
     assert sent[-1].state in ("ok", "degraded")
     told = [msgspec.json.decode(d)["text"] for n, d in bench.published if n == "event"]
     assert "internal error: ZeroDivisionError: a defect" in told
+
+
+async def test_what_was_read_for_a_sample_that_failed_is_in_no_later_one(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A driver breaks off at the last poll of one sample; nobody may average its other readings into the next."""
+    read, calls = bench.device.read, 0
+
+    async def defective_once() -> Mapping[int, Reading]:
+        nonlocal calls
+        calls += 1
+        if calls == 6 * 10:
+            raise ZeroDivisionError("a defect")
+        return await read()
+
+    monkeypatch.setattr(bench.device, "read", defective_once)
+    await bench.run(20)
+    samples = [msgspec.json.decode(d, type=Sample) for n, d in bench.published if n == "sample"]
+    assert len(samples) == 19
+    assert {channel.polls for sample in samples for channel in sample.channels.values()} == {6}
 
 
 @pytest.mark.parametrize("where", ["_guards.check", "_decision.decide", "plausibility.update", "_set_zero"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import struct
 import time
 from collections.abc import AsyncIterator
@@ -281,6 +282,25 @@ async def test_old_measurements_are_left_out(rig: Any, controller: Controller) -
     await asyncio.sleep(0.8)
     controller.send(block(2, (30, 30)))
     await asyncio.sleep(0.005)
+    assert (await made.read())[0].count == 1
+
+
+async def test_a_stream_that_has_stopped_has_no_value(
+    rig: Any, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its connection stands for a while yet, and the last block before the stop is older than the window."""
+    monkeypatch.setattr(capancdt_link, "SILENT_S", 60.0)
+    made = await started(rig, controller, window_s=5.0)
+    controller.send(block(1, (10, 10)))
+    link = made._link
+    async with asyncio.timeout(BOUND_S):
+        while not link._complete():
+            await asyncio.sleep(0.001)
+    for kept in link._kept.values():
+        kept[-1] = dataclasses.replace(kept[-1], time_s=kept[-1].time_s - 6.0)
+    with pytest.raises(DeviceTimeout, match="no new measurement"):
+        await made.read()
+    controller.send(block(2, (30, 30)))
     assert (await made.read())[0].count == 1
 
 
