@@ -349,7 +349,8 @@ class PlausibilityCheck:
     def _describe_alarm(self, block: ResidualBlock, named: list[FaultFit], misfit: bool) -> str:
         words = [f"{fit.words} since {self._ago(fit)}" if fit.suspect != "model" else fit.words for fit in named]
         if misfit:
-            none = "none of these fits well" if words else "no fault of a sensor explains this"
+            # Version 0.1.0 recorded "none of this": an audit of its recordings compares the text.
+            none = "none of this fits well" if words else "no fault of a sensor explains this"
             words.append(f"{none}: something acts that the model does not know")
         return (
             f"measured − predicted Y is {block.residual_um:+.2f} µm where ±{block.std_um:.2f} µm is stated: "
