@@ -157,7 +157,8 @@ class Plausibility(_Table, frozen=True, kw_only=True):
     exchanged sensors.
     `false_alarm_days`: mean time between two false alarms of the residual. `residual_std_um`: standard deviation of the
     residual of the healthy machine, by default the model's own; `residual_correlation_min`: its correlation time.
-    `residual_hold_um`: during an alarm, a residual beyond this holds the offset.
+    `residual_hold_um`: during an alarm, a residual beyond this holds the offset. `sensor_must_fit`: a sensor is
+    suspected only where its fault explains most of the residual, otherwise only the model is.
     """
 
     t_q_below_at_after_min: Minutes | None = None
@@ -165,6 +166,7 @@ class Plausibility(_Table, frozen=True, kw_only=True):
     residual_std_um: Micrometres | None = None
     residual_correlation_min: Annotated[float, Meta(ge=10, le=1440)] = 60.0
     residual_hold_um: Micrometres | None = None
+    sensor_must_fit: bool = False
     rest: Rest | None = None
 
 

@@ -217,6 +217,6 @@ def compare(
         t_h=runs.t_h,
         from_h=from_h,
         samples=runs.samples,
-        data=", ".join(dict.fromkeys(one.label for one in measured)),
+        data=", ".join(dict.fromkeys(origin.name for one in measured for origin in one.origins)),
         in_frame=any(one.in_frame for one in measured),
     )

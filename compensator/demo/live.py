@@ -45,6 +45,7 @@ CHECKS = """
 [plausibility]
 t_q_below_at_after_min = 15.0
 false_alarm_days = 30.0
+sensor_must_fit = true
 """
 #: A value that stands still is noticed after this time here, min; a real machine allows hours, as air may be still.
 STUCK_AFTER_MIN = {"t_q": 15.0, "at": 15.0, "y": 3.0}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -148,6 +149,13 @@ class Diagnosis:
     def noise_floor_um(self) -> float:
         """What the sensors' noise alone makes of the residual, µm."""
         return self.evidence.noise.noise_um
+
+    def deploys(self, effect: FoundEffect) -> bool:
+        """Return whether the extended model has an effect."""
+        # There it also has what the data leave open of all parameters together.
+        return any(
+            dataclasses.replace(one, std_factor=effect.effect.std_factor) == effect.effect for one in self.model.effects
+        )
 
     def _scores(self, residual: Vector) -> Scores:
         y = self.evidence.y_um

@@ -351,7 +351,7 @@ def parameter_table(effect: FoundEffect, *, count: int | None = None) -> Table:
 
 def explanation(diagnosis: Diagnosis, effect: FoundEffect, *, title: str = "Explanation") -> Words:
     """Return the explanation of an effect, and whether the extended model has it."""
-    if effect.effect in diagnosis.model.effects:
+    if diagnosis.deploys(effect):
         deploy = "Deployed in the extended model."
     elif effect.deployable:
         deploy = "Not deployed: the model was left unchanged."

@@ -180,7 +180,11 @@ def _figure(figure: Figure, numbers: Iterator[int], width: float) -> str:
     note = f"<p>{html.escape(figure.note)}</p>" if figure.note else ""
     picture = svg(figure, f"f{next(numbers)}", width)
     if width > _NARROW_IN:
-        picture = f'<div class="scroll" tabindex="0"><div class="wide">{picture}</div></div>'
+        label = html.escape(figure.title or "plot")
+        picture = (
+            f'<div class="scroll" role="region" aria-label="{label}" tabindex="0">'
+            f'<div class="wide">{picture}</div></div>'
+        )
     return f"<figure><figcaption>{html.escape(figure.title)}</figcaption>{picture}{note}</figure>"
 
 
@@ -196,8 +200,11 @@ def _block(block: Block, numbers: Iterator[int], level: int) -> str:
         sign = '<span aria-hidden="true">⚠ </span>' if block.kind == "warning" else ""
         return f'<div class="words {block.kind}">{_heading(block.title, level, sign)}<ul>{items}</ul></div>'
     if isinstance(block, Listing):
-        lines = f'<div class="scroll" tabindex="0"><pre>{html.escape(block.lines)}</pre></div>'
-        return f"<p>{html.escape(block.title)}:</p>{lines}"
+        title = html.escape(block.title)
+        return (
+            f'<p>{title}:</p><div class="scroll" role="region" aria-label="{title}" tabindex="0">'
+            f"<pre>{html.escape(block.lines)}</pre></div>"
+        )
     inner = "".join(_block(part, numbers, level + 1) for part in block.blocks)
     if isinstance(block, Details):
         return f"<details><summary>{_heading(block.title, level)}</summary>{inner}</details>"

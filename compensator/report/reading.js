@@ -3,6 +3,8 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 const HINT = "Drag to zoom, double-click to show all. Values at the cursor appear here.";
+// A finger that is moved over a wide plot scrolls it.
+const TAP = "Tap the plot: its values there appear here. Two fingers enlarge it.";
 const KEYS = "Arrow keys move the cursor, + and − zoom, 0 shows all; after a click, the wheel zooms, too.";
 const MONTHS = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
 // Steps of a time of day, min.
@@ -32,12 +34,18 @@ class Plot {
     this.axes = this.panels.map((panel) => document.getElementById(panel.id));
     this.readout = document.createElement("output");
     this.readout.className = "readout";
-    this.readout.textContent = HINT;
-    (svg.closest(".scroll") ?? svg).after(this.readout);
+    this.box = svg.closest(".scroll");
+    this.readout.textContent = this.hint;
+    (this.box ?? svg).after(this.readout);
     svg.setAttribute("tabindex", "0");
     svg.setAttribute("aria-description", KEYS);
     this.listen();
   }
+
+  // Whether the plot is wider than its box, so that a finger scrolls it.
+  get scrolls() { return this.box?.dataset.scrolls === "true"; }
+
+  get hint() { return this.scrolls && matchMedia("(pointer: coarse)").matches ? TAP : HINT; }
 
   get zoomed() { return this.to - this.from < (this.x[1] - this.x[0]) * 0.9999; }
 
@@ -192,7 +200,7 @@ class Plot {
   point(value, spoken = false) {
     this.cursor?.remove();
     this.cursor = null;
-    if (value === null || value < this.from || value > this.to) { this.readout.textContent = HINT; return; }
+    if (value === null || value < this.from || value > this.to) { this.readout.textContent = this.hint; return; }
     this.at = value;
     const x = this.place(value), all = this.left + (value - this.x[0]) / (this.x[1] - this.x[0]) * this.width;
     this.cursor = made("line", {class: "cursor", x1: x, x2: x, y1: this.top, y2: this.bottom}, this.svg);
@@ -214,7 +222,7 @@ class Plot {
     let start = null, box = null;
     const end = () => { box?.remove(); start = box = null; };
     svg.addEventListener("pointerdown", (event) => {
-      if (event.button === 0) start = at(event);
+      if (event.button === 0 && !(event.pointerType === "touch" && this.scrolls)) start = at(event);
     });
     svg.addEventListener("pointermove", (event) => {
       const x = at(event);
@@ -229,9 +237,11 @@ class Plot {
       const zooms = box !== null;
       end();
       if (zooms) this.show(this.value(Math.min(one, other)), this.value(Math.max(one, other)));
+      // A finger has no cursor: what it tapped stays.
+      else if (event.pointerType === "touch") this.point(this.value(other));
     });
     svg.addEventListener("pointercancel", end);
-    svg.addEventListener("pointerleave", () => { if (start === null && document.activeElement !== svg) this.point(null); });
+    svg.addEventListener("pointerleave", (event) => { if (start === null && event.pointerType !== "touch" && document.activeElement !== svg) this.point(null); });
     svg.addEventListener("dblclick", () => this.show(...this.x));
     svg.addEventListener("wheel", (event) => {
       // A page scrolls past its plots until one is clicked.
@@ -267,7 +277,7 @@ class Plot {
   }
 }
 
-// Only a table that is wider than its box says that it scrolls.
+// Only a table or plot that is wider than its box says that it scrolls.
 function fits() {
   for (const box of document.querySelectorAll('.scroll[role="region"]')) box.dataset.scrolls = box.scrollWidth > box.clientWidth + 1;
 }

@@ -82,6 +82,9 @@ def _headline(
     now_ns: int,
     warnings: Sequence[str],
 ) -> Headline:
+    if shown == State.STARTING and list(reasons[:1]) == [Reason.NO_ZERO]:
+        # Reason and state say the same; what to do at a start is to wait.
+        return Headline("no", "Do not cut to size", f"{_words(reasons[:1])[0]} {State.STARTING.action}")
     if shown in (WatchWarning.SILENT, WatchWarning.UNKNOWN, State.FAULT, State.STARTING):
         return Headline("no", "Do not cut to size", " ".join(_words([*reasons[:1], shown])))
     lost = _lost(channels, reasons)

@@ -18,6 +18,13 @@ addEventListener("load", () => {
   const seen = [...document.querySelectorAll("iframe")].map(frame => {
     const page = frame.contentDocument, view = frame.contentWindow;
     const closed = page.documentElement.scrollWidth;
+    const letters = [...page.querySelectorAll("svg text")].filter(one => one.textContent.trim() && one.getScreenCTM() && !one.closest("details"))
+      .map(one => parseFloat(view.getComputedStyle(one).fontSize) * Math.hypot(one.getScreenCTM().a, one.getScreenCTM().b));
+    const unsaid = [...page.querySelectorAll(".scroll")].filter(one => one.scrollWidth > one.clientWidth + 1).filter(one => {
+      const said = () => view.getComputedStyle(one, "::before").content.includes("scroll"), script = said();
+      one.removeAttribute("data-scrolls");
+      return !(script && said());
+    }).map(one => one.outerHTML.slice(0, 90));
     page.querySelectorAll("details").forEach(one => one.open = true);
     const out = [...page.querySelectorAll("main *")].filter(one => !one.parentElement.closest(".scroll, svg"))
       .filter(one => one.getBoundingClientRect().right > view.innerWidth + 0.5).map(one => one.outerHTML.slice(0, 90));
@@ -25,12 +32,14 @@ addEventListener("load", () => {
       .map(one => one.getAttribute("aria-label") || "picture");
     const style = view.getComputedStyle(page.body);
     return {name: frame.title, width: view.innerWidth, closed, opened: page.documentElement.scrollWidth, out, scrolls,
-      paper: style.backgroundColor, ink: style.color,
+      letters: Math.min(99, ...letters), unsaid, paper: style.backgroundColor, ink: style.color,
       curve: view.getComputedStyle(page.querySelector("svg path[style*=line-]") || page.body).stroke};
   });
   document.getElementById("seen").textContent = JSON.stringify(seen);
 });
-</script></body>"""
+</script></body>"""  # noqa: E501
+#: Smallest letters of a picture, px.
+SMALLEST = 8.5
 
 
 def seen(pages: dict[str, Path], folder: Path, *options: str) -> list[dict]:
@@ -82,6 +91,9 @@ def test_nothing_sticks_out(pages: dict[str, Path], tmp_path: Path, scheme: int,
         # On a desk no table has to be moved sideways to be read, opened or not.
         assert one["width"] < 1400 or one["scrolls"] == [], (one["name"], one["scrolls"])
         assert one["paper"] == paper and one["ink"] != paper
+        # A wide picture keeps letters that can be read and says that it scrolls, with the script and without.
+        assert one["letters"] >= SMALLEST, (one["name"], one["width"], one["letters"])
+        assert one["unsaid"] == [], (one["name"], one["width"])
     # On a phone some are: the measure sees it.
     assert any(one["scrolls"] for one in looked if one["width"] == 360)
     # Pictures follow the scheme, too.

@@ -214,8 +214,9 @@ def drawn_term(kind: str) -> Any:
 
 
 def test_an_effect_that_was_not_deployed_does_not_claim_it(found: Diagnosis) -> None:
-    assert any(effect.effect in found.model.effects for effect in found.effects)
-    assert "Deployed in the extended model." in text(found)
+    assert len(found.model.effects) == sum(effect.deployable for effect in found.effects) > 0
+    assert text(found).count("Deployed in the extended model.") == len(found.model.effects)
+    assert "Not deployed: the model was left unchanged." not in text(found)
     unchanged = dataclasses.replace(found, model=QUILL)
     assert "Deployed in the extended model." not in text(unchanged)
     assert "Not deployed: the model was left unchanged." in text(unchanged)

@@ -98,8 +98,9 @@ HARNESS = """<!doctype html><meta charset="utf-8"><iframe width="1000" height="1
 addEventListener("load", () => {
   const frame = document.querySelector("iframe"), page = frame.contentDocument, view = frame.contentWindow;
   const svg = page.querySelector("svg[data-plot]"), plot = JSON.parse(svg.dataset.plot), seen = {};
-  const [left, top, right] = plot.panels[0].box, to = svg.getScreenCTM();
-  const at = (hours) => ({bubbles: true, cancelable: true, button: 0, pointerId: 1, clientY: to.f + to.d * (top + 9),
+  const [left, top, right] = plot.panels[0].box;
+  const at = (hours, to = svg.getScreenCTM()) => ({bubbles: true, cancelable: true, button: 0, pointerId: 1,
+    clientY: to.f + to.d * (top + 9),
     clientX: to.e + to.a * (left + (hours - plot.x[0]) / (plot.x[1] - plot.x[0]) * (right - left))});
   const pointer = (kind, hours) => svg.dispatchEvent(new view.PointerEvent(kind, at(hours)));
   const key = (name) => svg.dispatchEvent(new view.KeyboardEvent("keydown", {key: name, bubbles: true, cancelable: true}));
@@ -119,6 +120,10 @@ addEventListener("load", () => {
   svg.focus(); seen.taken = svg.dispatchEvent(wheel()); seen.wheel = labels();
   svg.dispatchEvent(new view.MouseEvent("dblclick", at(12))); seen.restored = shapes() === before; seen.none = labels();
   key("+"); seen.plus = labels(); key("ArrowRight"); seen.arrow = words(); key("0"); seen.zero = labels();
+  const touch = (kind, hours) => svg.dispatchEvent(new view.PointerEvent(kind, {...at(hours), pointerType: "touch"}));
+  frame.width = 390; view.dispatchEvent(new view.Event("resize"));
+  touch("pointerdown", 3); touch("pointermove", 5); touch("pointercancel", 5); seen.swiped = labels();
+  svg.blur(); touch("pointerdown", 4); touch("pointerup", 4); touch("pointerleave", 4); seen.tapped = words();
   view.dispatchEvent(new view.Event("beforeprint")); seen.cursors = svg.querySelectorAll(".cursor").length;
   document.getElementById("seen").textContent = JSON.stringify(seen);
 });
@@ -155,4 +160,6 @@ def test_a_plot_is_zoomed_and_read_off(tmp_path: Path) -> None:
     assert seen["scrolls"] and not seen["taken"], "a page scrolls past a plot until it is clicked"
     assert seen["wheel"] != seen["labels"]
     assert seen["restored"] and seen["none"] == [] and seen["zero"] == []
+    # On a phone a finger scrolls the plot, and what it taps is read off.
+    assert seen["swiped"] == [] and re.match(r"(4\.0\d?|3\.9\d) h · ", seen["tapped"]), seen["tapped"]
     assert seen["plus"] and " h · " in seen["arrow"] and seen["cursors"] == 0

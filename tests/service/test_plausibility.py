@@ -92,7 +92,7 @@ def test_a_drift_is_raised_and_the_right_sensor_is_among_the_suspects(
     def drift(i: int, values: dict[str, float]) -> None:
         values[channel] += per_h * max(i - BEGIN, 0) / 60.0
 
-    outcomes = outcomes_of(day, BEGIN + 300, drift)
+    outcomes = outcomes_of(day, BEGIN + 300, drift, checked(sensor_must_fit=True))
     raised = first_at(outcomes, "implausible")
     assert BEGIN < raised <= BEGIN + within_min
     standing = outcomes[raised:]
@@ -115,13 +115,55 @@ def test_a_jump_names_one_sensor_and_is_forgotten_when_it_goes(
     def jump(i: int, values: dict[str, float]) -> None:
         values[channel] += size if BEGIN <= i < BEGIN + 120 else 0.0
 
-    outcomes = outcomes_of(day, BEGIN + 300, jump)
+    outcomes = outcomes_of(day, BEGIN + 300, jump, checked(sensor_must_fit=True))
     raised = first_at(outcomes, "implausible")
     assert BEGIN < raised < BEGIN + 80
     assert outcomes[BEGIN + 118].offset.reasons == [f"implausible:{channel}"]
     if channel == "y_um":  # what a wrong temperature did stays in the model for hours
         assert outcomes[-1].offset.state == "ok"
         assert told(outcomes)[-1][1] == "measured and predicted Y agree again"
+
+
+def test_a_joint_that_sticks_accuses_no_sensor(day: dict[str, np.ndarray]) -> None:
+    """Play of 6.5 µm, which the model lacks: the best of shapes that all fail names no healthy sensor."""
+
+    def named(outcomes: list[Outcome]) -> list[set[str]]:
+        return [{r for r in o.offset.reasons if r.startswith("implausible:")} for o in outcomes]
+
+    def run(*, must_fit: bool) -> list[Outcome]:
+        stuck = [250.0]
+
+        def play(i: int, values: dict[str, float]) -> None:
+            y = values["y_um"]
+            stuck.append(min(max(stuck[-1], y - 6.5), y + 6.5))
+            values["y_um"] = stuck[-1]
+
+        return outcomes_of(day, 720, play, checked(sensor_must_fit=must_fit))
+
+    outcomes, before = run(must_fit=True), run(must_fit=False)
+    raised = first_at(outcomes, "implausible")
+    assert 0 < raised == first_at(before, "implausible")
+    # A first slip looks like a sensor that jumped; once it has slipped back, it is the model.
+    clear = raised + 60
+    assert set.union(*named(outcomes)[clear:]) == {"implausible:model"}
+    assert any("no fault of a sensor explains this" in text for _, text in told(outcomes))
+    assert any(len(names) > 1 for names in named(before)[clear:])
+    # Only names differ: offset and stated deviation are the same.
+    assert [o.offset.y_offset_std_um for o in outcomes] == [o.offset.y_offset_std_um for o in before]
+
+
+def test_a_couple_that_came_off_does_not_accuse_the_model_alone(day: dict[str, np.ndarray]) -> None:
+    """T_Q tends to AT: neither a drift nor a jump, but a sensor explains most of it."""
+
+    def off(i: int, values: dict[str, float]) -> None:
+        if i >= BEGIN:
+            share = math.exp(-(i - BEGIN) / 10.0)
+            values["t_q_degc"] = values["at_degc"] + 0.5 + share * (values["t_q_degc"] - values["at_degc"])
+
+    outcomes = outcomes_of(day, BEGIN + 120, off, checked(sensor_must_fit=True))
+    raised = first_at(outcomes, "implausible")
+    assert BEGIN < raised < BEGIN + 60
+    assert all(set(o.offset.reasons) - {"implausible:model"} for o in outcomes[raised:])
 
 
 def test_a_probe_that_measures_another_axis_is_told_from_drift(day: dict[str, np.ndarray]) -> None:

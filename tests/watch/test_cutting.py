@@ -54,6 +54,13 @@ def test_each_state_says_whether_one_may_cut(shown: str, reasons: tuple[str, ...
     assert found.cut == cut and words in found.text
 
 
+def test_a_start_says_once_that_there_is_no_zero() -> None:
+    found = of("starting", "no_zero")
+    assert found.text == f"No zero has been set yet. {State.STARTING.action}"
+    # With a cause, the cause comes first.
+    assert of("starting", "t_q_missing", "no_zero").text.startswith(Reason.T_Q_MISSING.meaning)
+
+
 def test_a_doubt_in_the_model_beside_a_lost_couple_asks_for_care() -> None:
     found = of("degraded", "t_q_missing", "implausible:model", "predicting", until_min=29.0, t_q_degc="open_circuit")
     assert found.cut == "until" and found.word.startswith("Cut with care until ")

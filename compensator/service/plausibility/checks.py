@@ -10,7 +10,8 @@ Three checks, each on only if the configuration has its limit:
 - *residual*: measured − predicted Y against its stated standard deviation, by a two-sided CUSUM on its innovations.
   Model errors are correlated over `residual_correlation_min`, so only what the previous block does not predict counts:
   e = z − φ z'. The threshold follows from the mean time between false alarms, by Siegmund's formula. `isolation` finds
-  the sensor that explains the residual best. The offset continues; its standard deviation includes the residual.
+  the sensor that explains the residual best; with `sensor_must_fit` only the model is suspected where no sensor's fault
+  explains most of it. The offset continues; its standard deviation includes the residual.
 
 The checks use only the sample and no clock; their state is part of the compensation's.
 
@@ -31,7 +32,7 @@ from compensator.codes import Reason
 from compensator.config import Config, Plausibility
 from compensator.events import EventKind, Implausibility, Note
 from compensator.model.thermal_model import ThermalModel
-from compensator.service.plausibility.isolation import LOG_ODDS, FaultFit, FaultIsolation, ResidualBlock
+from compensator.service.plausibility.isolation import LEAST_SHARE, LOG_ODDS, FaultFit, FaultIsolation, ResidualBlock
 
 #: Samples in a block of the residual: single minutes after a heat step are not evidence against a sensor.
 BLOCK_SAMPLES = 10
@@ -330,6 +331,9 @@ class PlausibilityCheck:
             return
         ranked, misfit = self._isolation.fits(self.state.blocks)
         named = [fit for fit in ranked if fit.gain >= ranked[0].gain - LOG_ODDS]
+        if misfit and self._limits.sensor_must_fit:
+            # The best of shapes that all fail names a sensor only if it explains most of the residual.
+            named = [fit for fit in named if fit.suspect == "model" or fit.share >= LEAST_SHARE]
         suspects = sorted({fit.suspect for fit in named} | ({"model"} if misfit else set()))
         if suspects == self.state.suspects:
             return
@@ -345,7 +349,9 @@ class PlausibilityCheck:
     def _describe_alarm(self, block: ResidualBlock, named: list[FaultFit], misfit: bool) -> str:
         words = [f"{fit.words} since {self._ago(fit)}" if fit.suspect != "model" else fit.words for fit in named]
         if misfit:
-            words.append("none of these fits well: something acts that the model does not know")
+            # Version 0.1.0 recorded "none of this": an audit of its recordings compares the text.
+            none = "none of this fits well" if words else "no fault of a sensor explains this"
+            words.append(f"{none}: something acts that the model does not know")
         return (
             f"measured − predicted Y is {block.residual_um:+.2f} µm where ±{block.std_um:.2f} µm is stated: "
             + ", or ".join(words)

@@ -26,6 +26,9 @@ from compensator.model.thermal_model import ThermalModel
 LOG_ODDS = 3.0
 #: Remaining mean square with the best shape, relative to the expected one, above which no shape fits.
 MISFIT = 4.0
+#: Part of a residual that a sensor's fault must explain to be suspected where no shape fits. A fault of another shape,
+#: such as T_Q that has come off, explains more of it; an effect of the machine that comes and goes soon leaves less.
+LEAST_SHARE = 0.75
 #: Samples without a change before a response is computed, so that the observer's gains have settled.
 _SETTLING = 120
 
@@ -53,12 +56,15 @@ class FaultFit:
         Number of blocks since it started.
     gain : float
         Log likelihood over that of no fault.
+    share : float
+        Part of the whitened residual's square that it explains.
     """
 
     suspect: str
     words: str
     blocks_ago: int
     gain: float
+    share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +111,8 @@ class FaultIsolation:
                 best[fit.suspect] = fit
         ranked = sorted(best.values(), key=lambda fit: (-fit.gain, fit.suspect))
         energy, count = _energy(z, self._keep)
+        if energy > 0.0:
+            ranked = [dataclasses.replace(fit, share=fit.gain / energy) for fit in ranked]
         left = 2.0 * (energy - ranked[0].gain) if ranked else 0.0
         return ranked, count > 0 and left > MISFIT * count
 
