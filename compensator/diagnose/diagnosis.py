@@ -36,8 +36,9 @@ from compensator.progress import ExecutorMap, Progress, unreported
 
 #: A base whose own calibration left more than this share of the deformation's spread lacks something.
 FAR_OFF = 0.1
-#: Effects are not deployed where held-out blocks are predicted worse with them by more than this factor.
-CONTRADICTS = 1.25
+#: Nothing is deployed where held-out blocks are predicted worse with it by more than this factor: the base's paths are
+#: kept, or fitted anew, where each block knows less of them than the whole.
+CONTRADICTS = (1.25, 2.5)
 #: From few values a remainder is deployed only where it leaves less than this share of the error on held-out ones.
 LOWERS = 0.97
 
@@ -77,7 +78,8 @@ def diagnose(
     found, effects, held_out = _worth_deploying(found, effects, held_out)
     few = evidence.is_sparse
     # Where every block holds an event of its own, none foretells another: only a clear contradiction counts.
-    contradicted = not (few or evidence.free_paths) and rms_of(held_out.whole) > CONTRADICTS * rms_of(held_out.nothing)
+    factor = CONTRADICTS[evidence.free_paths]
+    contradicted = not few and rms_of(held_out.whole) > factor * rms_of(held_out.nothing)
     reverses = any(effect.reverses_path for effect in effects)
     extended, remarks = (model, ()) if contradicted or reverses else _extended(model, found, effects)
     deployed = extended is not model

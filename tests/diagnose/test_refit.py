@@ -8,6 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from compensator.data.measurement import read, runs_in
+from compensator.diagnose import diagnosis as diagnosis_module
 from compensator.diagnose.background import Background
 from compensator.diagnose.diagnosis import diagnose
 from compensator.diagnose.evidence import evidence_of
@@ -89,6 +90,22 @@ def test_blocks_that_took_no_part_and_a_run_of_other_speeds_come_out_right(found
 def test_the_extended_model_says_what_error_it_has_left(found):
     assert 0.0 < found.model.y_std_um < 1.5
     assert any("were refitted" in str(words) for words in found.warnings)
+
+
+@pytest.mark.parametrize(("times", "deployed"), [(2.0, True), (3.0, False)])
+def test_paths_that_held_out_blocks_contradict_are_not_deployed(runs, monkeypatch, times, deployed):
+    """Each block knows less of new paths than the whole, but not three times less."""
+    held_out_of = diagnosis_module.held_out_of
+
+    def worse(*arguments):
+        errors = held_out_of(*arguments)
+        return dataclasses.replace(errors, named=times * errors.nothing, whole=times * errors.nothing)
+
+    monkeypatch.setattr(diagnosis_module, "held_out_of", worse)
+    model = calibrated(runs)
+    again = diagnose(model, runs).model
+    assert (again.dtf != model.dtf and len(again.effects) > 0) is deployed
+    assert (again.dtf == model.dtf and again.effects == ()) is not deployed
 
 
 def test_a_model_that_does_not_say_how_good_it_is_comes_to_the_same(found, runs):
