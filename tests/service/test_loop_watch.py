@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from compensator.clock import NS
 from compensator.config import Loop as LoopSettings
@@ -64,9 +65,10 @@ def watching(hours: float, verdict: ComparisonData, misfit_h: float = 0.0, *, si
     return Loop(LoopSettings(policy="adopt"), 60.0, ["gain:DTF"], state), now_ns
 
 
-def follows(loop: Loop, now_ns: int) -> tuple[str, str]:
-    """Return what follows from a diagnosis that has found another effect."""
+def follows(loop: Loop, now_ns: int, *, same: bool = False) -> tuple[str, str]:
+    """Return what follows from a diagnosis that has found another effect, or the same with other parameters."""
     found = DiagnosisData(verdict="explained", effects=["input:coolant_degc"], candidate_sha256="b" * 64)
+    found = replace(found, same_effects=same, change_deviations=9.0 if same else None)
     (note,) = loop.receive(found, now_ns)
     return note.data["step"], note.data.get("why", "")
 
@@ -76,26 +78,28 @@ def judged(verdict: ComparisonVerdict, deviations: float | None = None, ratio: f
 
 
 @pytest.mark.parametrize(
-    ("hours", "verdict", "misfit_h", "waits"),
+    ("hours", "verdict", "misfit_h", "other_waits", "same_waits"),
     [
-        (100.0, judged(NOT_JUDGED), 0.0, True),
-        (100.0, judged(ALIKE, 0.5, 1.0), 0.0, True),
-        (23.9, judged(WORSE, -9.0, 3.0), 0.0, True),
-        (24.0, judged(WORSE, -9.0, 3.0), 0.0, False),
-        (10.0, judged(WORSE, -9.0, 3.0), 3.0, False),
-        (10.0, judged(NOT_JUDGED), 3.0, True),
-        (10.0, judged(ALIKE, 0.5, 1.0), 3.0, False),
-        (10.0, judged(ALIKE, 0.5, 1.0), 2.9, True),
-        (10.0, judged(ALIKE, 2.5, 0.8), 3.0, True),
+        (100.0, judged(NOT_JUDGED), 0.0, True, True),
+        (100.0, judged(ALIKE, 0.5, 1.0), 0.0, False, True),
+        (100.0, judged(ALIKE, 2.5, 0.8), 0.0, True, True),
+        (23.9, judged(WORSE, -9.0, 3.0), 0.0, True, True),
+        (24.0, judged(WORSE, -9.0, 3.0), 0.0, False, False),
+        (10.0, judged(WORSE, -9.0, 3.0), 3.0, False, False),
+        (10.0, judged(NOT_JUDGED), 3.0, True, True),
+        (10.0, judged(ALIKE, 0.5, 1.0), 3.0, False, False),
+        (10.0, judged(ALIKE, 0.5, 1.0), 2.9, True, True),
+        (10.0, judged(ALIKE, 2.5, 0.8), 3.0, True, True),
     ],
 )
-def test_a_candidate_waits_until_the_model_before_has_shown_itself_worse_or_neither_suffices(
-    hours: float, verdict: ComparisonData, misfit_h: float, *, waits: bool
+def test_a_candidate_waits_until_the_model_before_is_not_better_and_something_else_is_needed(
+    hours: float, verdict: ComparisonData, misfit_h: float, *, other_waits: bool, same_waits: bool
 ) -> None:
-    loop, now_ns = watching(hours, verdict, misfit_h)
-    assert follows(loop, now_ns) == (("nothing", "waits") if waits else ("shadow", ""))
-    assert (loop.state.diagnosis is None) == waits
-    assert loop.state.shadow is not None and loop.state.shadow.sha256 == "a" * 64
+    for same, waits in ((False, other_waits), (True, same_waits)):
+        loop, now_ns = watching(hours, verdict, misfit_h)
+        assert follows(loop, now_ns, same=same) == (("nothing", "waits") if waits else ("shadow", ""))
+        assert (loop.state.diagnosis is None) == waits
+        assert loop.state.shadow is not None and loop.state.shadow.sha256 == "a" * 64
 
 
 def test_the_calibrated_model_that_a_diagnosis_has_brought_gives_way_to_a_candidate() -> None:

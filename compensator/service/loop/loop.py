@@ -315,7 +315,8 @@ class Loop:
             return "in_shadow"
         if not found.calibrated and is_avoided(self.state, found.effects, now_ns):
             return "avoided"
-        return "waits" if has_to_wait(self.state, self._settings, now_ns) else ""
+        waits = has_to_wait(self.state, self._settings, now_ns, same_effects=found.same_effects)
+        return "waits" if waits else ""
 
     # ------------------------------------------------------------------ between two samples
 

@@ -25,19 +25,20 @@ def leads(found: ComparisonData, settings: LoopSettings) -> bool:
     return found.deviations >= LEADS * settings.deviations and found.ratio <= BETTER_PART
 
 
-def has_to_wait(state: LoopState, settings: LoopSettings, now_ns: int) -> bool:
+def has_to_wait(state: LoopState, settings: LoopSettings, now_ns: int, *, same_effects: bool) -> bool:
     """Return whether what a diagnosis finds now has to wait for a later diagnosis.
 
-    The model before an adoption keeps its place until it is clearly worse than the adopted one and an adoption is
-    permitted again. A misfit needs a candidate sooner, but only once the model before has been judged and is not better
-    so far: else the service may have to go back to it.
+    The model before an adoption keeps its place until it has been judged and is not better so far: else the service may
+    have to go back to it. Without a misfit it also keeps it until an adoption is permitted again, and from other
+    parameters of the same effects until it is clearly worse than the adopted model.
     """
-    shadow, found = state.shadow, state.verdict
+    shadow, verdict = state.shadow, state.verdict.verdict
     if state.exchange:
         return True
     if shadow is None or shadow.role != "before" or shadow.since_utc_ns != state.adopted_utc_ns:
         return False
+    if verdict == ComparisonVerdict.NOT_JUDGED or leads(state.verdict, settings):
+        return True
     errs = state.misfit_min >= 60.0 * settings.misfit_h
-    if found.verdict == ComparisonVerdict.WORSE:
-        return not errs and now_ns - shadow.since_utc_ns < ADOPTION_H * _HOUR_NS
-    return not errs or found.verdict == ComparisonVerdict.NOT_JUDGED or leads(found, settings)
+    is_early = now_ns - shadow.since_utc_ns < ADOPTION_H * _HOUR_NS
+    return not errs and (is_early or (same_effects and verdict != ComparisonVerdict.WORSE))
