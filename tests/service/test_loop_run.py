@@ -250,7 +250,7 @@ def test_between_two_adoptions_is_a_day() -> None:
     night = Night(shown(extended(1.5)), shown(extended(3.0)))
     tables = {"loop": {"policy": "adopt", "shadow_h": 6.0}}
     loop = LoopRun(settings(**tables), QUILL, night)
-    steps = run(loop, machine(3 * DAY))
+    steps = run(loop, machine(4 * DAY))
     adopted = [seq for seq, step, _ in decisions(steps) if step == "adopt"]
     assert len(adopted) == 2 and adopted[1] - adopted[0] >= DAY
 

@@ -132,12 +132,14 @@ class LiveLoop:
         if core.drop_ended():
             self._journal.start_new_file()
         warmed = self._warming
-        if warmed is not None and warmed.compensation is not None and core.state.diagnosis is not None:
+        is_wanted = core.state.diagnosis is not None and not core.state.exchange
+        if is_wanted and warmed is not None and warmed.compensation is not None:
             self._begin_shadow(core, warmed, warmed.compensation)
         if not (core.state.exchange and self._stored):
             return present
         verdict, action, self._stored = core.state.verdict, core.state.exchange, False
         new, self._model = core.exchange(present, self._model, present.status.time_utc_ns)
+        self._warming = None  # its diagnosis has ended with the exchange
         self._journal.start_new_file(self._model)
         self._events.note(*exchange_note(action, present, new, verdict, core.state.level_um))
         return new
@@ -362,6 +364,7 @@ class LiveLoop:
         self._stored, self._not_stored = False, ""
 
     def _give_up(self, core: ModelLoop, why: str) -> None:
+        self._warming = None
         if core.state.shadow is None and core.state.diagnosis is None:
             data = LoopData(step=LoopAction.END, why=FAILED_OUTSIDE)
             self._events.note(EventKind.LOOP, why, data.table())

@@ -2,7 +2,8 @@
 
     idle → diagnosis → shadow → proposed → adopted → watching the model before → idle
 
-At most one other model runs in shadow: before an adoption the candidate, after it the model from before. In both cases
+At most one other model runs in shadow: before an adoption the candidate, after it the model from before, which keeps
+its place from candidates until it is no longer needed (`place`). In both cases
 it replaces the present model once measured Y after its beginning shows clearly that it is better: adopting and going
 back are one rule. No clock, socket or file: a replay of the recorded samples and diagnoses decides the same.
 """
@@ -21,7 +22,8 @@ from compensator.errors import ServiceError
 from compensator.events import ComparisonVerdict, DiagnosisData, EventKind, LoopAction, LoopData, Note
 from compensator.service.loop.avoided import avoid, avoid_after_back, is_avoided
 from compensator.service.loop.level import ErrorBlocks, level_um
-from compensator.service.loop.proof import BETTER_PART, is_better_about_zero, is_clearly_better, is_enough, is_limited
+from compensator.service.loop.place import ADOPTION_H, has_to_wait, leads
+from compensator.service.loop.proof import is_better_about_zero, is_clearly_better, is_enough, is_limited
 from compensator.service.loop.schedule import begin_again, begin_if_due, pass_planned
 from compensator.service.loop.shadow import Role
 from compensator.service.loop.state import Compared, Exchange, LoopState, fresh
@@ -33,10 +35,6 @@ from compensator.service.transfer.second_opinion import described, is_unusable
 
 #: A candidate with the effects of the present model must differ from it by so many standard deviations.
 DIFFERS = 4.0
-#: Least time between two adoptions, which is that after going back from a model, too, h.
-ADOPTION_H = 24.0
-#: A candidate is better so far if it has shown this part of the deviations that it must show.
-LEADS = 0.5
 #: What is compared counts for so long, in `shadow_h`, and the least of it, h; of a candidate as long as the record that
 #: is diagnosed. A candidate that is better so far has as long before the next diagnosis.
 _REMEMBERED, _REMEMBERED_H = 2.0, 24.0
@@ -275,12 +273,12 @@ class Loop:
 
     def _is_leading(self, now_ns: int) -> bool:
         """Return whether a candidate is better so far: it may be what is missing, and gets time to show it."""
-        shadow, found = self.state.shadow, self.state.verdict
-        if shadow is None or shadow.role != "candidate" or found.deviations is None or found.ratio is None:
+        shadow = self.state.shadow
+        if shadow is None or shadow.role != "candidate":
             return False
-        is_new = now_ns - shadow.since_utc_ns < self._remembered_h * _HOUR_NS
-        leads = found.deviations >= LEADS * self._settings.deviations and found.ratio <= BETTER_PART
-        return is_new and leads
+        return now_ns - shadow.since_utc_ns < self._remembered_h * _HOUR_NS and leads(
+            self.state.verdict, self._settings
+        )
 
     def receive(self, found: DiagnosisData, now_ns: int) -> list[Note]:
         """Decide what follows from a diagnosis; a candidate is then warmed up (`shadow_begins`)."""
@@ -317,7 +315,8 @@ class Loop:
             return "in_shadow"
         if not found.calibrated and is_avoided(self.state, found.effects, now_ns):
             return "avoided"
-        return ""
+        waits = has_to_wait(self.state, self._settings, now_ns, same_effects=found.same_effects)
+        return "waits" if waits else ""
 
     # ------------------------------------------------------------------ between two samples
 
@@ -345,6 +344,8 @@ class Loop:
         assert state.shadow is not None
         before, state.effects = state.effects, state.shadow.effects
         state.error.clear()
+        if state.diagnosis is not None and state.diagnosis.candidate_sha256:
+            state.diagnosis = None  # a candidate that is warmed up was weighed beside the model that has gone
         if back:
             longest_h = self._settings.watch_h
             avoid_after_back(state, before, now_ns, first_h=ADOPTION_H, longest_h=longest_h)
