@@ -114,7 +114,8 @@ def _root(fit: Fit, likelihood: Likelihood, prior: Vector | None = None) -> Matr
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
     _, s, vt = np.linalg.svd(jacobian / scale, full_matrices=False)
-    return np.asarray(vt.T / np.maximum(s, 1e-7 * s[0]) / scale[:, None])
+    # Where no parameter moves a point, all are open: a time between two values.
+    return np.asarray(vt.T / np.maximum(s, 1e-7 * max(s[0], 1.0)) / scale[:, None])
 
 
 def _values(terms: Sequence[Term]) -> Vector:
