@@ -199,23 +199,25 @@ def test_the_test_that_is_said_to_decide_decides_when_it_is_run(twins):
     rival = effect.rivals[0]
     trial = next(t for t in Trials(found.evidence).of((rival.test.driver,)) if t.words == rival.test.words)
     count = round(rival.test.hours * 60.0) + 1
-    run = as_measured(trial.signals, columns, count)
+    tried = [as_measured(trial.signals, columns, count, seed) for seed in (6, 7, 8, 9)]
     gained = []
-    for runs in (runs_from(columns), [*runs_from(columns), *runs_from(run)]):
+    starts = [
+        next(term for term in (effect.term, rival.term) if name in term.hypothesis.place).start
+        for name in ("coolant_degc", "cabinet_degc")
+    ]
+    for runs in (runs_from(columns), *([*runs_from(columns), *runs_from(run)] for run in tried)):
         points = Points(evidence_of(QUILL, runs))
-        likelihood = settled(fit_terms(Likelihood(points, points.typical_rest()), [effect.term.start])).likelihood
-        coolant, cabinet = (
-            fit_terms(likelihood, [next(t for t in (effect.term, rival.term) if name in t.hypothesis.place).start])
-            for name in ("coolant_degc", "cabinet_degc")
-        )
+        likelihood = settled(fit_terms(Likelihood(points, points.typical_rest()), [starts[0]])).likelihood
+        coolant, cabinet = (fit_terms(likelihood, [start]) for start in starts)
         gained.append(coolant.log_evidence - cabinet.log_evidence)
-    assert gained[1] - gained[0] > DECIDES, gained
-    assert 0.3 < (gained[1] - gained[0]) / rival.test.expected_evidence < 3.0
+    changes = np.array(gained[1:]) - gained[0]
+    assert changes.min() > DECIDES, changes
+    assert 0.3 < changes.mean() / rival.test.expected_evidence < 3.0, changes
 
 
-def as_measured(planned, columns, count):
+def as_measured(planned, columns, count, seed):
     """The run that a planned test gives on the true machine, with noise."""
-    rng = np.random.default_rng(6)
+    rng = np.random.default_rng(seed)
     coolant = planned.channels["coolant_degc"]
     y = planned.y_dtf_um + planned.y_tdtf_um + 1.5 * lag(coolant, 30.0) + rng.normal(0.0, 0.3, coolant.size)
     difference = QUILL.ttf.sampled.response(planned.drive)

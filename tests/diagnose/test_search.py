@@ -127,15 +127,16 @@ def test_of_two_equal_lags_the_sum_is_stated():
     """Each gain by itself is anything; what the channel does at rest is known, and comes first."""
     columns, _, _ = record([draw("input", 3, 4.0)], 70, 24.0)
     evidence = evidence_of(QUILL, runs_from(columns))
-    one = Search(evidence).run().fit.terms[0]
-    of_channel = [h for h in proposals(evidence.context) if h.place == one.hypothesis.place]
-    two = next(h for h in of_channel if h.form == "two lags")
+    place = Search(evidence).run().fit.terms[0].hypothesis.place
+    of_channel = {h.form: h for h in proposals(evidence.context) if h.place == place}
+    one_lag, two = of_channel["lag"], of_channel["two lags"]
+    points = Points(evidence)
+    fit = fit_terms(Likelihood(points, points.typical_rest()), [(one_lag, (30.0,))])
+    (one,) = fit.terms
     (tau,) = one.values
     term = Term(
         hypothesis=two, values=(tau, 1.001 * tau), amplitudes=(3.0 * one.amplitudes[0], -2.0 * one.amplitudes[0])
     )
-    points = Points(evidence)
-    fit = fit_terms(Likelihood(points, points.typical_rest()), [one.start])
     (error,) = standard_errors(dataclasses.replace(fit, terms=(term,)))
     gain, first, second = (name for name in term.named if name.startswith("gain_"))
     assert next(iter(term.named)) == gain and term.named[gain] == pytest.approx(one.amplitudes[0])
