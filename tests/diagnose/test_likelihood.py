@@ -47,7 +47,7 @@ def test_points_are_the_means_of_what_is_used(evidence):
     assert set(part.first) < set(points.first)
     course = np.arange(float(end))
     compared = evidence.used.copy()
-    for run_end in np.cumsum([record.size for record in evidence.signals]):
+    for run_end in np.cumsum([signals.size for signals in evidence.signals]):
         compared[run_end - 10 : run_end] = False  # only later samples would say what acted there
     for each, used in ((points, compared), (part, compared & ~held_out)):
         edges = [*each.first.tolist(), end]
