@@ -31,6 +31,7 @@ from compensator.report.page import (
     Table,
     Tone,
     Words,
+    data_of,
     sentence_of,
 )
 
@@ -70,7 +71,8 @@ def audit_page(found: Audit) -> Page:
         blocks.append(Words(title="Remarks", lines=lines))
     blocks.append(_hashes(found))
     title = f"Audit: {found.machines}{_span(found)}"
-    return Page(title=title, verdict=verdict(found), blocks=blocks, tone=_tone(found))
+    data = data_of([file.file for file in found.files])
+    return Page(title=title, verdict=verdict(found), blocks=blocks, tone=_tone(found), data=data)
 
 
 def _tone(found: Audit) -> Tone:

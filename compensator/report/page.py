@@ -116,6 +116,17 @@ def html_of(page: Page, *, date: str = "", can_zoom: bool = True) -> str:
     )
 
 
+def data_of(files: Sequence[str]) -> str:
+    """Return the names of several files for the last line of a page: the first and the last.
+
+    Examples
+    --------
+    >>> data_of(["monday.mcap", "tuesday.mcap", "friday.mcap"])
+    'monday.mcap to friday.mcap (3 files)'
+    """
+    return f"{files[0]} to {files[-1]} ({len(files)} files)" if len(files) > 1 else "".join(files)
+
+
 def _origin(page: Page, date: str) -> str:
     """Return the last line: version, date, data."""
     parts = [f"quill-compensator {__version__}", date, f"data: {page.data}" if page.data else ""]

@@ -61,6 +61,11 @@ def test_time_is_counted_once_and_wholly(history: History) -> None:
     assert list(history.days) == ["2026-01-05", "2026-01-06"]
 
 
+def test_its_last_line_names_the_recordings(folder: Path, text: str) -> None:
+    names = [path.name for path in sorted(folder.glob("*.mcap"))]
+    assert len(names) == 2 and f"data: {names[0]} to {names[1]} (2 files)." in text
+
+
 def test_what_was_lost_is_no_value_and_is_counted(history: History) -> None:
     t, y = history.curves["channel t_q_degc"].points()
     at = (t - START_S) / 60.0
