@@ -52,6 +52,10 @@ class Asked:
         self.reply = self._machine.command(self._name, self._data)
 
     @property
+    def is_answered(self) -> bool:
+        return self.reply is not None and (not isinstance(self.reply, Future) or self.reply.done())
+
+    @property
     def answer(self) -> dict[str, Any]:
         answer: dict[str, Any] = self.reply.result(timeout=0) if isinstance(self.reply, Future) else self.reply
         return answer
@@ -302,10 +306,7 @@ async def test_payloads_that_are_no_model_are_refused_in_words(tmp_path: Path, d
     machine = Machine(tmp_path)
     asked = machine.at_sample[2] = Asked(machine, "adopt", data)
 
-    def answered(_: Outcome) -> bool:
-        return asked.reply is not None and (not isinstance(asked.reply, Future) or asked.reply.done())
-
-    await machine.run(100, answered)
+    await machine.run(100, lambda _: asked.is_answered)
     assert not asked.answer["ok"] and asked.answer["text"] and "Traceback" not in asked.answer["text"]
 
 
@@ -317,9 +318,15 @@ async def test_an_order_too_large_is_refused_at_once_and_keeps_no_other_waiting(
     path = f'[paths.DTF]\nunit = "um/W"\nform = "sampled"\nb = [{values}]\na = [1.0, {values}]\n\n['
     large = (head + path + rest.partition("\n[")[2]).encode()
     first = machine.at_sample[10] = Asked(machine, "adopt", payload(large))
-    second = machine.at_sample[14] = Asked(machine, "adopt", payload(STRONGER, force=True))
+    second = Asked(machine, "adopt", payload(STRONGER, force=True))
+
+    def both_answered(_: Outcome) -> bool:
+        if first.is_answered and second.reply is None:
+            second()
+        return second.is_answered
+
     began = time.monotonic()
-    await machine.run(20)
+    await machine.run(1000, both_answered)
     assert time.monotonic() - began < 20.0
     assert not first.answer["ok"] and f"b has {count} values, expected at most 20" in first.answer["text"]
     assert second.answer["ok"], second.answer
