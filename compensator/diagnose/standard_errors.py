@@ -32,7 +32,7 @@ def standard_errors(fit: Fit) -> list[dict[str, float]]:
     def named(values: Vector) -> Vector:
         return np.array([v for term in _moved(fit.terms, values) for v in term.named.values()])
 
-    spread = _slopes(named, _values(fit.terms)) @ _root(fit, exact)
+    spread = _slopes(named, _values(fit.terms)) @ _root(exact, _added_slopes(fit))
     errors = iter(np.sqrt(np.maximum(np.einsum("ij,ij->i", spread, spread), 0.0)).tolist())
     return [dict(zip(term.named, errors, strict=False)) for term in fit.terms]
 
@@ -43,16 +43,14 @@ def deviations(fit: Fit) -> list[tuple[float, float]]:
     Two effects may be known together and not apart: then each has an error of its own that the other makes up for, in
     this record and not on another day.
     """
-    points, found = fit.likelihood.points, []
-    root = _root(fit, fit.likelihood)
-    for i in range(len(fit.terms)):
-
-        def added(values: Vector, i: int = i) -> Vector:
-            columns = response(points.evidence, _moved(fit.terms, values)[i])
-            return points.averaged(columns[:, None])[:, 0]
-
-        spread = _slopes(added, _values(fit.terms)) @ root
-        found.append((float(np.std(added(_values(fit.terms)))), float(np.sqrt(np.sum(np.var(spread, axis=0))))))
+    points, slopes, found, first = fit.likelihood.points, _added_slopes(fit), [], 0
+    root = _root(fit.likelihood, slopes)
+    for term in fit.terms:
+        own = slice(first, first + len(term.values) + len(term.amplitudes))
+        moves = points.averaged(response(points.evidence, term)[:, None])
+        spread = slopes[:, own] @ root[own]
+        found.append((float(np.std(moves)), float(np.sqrt(np.sum(np.var(spread, axis=0))))))
+        first = own.stop
     return found
 
 
@@ -70,20 +68,15 @@ def std_factors(fit: Fit, terms: Sequence[Term]) -> list[tuple[tuple[float, ...]
     """
     if not terms:
         return []
-    points, values = fit.likelihood.points, _values(fit.terms)
+    slopes, spread = _added_slopes(fit), fit.likelihood.points.evidence.spread_um
     free = [one for term in fit.terms for one in (*term.hypothesis.free, *[None] * len(term.amplitudes))]
-
-    def added(values: Vector) -> Vector:
-        return points.averaged(summed(points.evidence, _moved(fit.terms, values))[:, None])[:, 0]
-
-    slopes = _slopes(added, values)
     # What the data leave wholly open is known as well as before them.
-    spread, moves = points.evidence.spread_um, np.std(slopes, axis=0)
+    moves = np.std(slopes, axis=0)
     prior = [
         spread / move if one is None else (one.high - one.low) * math.sqrt(1.0 / 12.0)
         for one, move in zip(free, np.maximum(moves, 1e-9 * spread).tolist(), strict=True)
     ]
-    root = _root(fit, fit.likelihood, np.array(prior))
+    root = _root(fit.likelihood, slopes, np.array(prior))
     _, sizes, directions = np.linalg.svd(slopes @ root, full_matrices=False)
     count = int(np.searchsorted(np.cumsum(sizes**2), (1.0 - UNSTATED) * float(sizes @ sizes))) + 1
     deployed = _values(terms)
@@ -98,17 +91,22 @@ def std_factors(fit: Fit, terms: Sequence[Term]) -> list[tuple[tuple[float, ...]
     return [tuple(found) for found in rows]
 
 
-def _root(fit: Fit, likelihood: Likelihood, prior: Vector | None = None) -> Matrix:
+def _added_slopes(fit: Fit) -> Matrix:
+    """Return by how much all effects together move each point with each parameter, shape (points, parameters)."""
+    points = fit.likelihood.points
+
+    def added(values: Vector) -> Vector:
+        return points.averaged(summed(points.evidence, _moved(fit.terms, values))[:, None])[:, 0]
+
+    return _slopes(added, _values(fit.terms))
+
+
+def _root(likelihood: Likelihood, slopes: Matrix, prior: Vector | None = None) -> Matrix:
     """Return a root of the covariance of all parameters: searched ones and amplitudes of each effect in turn.
 
     With the standard deviation that each had before the data, where it is given.
     """
-
-    def predicted(values: Vector) -> Vector:
-        total = summed(likelihood.points.evidence, _moved(fit.terms, values))
-        return likelihood.projected(likelihood.points.averaged(total[:, None]))[:, 0]
-
-    jacobian = _slopes(predicted, _values(fit.terms))
+    jacobian = likelihood.projected(slopes)
     if prior is not None:
         jacobian = np.concatenate([jacobian, np.diag(1.0 / prior)])
     scale = np.linalg.norm(jacobian, axis=0)
