@@ -21,6 +21,8 @@ from sim_hardware.wire import (
 
 MACHINES = {"conduction": QuillMachine, "published": PublishedQuill}
 POLL_INTERVAL_S = 10.0
+#: Devices answer in real time while the day runs in simulated time: a computer that is busy for a moment loses no reading.
+TIMEOUT_S = 3.0
 PROBE_RANGE_UM = 500.0
 #: Standard deviation of one value of the touch probe, µm.
 TOUCH_STD_UM = 1.5
@@ -143,20 +145,24 @@ folder = "recordings"
 name = "rs485"
 protocol = "modbus-rtu"
 port = "{lines["rtu"]}"
+timeout_s = {TIMEOUT_S}
 [[line]]
 name = "cabinet"
 protocol = "modbus-tcp"
 host = "127.0.0.1"
 tcp_port = {lines["tcp"]}
+timeout_s = {TIMEOUT_S}
 [[line]]
 name = "plc"
 protocol = "modbus-tcp"
 host = "127.0.0.1"
 tcp_port = {lines["plc"]}
+timeout_s = {TIMEOUT_S}
 [[line]]
 name = "base-line"
 protocol = "dcon"
 port = "{lines["dcon"]}"
+timeout_s = {TIMEOUT_S}
 {sensor["line"]}
 [[device]]
 name = "spindle-thermocouples"
@@ -226,6 +232,7 @@ protocol = "capancdt"
 host = "127.0.0.1"
 data_port = {lines["data"]}
 command_port = {lines["command"]}
+timeout_s = {TIMEOUT_S}
 """,
         "device": """[[device]]
 name = "probe"

@@ -10,12 +10,7 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, also in the back
 given = dict(enumerate(sys.argv))
 endpoint, prefix = given.get(1, "tcp/127.0.0.1:7447"), given.get(2, "shop/vmc-07")
 connect = {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
-config = zenoh.Config.from_json5(json.dumps(connect))
-try:
-    opened = zenoh.open(config)
-except zenoh.ZError:
-    sys.exit(f"nobody answers at {endpoint}: start the service or the router there, or name another endpoint")
-with opened as session:
+with zenoh.open(zenoh.Config.from_json5(json.dumps(connect))) as session:  # an error where nobody answers
     subscriber = session.declare_subscriber(f"{prefix}/thermal/y/offset")  # without a name it would be gone at once
     for _ in range(int(given.get(3, sys.maxsize))):
         offset = json.loads(subscriber.recv().payload.to_bytes())
