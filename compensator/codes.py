@@ -140,6 +140,11 @@ class Reason(Code):
         "A channel has jumped; it is not used until it returns, or the model or measured Y confirms its new value.",
         "Check that sensor and its plug; if it is right, send resume; if it was replaced, send zero.",
     )
+    UNCONFIRMED_CHANNEL = (
+        "unconfirmed_channel",
+        "Since a channel was missing it reads otherwise than expected: heat, air or its zero has changed; it is used.",
+        "If nothing was done at that sensor, send resume; else send zero with the machine at rest.",
+    )
     OUTSIDE_VALIDITY = (
         "outside_validity",
         "T_Q, AT or the heat is outside the range of validity.",
@@ -213,6 +218,7 @@ SUFFIXES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         Reason.CHANNEL_MISSING: (),
         Reason.SUSPECT_CHANNEL: ("t_q_degc", "at_degc"),
+        Reason.UNCONFIRMED_CHANNEL: ("t_q_degc", "at_degc"),
         Reason.OUTSIDE_VALIDITY: ("t_q_degc", "at_degc", "heat_w"),
         Reason.IMPLAUSIBLE: ("t_q_degc", "at_degc", "y_um", "model"),
     }
@@ -993,6 +999,14 @@ SUFFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         f"{Reason.SUSPECT_CHANNEL}:at_degc": (
             "AT has jumped and is not used until it returns, or until the model or measured Y agrees with it.",
             "Check the couple of AT and its plug; if it is right, send resume; if it was replaced, send zero.",
+        ),
+        f"{Reason.UNCONFIRMED_CHANNEL}:t_q_degc": (
+            "Since T_Q was missing it reads otherwise than expected: heat or its zero has changed; it is used.",
+            "If nothing was done at the couple of T_Q, send resume; else send zero with the machine at rest.",
+        ),
+        f"{Reason.UNCONFIRMED_CHANNEL}:at_degc": (
+            "Since AT was missing it reads otherwise than expected: the air or its zero has changed; it is used.",
+            "If nothing was done at the couple of AT, send resume; else send zero with the machine at rest.",
         ),
         f"{Reason.OUTSIDE_VALIDITY}:t_q_degc": (
             "T_Q is outside the range in which the machine was calibrated.",

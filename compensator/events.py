@@ -376,6 +376,7 @@ class Implausibility(StrEnum):
     RESIDUAL = "residual"
     RESIDUAL_OVER = "residual_over"
     JUMPED = "jumped"
+    UNCONFIRMED = "unconfirmed"
     ACCEPTED = "accepted"
 
 

@@ -348,13 +348,13 @@ class Compensation:
         if self.plausibility.is_on:
             notes += self.plausibility.update(self._evidence(raw, values, prediction))
         decision = self._decision.decide(
-            values, prediction if estimate else None, self._memory, self.plausibility, self._jumps.suspects
+            values, prediction if estimate else None, self._memory, self.plausibility, self._jumps
         )
         if self.probing is not None and decision.limited is not None:
             held = decision.state in (State.HOLD, State.FAULT)
             self.probing.publish(decision.limited.offset_um, decision.limited.rate_um_per_min, is_held=held)
         # During an alarm the offset may be wrong by the difference between measured and predicted Y.
-        std = math.hypot(prediction.std_um, self.plausibility.error_um)
+        std = math.hypot(prediction.std_um, self.plausibility.error_um, self._jumps.doubt_um)
         return Outcome(
             sample=sample,
             estimate=estimate_message(sample, values, estimate, self._engine.reference, self._zero, prediction),
@@ -450,7 +450,7 @@ class Compensation:
             zero.y_base, self._memory.cold_min = 0.0, 0.0
         zero.y_ref, zero.wanted = values.y, False
         self.plausibility.reset(at_rest=not warm)
-        self._jumps.reset()
+        self._jumps.reset(at_rest=not warm)
         if self.probing is not None:
             at_zero = self._memory.estimate
             self.probing.set_zero(time_ns, at_zero.contributions_um if at_zero is not None else None)

@@ -12,7 +12,7 @@ from compensator.config import Config, Limits
 from compensator.messages import SCHEMA, Offset
 from compensator.model.thermal_model import ThermalModel
 from compensator.service.outcome import Prediction, Values
-from compensator.service.plausibility import PlausibilityCheck
+from compensator.service.plausibility import JumpWatch, PlausibilityCheck
 from compensator.service.state import Memory
 
 #: A published offset is valid for this many samples.
@@ -118,7 +118,7 @@ class OffsetDecision:
         prediction: Prediction | None,
         memory: Memory,
         plausibility: PlausibilityCheck,
-        suspects: Sequence[str] = (),
+        jumps: JumpWatch | None = None,
     ) -> Decision:
         """Decide one sample.
 
@@ -132,13 +132,15 @@ class OffsetDecision:
             Values kept from sample to sample; times in it advance.
         plausibility : PlausibilityCheck
             Checks between the sensors, including this sample.
-        suspects : sequence of str
-            Channels that have jumped and are not used.
+        jumps : JumpWatch, optional
+            Channels that have jumped, and those that may have.
         """
         pairs = ((Reason.T_Q_MISSING, values.t_q), (Reason.AT_MISSING, values.at))
         reasons: list[str] = [reason for reason, value in pairs if math.isnan(value)]
         lost = bool(reasons)
-        reasons += [f"{Reason.SUSPECT_CHANNEL}:{name}" for name in suspects]
+        if jumps is not None:
+            reasons += [f"{Reason.SUSPECT_CHANNEL}:{name}" for name in jumps.suspects]
+            reasons += [f"{Reason.UNCONFIRMED_CHANNEL}:{name}" for name in jumps.unconfirmed]
         memory.missing_min = memory.missing_min + self._period_min if lost else 0.0
         expired = lost and memory.missing_min > self._predict_for_min
         if prediction is None:

@@ -26,8 +26,9 @@ BRIDGED_SAMPLES = 480
 _CLIP = 5.0
 #: Weight of the past in the log likelihood ratio of a suspect channel, by sample: about half an hour.
 _KEEP = 1.0 - 1.0 / 30.0
-#: Y speaks for one engine: its residual within the first, the other's larger by the second, in deviations of Y.
-_FITS, _CONTRADICTS = 3.0, 4.0
+#: Y speaks for an engine whose residual is within the first, or within the third part of the other's (how far a sensor
+#: jumped unseen is not known exactly), and smaller than the other's by the second, in deviations of Y.
+_FITS, _CONTRADICTS, _FITS_PART = 3.0, 4.0, 0.1
 
 
 @dataclass(slots=True)
@@ -156,12 +157,12 @@ class JumpEngines:
                 if name in fed.jumped or math.isnan(values[name]):
                     continue
                 expected, std = expected_value(run.engine, name, values["at_degc"])
-                cost += sign * min(((values[name] - expected) / std) ** 2, _CLIP * _CLIP)
+                cost += sign * (min(((values[name] - expected) / std) ** 2, _CLIP * _CLIP) + 2.0 * math.log(std))
         keep = _KEEP if state.is_suspect else 1.0
         state.ratio = keep * state.ratio + cost
 
-    def believes(self, y_um: float, std_um: float) -> bool | None:
-        """Return whether a value of Y agrees with the believing engine and contradicts the shifted one.
+    def speaks(self, y_um: float, std_um: float) -> int:
+        """Return for which engine a value of Y speaks: it agrees with that one and contradicts the other.
 
         Parameters
         ----------
@@ -170,13 +171,21 @@ class JumpEngines:
 
         Returns
         -------
-        bool or None
-            None before the first sample.
+        int
+            1 for the believing engine, -1 for the shifted one, 0 for neither.
         """
         if self.believing.estimate is None or self.shifted.estimate is None:
-            return None
-        for_it, against = abs(y_um - self.believing.estimate.y_um), abs(y_um - self.shifted.estimate.y_um)
-        return for_it < _FITS * std_um and against > for_it + _CONTRADICTS * std_um
+            return 0
+        left = [abs(y_um - run.estimate.y_um) / std_um for run in (self.believing, self.shifted) if run.estimate]
+        if min(left) >= max(_FITS, _FITS_PART * max(left)) or abs(left[0] - left[1]) <= _CONTRADICTS:
+            return 0
+        return 1 if left[0] < left[1] else -1
+
+    @property
+    def apart_um(self) -> float:
+        """Difference of their predictions, µm; 0 before the first sample."""
+        believing, shifted = self.believing.estimate, self.shifted.estimate
+        return abs(believing.y_um - shifted.y_um) if believing is not None and shifted is not None else 0.0
 
 
 def count_held(state: JumpState, engine: Engine, at_degc: float) -> None:

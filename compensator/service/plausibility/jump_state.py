@@ -43,10 +43,14 @@ class JumpState(msgspec.Struct, kw_only=True):
         Consecutive samples for which each channel has been back.
     at_held : int
         Consecutive samples for which AT has been where it was before the jump.
-    y_for : int
-        Consecutive samples for which measured Y has spoken for the believing engine.
-    probes_for : int
-        Probes that have spoken for it.
+    unseen : dict of str to int
+        By channel: samples since its last value.
+    is_unconfirmed : bool
+        Whether these channels read otherwise than expected after samples without them; they are used meanwhile.
+    y_for, y_against : int
+        Consecutive samples for which measured Y has spoken for the believing engine, and for the shifted one.
+    probes_for, probes_against : int
+        Probes that have spoken for them.
     believing, shifted : Branch, optional
         The two engines; None if no channel has jumped.
     """
@@ -57,26 +61,37 @@ class JumpState(msgspec.Struct, kw_only=True):
     again: int = 0
     quiet: int = FORGOTTEN_SAMPLES
     is_suspect: bool = False
+    is_unconfirmed: bool = False
+    unseen: dict[str, int] = {}
     samples: int = 0
     ratio: float = 0.0
     back: dict[str, int] = {}
     at_held: int = 0
     y_for: int = 0
+    y_against: int = 0
     probes_for: int = 0
+    probes_against: int = 0
     believing: Branch | None = None
     shifted: Branch | None = None
 
     def start_evidence(self) -> None:
         """Count the evidence from here on."""
-        self.samples, self.ratio, self.y_for, self.probes_for = 0, 0.0, 0, 0
+        self.samples, self.ratio = 0, 0.0
+        self.y_for = self.y_against = self.probes_for = self.probes_against = 0
 
-    def begun(self, *, is_suspect: bool) -> JumpState:
-        """Return the state when a channel has jumped."""
+    def begun(self, *, is_suspect: bool = False, is_unconfirmed: bool = False) -> JumpState:
+        """Return the state when a channel has jumped, or may have while it was not seen."""
         again = self.again + 1 if self.quiet < FORGOTTEN_SAMPLES else 0
-        return JumpState(level_um=self.level_um, is_suspect=is_suspect, again=again)
+        return JumpState(
+            level_um=self.level_um,
+            is_suspect=is_suspect,
+            is_unconfirmed=is_unconfirmed,
+            unseen=self.unseen,
+            again=again,
+        )
 
     def ended(self) -> JumpState:
         """Return the state when all channels are used again; the level of Y − prediction is another one then."""
         if self.is_suspect:
-            return JumpState(again=self.again, quiet=0)
-        return JumpState(level_um=self.level_um, again=self.again, quiet=self.quiet)
+            return JumpState(unseen=self.unseen, again=self.again, quiet=0)
+        return JumpState(level_um=self.level_um, unseen=self.unseen, again=self.again, quiet=self.quiet)

@@ -19,6 +19,11 @@ A jump within `rate_max_per_min` is used at first; with `jump_min_k` both engine
 within its range of validity explains a jump of T_Q. Where the shifted one expects them far better, the channel becomes
 suspect and the state that of the shifted engine: what the wrong values did is undone.
 
+A jump may also hide in samples without the channel: its couple was open, or the service was stopped. With `jump_min_k`
+a channel that then reads otherwise than expected is *unconfirmed*: heat or air that changed meanwhile looks the same.
+It is used, both engines run, and their difference is part of the standard deviation until the same evidence speaks for
+one of them.
+
 Everything here is computed from the samples alone, with scalar floats; the state is part of the compensation's.
 """
 
@@ -53,6 +58,8 @@ _NATURAL = 0.5
 _AGREES, _AGREES_SAMPLES = 12.0, 10
 #: A jump within the permitted rate is watched for this number of samples, and refuted at this log likelihood ratio.
 WATCHED_SAMPLES, _REFUTED = 15, 12.0
+#: Samples without a channel that can hide a jump; one missing sample is a reading that failed.
+_UNSEEN_SAMPLES = 2
 #: Heat beyond its range of validity by this part of the range cannot explain such a jump of T_Q.
 _BEYOND = 0.2
 #: Standard deviations of the innovation that such a jump exceeds in any case.
@@ -120,6 +127,17 @@ class JumpWatch:
         return tuple(self._state.shifts_k) if self._state.is_suspect else ()
 
     @property
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Channels that are used, and may have another zero since samples without them."""
+        return tuple(self._state.shifts_k) if self._state.is_unconfirmed else ()
+
+    @property
+    def doubt_um(self) -> float:
+        """Standard deviation by unconfirmed channels, µm: either engine may be right."""
+        engines = self._engines
+        return engines.apart_um / math.sqrt(2.0) if engines is not None and self._state.is_unconfirmed else 0.0
+
+    @property
     def state(self) -> JumpState:
         """State after the last sample."""
         if self._engines is None:
@@ -144,21 +162,23 @@ class JumpWatch:
             shifts_k=dict(state.shifts_k),
             first_k=dict(state.first_k),
             back=dict(state.back),
+            unseen=dict(state.unseen),
         )
 
-    def reset(self) -> None:
-        """Forget the level of measured Y, and jumps that are only watched: there is another zero or another state."""
+    def reset(self, *, at_rest: bool) -> None:
+        """Forget the level of measured Y and jumps that are only watched; at rest unconfirmed channels, too."""
         self._state.level_um = NAN
-        if not self._state.is_suspect:
+        if not self._state.is_suspect and (at_rest or not self._state.is_unconfirmed):
             self._end()
 
     def pass_time(self, samples: int, *, held: bool) -> None:
-        """Account for samples that were not measured."""
+        """Account for samples that were not measured; after `held` ones the state is unknown and nothing expected."""
+        self._state.unseen = {} if held else {name: self._state.unseen.get(name, 0) + samples for name in TEMPERATURES}
         if self._engines is not None:
             self._engines.pass_time(samples, held=held)
 
     def release(self, engine: Engine, *, new_zero: bool) -> tuple[list[str], Estimate | None]:
-        """Use suspect channels again because an operator says so.
+        """Use suspect channels again because an operator says so; `resume` confirms those that are unconfirmed.
 
         Parameters
         ----------
@@ -175,6 +195,8 @@ class JumpWatch:
             The estimate of the new state; None if nothing was suspect.
         """
         names, engines = list(self.suspects), self._engines
+        if self._state.is_unconfirmed and not new_zero:
+            self._end()
         if not names or engines is None:
             return [], None
         new_zero = new_zero and self._model.inputs == "changes"
@@ -212,12 +234,16 @@ class JumpWatch:
         offered = {name: _offered(channels.get(name)) for name in TEMPERATURES}
         jumped = [name for name in TEMPERATURES if _quality(channels.get(name)) == SampleQuality.TOO_FAST]
         notes: list[Note] = []
-        if jumped and not self._state.is_suspect:
-            self._begin(engine, is_suspect=True)
+        seen_again = self._seen_again(offered)
+        if jumped and self._state.is_unconfirmed:
+            self._suspect()
+        elif jumped and not self._state.is_suspect:
+            self._begin(engine, self._state.begun(is_suspect=True))
         elif not self._state.shifts_k and self._least_k is not None:
-            jumped = self._watchable(engine, offered)
+            hidden = self._unexpected(engine, offered, seen_again)
+            jumped = [*hidden, *(name for name in self._watchable(engine, offered) if name not in hidden)]
             if jumped:
-                self._begin(engine, is_suspect=False)
+                self._begin(engine, self._state.begun(is_unconfirmed=bool(hidden)))
         engines = self._engines
         if engines is None:
             return Judgement()
@@ -227,12 +253,14 @@ class JumpWatch:
             engines.believe_as_shifted()
             self._state.start_evidence()
             notes += [self._jump_note(name) for name in jumped if name in fed.jumped]
+        elif fed.jumped and self._state.is_unconfirmed:
+            notes += [self._unconfirmed_note(name) for name in fed.jumped]
         engines.weigh(self._state, offered, fed)
         engines.step(offered, fed, others)
         self._state.samples += 1
         self._weigh_y(engines, y_um)
         is_suspect = self._state.is_suspect
-        verdict = self._suspected(engine, engines, offered) if is_suspect else self._watched(engine, engines)
+        verdict = (self._suspected if is_suspect else self._watched)(engine, engines, offered)
         return Judgement(verdict.estimate, [*notes, *verdict.notes], verdict.accepted)
 
     def receive_probe(self, innovation_um: float, std_um: float, predicted_um: float) -> None:
@@ -247,11 +275,12 @@ class JumpWatch:
         predicted_um : float
             Prediction of the compensation after the last sample, µm, without a correction.
         """
-        if not self.suspects or self._engines is None or math.isnan(innovation_um):
+        state = self._state
+        if not (state.is_suspect or state.is_unconfirmed) or self._engines is None or math.isnan(innovation_um):
             return
-        std_um = math.hypot(std_um, self._y_std_um)
-        if self._engines.believes(innovation_um + predicted_um, std_um):
-            self._state.probes_for += 1
+        speaks = self._engines.speaks(innovation_um + predicted_um, math.hypot(std_um, self._y_std_um))
+        state.probes_for += speaks > 0
+        state.probes_against += speaks < 0
 
     def observe(self, y_um: float, estimate: Estimate) -> None:
         """Count quiet samples, and follow the level of measured Y − prediction, which a later jump is compared with."""
@@ -268,13 +297,38 @@ class JumpWatch:
 
     # ------------------------------------------------------------------ inside
 
-    def _begin(self, engine: Engine, *, is_suspect: bool) -> None:
+    def _begin(self, engine: Engine, state: JumpState) -> None:
         self._engines = JumpEngines.begin(self._model, engine.snapshot())
-        self._state = self._state.begun(is_suspect=is_suspect)
+        self._state = state
+
+    def _suspect(self) -> None:
+        """Use the channels no longer that were watched or unconfirmed."""
+        self._state.is_suspect, self._state.is_unconfirmed = True, False
+        self._state.start_evidence()
+
+    def _seen_again(self, offered: Mapping[str, float]) -> list[str]:
+        """Return the channels that are seen again after samples without them, and count such samples."""
+        unseen = self._state.unseen
+        self._state.unseen = {name: unseen.get(name, 0) + 1 for name in TEMPERATURES if math.isnan(offered[name])}
+        return [
+            name for name, samples in unseen.items() if samples >= _UNSEEN_SAMPLES and name not in self._state.unseen
+        ]
+
+    def _unexpected(self, engine: Engine, offered: Mapping[str, float], seen_again: list[str]) -> list[str]:
+        """Return the channels that, seen again, differ from what the engine expects."""
+        if not seen_again or self._least_k is None:
+            return []
+        with_at, without = engine.forecast(offered["at_degc"]), engine.forecast(NAN)
+        # As for a jump that is watched: T_Q follows AT if AT is right, and not if it is wrong.
+        apart_k = {
+            "t_q_degc": min(abs(offered["t_q_degc"] - expected.t_q_k) for expected in (with_at, without)),
+            "at_degc": abs(offered["at_degc"] - without.at_k),
+        }
+        return [name for name in TEMPERATURES if name in seen_again and apart_k[name] > self._least_k]
 
     def _watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
         """Return the channels that differ from what the engine expects by more than its deviation explains."""
-        if math.isnan(offered["t_q_degc"]) or math.isnan(offered["at_degc"]) or self._least_k is None:
+        if math.isnan(offered["t_q_degc"]) or self._least_k is None:
             return []
         at_degc, t_q_degc, least_k = offered["at_degc"], offered["t_q_degc"], self._least_k
         # T_Q follows AT if AT is right, and not if it is wrong: only what neither explains is a jump of T_Q.
@@ -297,13 +351,13 @@ class JumpWatch:
         return low - beyond <= heat_w <= high + beyond
 
     def _weigh_y(self, engines: JumpEngines, y_um: float) -> None:
-        """Count the samples for which measured Y has spoken for the believing engine."""
+        """Count the samples for which measured Y has spoken for one engine."""
         state = self._state
         if math.isnan(y_um) or math.isnan(state.level_um) or not self._y_std_um > 0.0:
             return
-        believes = engines.believes(y_um - state.level_um, self._y_std_um)
-        if believes is not None:
-            state.y_for = state.y_for + 1 if believes else 0
+        speaks = engines.speaks(y_um - state.level_um, self._y_std_um)
+        state.y_for = state.y_for + 1 if speaks > 0 else 0
+        state.y_against = state.y_against + 1 if speaks < 0 else 0
 
     def _suspected(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
         state = self._state
@@ -312,13 +366,21 @@ class JumpWatch:
             return self._accept(engine, offered, engines.shifted, "has returned to what was expected before")
         if state.at_held >= needed:
             return self._accept(engine, offered, None, "has returned to where it was before")
-        if state.y_for >= Y_SAMPLES:
-            return self._accept(engine, offered, engines.believing, "is used again: measured Y agrees with it")
-        if state.probes_for >= _PROBES:
-            return self._accept(engine, offered, engines.believing, "is used again: probes agree with it")
-        if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
-            return self._accept(engine, offered, engines.believing, "is used again: the model agrees with it")
+        by = self._confirmed_by()
+        if by:
+            return self._accept(engine, offered, engines.believing, f"is used again: {by} with it")
         return Judgement()
+
+    def _confirmed_by(self) -> str:
+        """Return what agrees with the believing engine, with its verb; empty if nothing decides."""
+        state = self._state
+        if state.y_for >= Y_SAMPLES:
+            return "measured Y agrees"
+        if state.probes_for >= _PROBES:
+            return "probes agree"
+        if state.ratio >= _AGREES and state.samples >= _AGREES_SAMPLES:
+            return "the model agrees"
+        return ""
 
     def _accept(self, engine: Engine, offered: Mapping[str, float], run: Run | None, how: str) -> Judgement:
         names = list(self._state.shifts_k)
@@ -337,10 +399,16 @@ class JumpWatch:
         self._end()
         return Judgement(estimate, notes, {name: offered[name] for name in names})
 
-    def _watched(self, engine: Engine, engines: JumpEngines) -> Judgement:
-        """Decide whether a jump within the permitted rate was one of the sensor."""
+    def _watched(self, engine: Engine, engines: JumpEngines, offered: Mapping[str, float]) -> Judgement:
+        """Decide whether a jump within the permitted rate, or one that nobody saw, was one of the sensor."""
         state, shifted = self._state, engines.shifted
-        if state.ratio <= -_REFUTED:
+        is_refuted = state.ratio <= -_REFUTED
+        if state.is_unconfirmed:
+            by = self._confirmed_by()
+            if by:
+                return self._accept(engine, offered, None, f"is confirmed: {by} with it")
+            is_refuted |= state.y_against >= Y_SAMPLES or state.probes_against >= _PROBES
+        if is_refuted:
             engine.restore(shifted.engine.snapshot())
             estimate = shifted.estimate
             if all(state.back.get(name, 0) > 0 for name in state.shifts_k):
@@ -348,10 +416,9 @@ class JumpWatch:
                 self._end()
             else:
                 notes = [self._jump_note(name) for name in state.shifts_k]
-                state.is_suspect = True
-                state.start_evidence()
+                self._suspect()
             return Judgement(estimate, notes)
-        if state.samples >= WATCHED_SAMPLES:
+        if state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed:
             self._end()
         return Judgement()
 
@@ -361,6 +428,15 @@ class JumpWatch:
             EventKind.PLAUSIBILITY,
             f"{NAMES[name]} has jumped by {shift:+.2f} K against what was expected, {then}",
             {"code": Implausibility.JUMPED, "channel": name, "shift_k": shift},
+        )
+
+    def _unconfirmed_note(self, name: str) -> Note:
+        shift = self._state.shifts_k[name]
+        return Note(
+            EventKind.PLAUSIBILITY,
+            f"{NAMES[name]} reads {shift:+.2f} K other than expected after samples without it; it is used, but nothing "
+            "confirms that the sensor has kept its zero",
+            {"code": Implausibility.UNCONFIRMED, "channel": name, "shift_k": shift},
         )
 
 
