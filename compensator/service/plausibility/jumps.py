@@ -50,6 +50,7 @@ from compensator.service.plausibility.jump_engines import (
     Run,
     count_held,
 )
+from compensator.service.plausibility.jump_signs import NAMES, JumpSigns, jump_note, unconfirmed_note
 from compensator.service.plausibility.jump_state import FORGOTTEN_SAMPLES, JumpState
 
 #: Part of the permitted change that the temperature itself makes; beyond it a suspect channel has jumped again.
@@ -60,18 +61,12 @@ _AGREES, _AGREES_SAMPLES = 12.0, 10
 WATCHED_SAMPLES, _REFUTED = 15, 12.0
 #: Samples without a channel that can hide a jump; one missing sample is a reading that failed.
 _UNSEEN_SAMPLES = 2
-#: Heat beyond its range of validity by this part of the range cannot explain such a jump of T_Q.
-_BEYOND = 0.2
-#: Standard deviations of the innovation that such a jump exceeds in any case.
-_JUMP = 6.0
 #: Consecutive samples for which Y must speak for a channel.
 Y_SAMPLES = 10
 #: Probes that must speak for a channel: one may have met a chip.
 _PROBES = 2
 #: Weight of a new residual in the level before a jump.
 _LEVEL = 0.1
-
-NAMES = {"t_q_degc": "T_Q", "at_degc": "AT"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +93,8 @@ class JumpWatch:
 
     def __init__(self, config: Config, model: ThermalModel) -> None:
         self.is_on = config.guards.suspect_jumps
-        self._least_k = config.guards.jump_min_k
+        least_k = config.guards.jump_min_k
+        self._signs = JumpSigns(model, least_k) if least_k is not None else None
         self._model = model
         period_min = model.period_s / 60.0
         self._change_k = {
@@ -115,9 +111,9 @@ class JumpWatch:
         """Describe whether jumps are watched for."""
         if not self.is_on:
             return "jumps of T_Q and AT off (no guards.suspect_jumps)"
-        if self._least_k is None:
+        if self._signs is None:
             return "jumps of T_Q and AT beyond rate_max_per_min (no guards.jump_min_k)"
-        return f"jumps of T_Q and AT beyond rate_max_per_min, and from {self._least_k:g} K on"
+        return f"jumps of T_Q and AT beyond rate_max_per_min, and from {self._signs.least_k:g} K on"
 
     # ------------------------------------------------------------------ state
 
@@ -239,9 +235,9 @@ class JumpWatch:
             self._suspect()
         elif jumped and not self._state.is_suspect:
             self._begin(engine, self._state.begun(is_suspect=True))
-        elif not self._state.shifts_k and self._least_k is not None:
-            hidden = self._unexpected(engine, offered, seen_again)
-            jumped = [*hidden, *(name for name in self._watchable(engine, offered) if name not in hidden)]
+        elif not self._state.shifts_k and self._signs is not None:
+            hidden = self._signs.unexpected(engine, offered, seen_again)
+            jumped = [*hidden, *(name for name in self._signs.watchable(engine, offered) if name not in hidden)]
             if jumped:
                 self._begin(engine, self._state.begun(is_unconfirmed=bool(hidden)))
         engines = self._engines
@@ -252,9 +248,9 @@ class JumpWatch:
         if fed.jumped and self._state.is_suspect:
             engines.believe_as_shifted()
             self._state.start_evidence()
-            notes += [self._jump_note(name) for name in jumped if name in fed.jumped]
+            notes += [jump_note(name, self._state.shifts_k[name]) for name in jumped if name in fed.jumped]
         elif fed.jumped and self._state.is_unconfirmed:
-            notes += [self._unconfirmed_note(name) for name in fed.jumped]
+            notes += [unconfirmed_note(name, self._state.shifts_k[name]) for name in fed.jumped]
         engines.weigh(self._state, offered, fed)
         engines.step(offered, fed, others)
         self._state.samples += 1
@@ -313,42 +309,6 @@ class JumpWatch:
         return [
             name for name, samples in unseen.items() if samples >= _UNSEEN_SAMPLES and name not in self._state.unseen
         ]
-
-    def _unexpected(self, engine: Engine, offered: Mapping[str, float], seen_again: list[str]) -> list[str]:
-        """Return the channels that, seen again, differ from what the engine expects."""
-        if not seen_again or self._least_k is None:
-            return []
-        with_at, without = engine.forecast(offered["at_degc"]), engine.forecast(NAN)
-        # As for a jump that is watched: T_Q follows AT if AT is right, and not if it is wrong.
-        apart_k = {
-            "t_q_degc": min(abs(offered["t_q_degc"] - expected.t_q_k) for expected in (with_at, without)),
-            "at_degc": abs(offered["at_degc"] - without.at_k),
-        }
-        return [name for name in TEMPERATURES if name in seen_again and apart_k[name] > self._least_k]
-
-    def _watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
-        """Return the channels that differ from what the engine expects by more than its deviation explains."""
-        if math.isnan(offered["t_q_degc"]) or self._least_k is None:
-            return []
-        at_degc, t_q_degc, least_k = offered["at_degc"], offered["t_q_degc"], self._least_k
-        # T_Q follows AT if AT is right, and not if it is wrong: only what neither explains is a jump of T_Q.
-        with_at, without = engine.forecast(at_degc), engine.forecast(NAN)
-        found = []
-        if abs(at_degc - without.at_k) > max(least_k, _JUMP * without.at_std_k):
-            found.append("at_degc")
-        jumps = [t_q_degc - expected.t_q_k for expected in (with_at, without)]
-        limits = [max(least_k, _JUMP * expected.t_q_std_k) for expected in (with_at, without)]
-        if all(abs(k) > most and not self._is_heat(engine.drive_for(k)) for k, most in zip(jumps, limits, strict=True)):
-            found.append("t_q_degc")
-        return found
-
-    def _is_heat(self, heat_w: float) -> bool:
-        """Return whether there can be so much heat; a short burst of it looks like a jump for many minutes."""
-        if "heat_w" not in self._model.validity:
-            return True
-        low, high = self._model.validity["heat_w"]
-        beyond = _BEYOND * (high - low)
-        return low - beyond <= heat_w <= high + beyond
 
     def _weigh_y(self, engines: JumpEngines, y_um: float) -> None:
         """Count the samples for which measured Y has spoken for one engine."""
@@ -412,32 +372,15 @@ class JumpWatch:
             engine.restore(shifted.engine.snapshot())
             estimate = shifted.estimate
             if all(state.back.get(name, 0) > 0 for name in state.shifts_k):
-                notes = [self._jump_note(name, "and has returned") for name in state.shifts_k]
+                notes = [jump_note(name, state.shifts_k[name], "and has returned") for name in state.shifts_k]
                 self._end()
             else:
-                notes = [self._jump_note(name) for name in state.shifts_k]
+                notes = [jump_note(name, state.shifts_k[name]) for name in state.shifts_k]
                 self._suspect()
             return Judgement(estimate, notes)
         if state.samples >= WATCHED_SAMPLES and not state.is_unconfirmed:
             self._end()
         return Judgement()
-
-    def _jump_note(self, name: str, then: str = "and is not used until its new value is confirmed") -> Note:
-        shift = self._state.shifts_k[name]
-        return Note(
-            EventKind.PLAUSIBILITY,
-            f"{NAMES[name]} has jumped by {shift:+.2f} K against what was expected, {then}",
-            {"code": Implausibility.JUMPED, "channel": name, "shift_k": shift},
-        )
-
-    def _unconfirmed_note(self, name: str) -> Note:
-        shift = self._state.shifts_k[name]
-        return Note(
-            EventKind.PLAUSIBILITY,
-            f"{NAMES[name]} reads {shift:+.2f} K other than expected after samples without it; it is used, but nothing "
-            "confirms that the sensor has kept its zero",
-            {"code": Implausibility.UNCONFIRMED, "channel": name, "shift_k": shift},
-        )
 
 
 def _quality(channel: ChannelSample | None) -> str:

@@ -1,0 +1,82 @@
+"""Signs of a jump of T_Q or AT in one sample, and the events that say so."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from compensator.arrays import NAN
+from compensator.events import EventKind, Implausibility, Note
+from compensator.model.engine import Engine
+from compensator.model.thermal_model import ThermalModel
+from compensator.service.plausibility.guards import TEMPERATURES
+
+#: Heat beyond its range of validity by this part of the range cannot explain a jump of T_Q within the permitted rate.
+_BEYOND = 0.2
+#: Standard deviations of the innovation that such a jump exceeds in any case.
+_JUMP = 6.0
+
+NAMES = {"t_q_degc": "T_Q", "at_degc": "AT"}
+
+
+class JumpSigns:
+    """Finds channels that differ from what an engine expects, by `least_k` K at least."""
+
+    def __init__(self, model: ThermalModel, least_k: float) -> None:
+        self._model = model
+        self.least_k = least_k
+
+    def unexpected(self, engine: Engine, offered: Mapping[str, float], seen_again: list[str]) -> list[str]:
+        """Return the channels that, seen again, differ from what the engine expects."""
+        if not seen_again:
+            return []
+        with_at, without = engine.forecast(offered["at_degc"]), engine.forecast(NAN)
+        # As for a jump that is watched: T_Q follows AT if AT is right, and not if it is wrong.
+        apart_k = {
+            "t_q_degc": min(abs(offered["t_q_degc"] - expected.t_q_k) for expected in (with_at, without)),
+            "at_degc": abs(offered["at_degc"] - without.at_k),
+        }
+        return [name for name in TEMPERATURES if name in seen_again and apart_k[name] > self.least_k]
+
+    def watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
+        """Return the channels that differ from what the engine expects by more than its deviation explains."""
+        if math.isnan(offered["t_q_degc"]):
+            return []
+        at_degc, t_q_degc, least_k = offered["at_degc"], offered["t_q_degc"], self.least_k
+        # T_Q follows AT if AT is right, and not if it is wrong: only what neither explains is a jump of T_Q.
+        with_at, without = engine.forecast(at_degc), engine.forecast(NAN)
+        found = []
+        if abs(at_degc - without.at_k) > max(least_k, _JUMP * without.at_std_k):
+            found.append("at_degc")
+        jumps = [t_q_degc - expected.t_q_k for expected in (with_at, without)]
+        limits = [max(least_k, _JUMP * expected.t_q_std_k) for expected in (with_at, without)]
+        if all(abs(k) > most and not self._is_heat(engine.drive_for(k)) for k, most in zip(jumps, limits, strict=True)):
+            found.append("t_q_degc")
+        return found
+
+    def _is_heat(self, heat_w: float) -> bool:
+        """Return whether there can be so much heat; a short burst of it looks like a jump for many minutes."""
+        if "heat_w" not in self._model.validity:
+            return True
+        low, high = self._model.validity["heat_w"]
+        beyond = _BEYOND * (high - low)
+        return low - beyond <= heat_w <= high + beyond
+
+
+def jump_note(name: str, shift_k: float, then: str = "and is not used until its new value is confirmed") -> Note:
+    """Return the event that a channel has jumped."""
+    return Note(
+        EventKind.PLAUSIBILITY,
+        f"{NAMES[name]} has jumped by {shift_k:+.2f} K against what was expected, {then}",
+        {"code": Implausibility.JUMPED, "channel": name, "shift_k": shift_k},
+    )
+
+
+def unconfirmed_note(name: str, shift_k: float) -> Note:
+    """Return the event that a channel may have jumped while nobody saw it."""
+    return Note(
+        EventKind.PLAUSIBILITY,
+        f"{NAMES[name]} reads {shift_k:+.2f} K other than expected after samples without it; it is used, but nothing "
+        "confirms that the sensor has kept its zero",
+        {"code": Implausibility.UNCONFIRMED, "channel": name, "shift_k": shift_k},
+    )
