@@ -26,8 +26,8 @@ BRIDGED_SAMPLES = 480
 _CLIP = 5.0
 #: Weight of the past in the log likelihood ratio of a suspect channel, by sample: about half an hour.
 _KEEP = 1.0 - 1.0 / 30.0
-#: Y speaks for an engine whose residual is within the first, or within the third part of the other's (how far a sensor
-#: jumped unseen is not known exactly), and smaller than the other's by the second, in deviations of Y.
+#: Y speaks for an engine whose residual is within the first, and smaller than the other's by the second, in deviations
+#: of Y; for the shifted one also within the third part of the other's: how far a sensor jumped is not known exactly.
 _FITS, _CONTRADICTS, _FITS_PART = 3.0, 4.0, 0.1
 
 
@@ -157,7 +157,10 @@ class JumpEngines:
                 if name in fed.jumped or math.isnan(values[name]):
                     continue
                 expected, std = expected_value(run.engine, name, values["at_degc"])
-                cost += sign * (min(((values[name] - expected) / std) ** 2, _CLIP * _CLIP) + 2.0 * math.log(std))
+                cost += sign * min(((values[name] - expected) / std) ** 2, _CLIP * _CLIP)
+                if state.is_unconfirmed:
+                    # After samples without the channel the two engines are not equally sure.
+                    cost += sign * 2.0 * math.log(std)
         keep = _KEEP if state.is_suspect else 1.0
         state.ratio = keep * state.ratio + cost
 
@@ -176,10 +179,11 @@ class JumpEngines:
         """
         if self.believing.estimate is None or self.shifted.estimate is None:
             return 0
-        left = [abs(y_um - run.estimate.y_um) / std_um for run in (self.believing, self.shifted) if run.estimate]
-        if min(left) >= max(_FITS, _FITS_PART * max(left)) or abs(left[0] - left[1]) <= _CONTRADICTS:
-            return 0
-        return 1 if left[0] < left[1] else -1
+        believing = abs(y_um - self.believing.estimate.y_um) / std_um
+        shifted = abs(y_um - self.shifted.estimate.y_um) / std_um
+        if believing < _FITS and shifted > believing + _CONTRADICTS:
+            return 1
+        return -1 if shifted < max(_FITS, _FITS_PART * believing) and believing > shifted + _CONTRADICTS else 0
 
     @property
     def apart_um(self) -> float:

@@ -31,12 +31,20 @@ class JumpSigns:
         if not seen_again:
             return []
         with_at, without = engine.forecast(offered["at_degc"]), engine.forecast(NAN)
-        # As for a jump that is watched: T_Q follows AT if AT is right, and not if it is wrong.
-        apart_k = {
-            "t_q_degc": min(abs(offered["t_q_degc"] - expected.t_q_k) for expected in (with_at, without)),
-            "at_degc": abs(offered["at_degc"] - without.at_k),
+        # As for a jump that is watched: T_Q follows AT if AT is right, and not if it is wrong. In a direct model T_Q
+        # goes its own way, as far as its deviation says.
+        least_k = [
+            max(self.least_k, _JUMP * expected.t_q_std_k if self._model.ttf is None else 0.0)
+            for expected in (with_at, without)
+        ]
+        found = {
+            "t_q_degc": all(
+                abs(offered["t_q_degc"] - expected.t_q_k) > least
+                for expected, least in zip((with_at, without), least_k, strict=True)
+            ),
+            "at_degc": abs(offered["at_degc"] - without.at_k) > self.least_k,
         }
-        return [name for name in TEMPERATURES if name in seen_again and apart_k[name] > self.least_k]
+        return [name for name in TEMPERATURES if name in seen_again and found[name]]
 
     def watchable(self, engine: Engine, offered: Mapping[str, float]) -> list[str]:
         """Return the channels that differ from what the engine expects by more than its deviation explains."""
