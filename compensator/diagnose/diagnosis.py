@@ -24,6 +24,7 @@ from compensator.diagnose.findings import Findings, findings_of, with_paths
 from compensator.diagnose.fit import Term
 from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
+from compensator.diagnose.initial_state import with_initial_state
 from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
 from compensator.diagnose.search import Candidate
@@ -69,7 +70,8 @@ def diagnose(
     found, left_out = findings_of(evidence), list[Remark]()
     if evidence.is_sparse:
         found, left_out = without_chips(found, partial(_evidence, model))
-        evidence = found.search.evidence
+    found = _as_begun(found)
+    evidence = found.search.evidence
     deciding = Deciding(Trials(evidence))
     effects = _effects(found, deciding)
     # Paths that were refitted with all effects say nothing beside only some of them.
@@ -97,7 +99,9 @@ def diagnose(
             found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained
         )
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
-    warnings = warnings_of(effects, held_out.nothing, held_out.whole, deployed=deployed, few=few)
+    warnings = warnings_of(
+        effects, held_out.nothing, held_out.whole, deployed=deployed, few=few, start_k=evidence.start_k
+    )
     return Diagnosis(
         verdict="unexplained" if hides or reverses else verdict,
         effects=effects,
@@ -119,6 +123,16 @@ def diagnose(
         advice=advice,
         could_hide=could_hide,
     )
+
+
+def _as_begun(found: Findings) -> Findings:
+    """Search once more with the initial state that the named effects need, and keep what explains more."""
+    evidence = with_initial_state(found.selection.fit)
+    if evidence is None:
+        return found
+    again = findings_of(evidence)
+    scores = [one.search.criterion.score(one.selection.fit) for one in (found, again)]
+    return again if scores[1] > scores[0] else found
 
 
 def _worth_deploying(

@@ -113,6 +113,10 @@ class Likelihood:
         """Return what effects that add so much to the points leave of the target."""
         return self.target - self.projected(added[:, None])[:, 0]
 
+    def weights(self, added: Vector) -> Vector:
+        """Return the most probable weights of `Points.random` beside effects that add so much to the points."""
+        return -self.left_by(added)[self.points.count :]
+
     def projected(self, table: Matrix) -> Matrix:
         """Return averaged columns without noise correlation, nuisances and own error."""
         white = self._whitening.of(table)

@@ -113,6 +113,8 @@ class Points:
         Standard deviation of the deformation, and the own error of the base's paths, µm.
     typical_logs : numpy.ndarray, shape (5,)
         `Rest.logs` as it is expected before the data are seen.
+    is_zero : numpy.ndarray of bool
+        Which columns of the nuisances are zeros of runs.
     zeros, starts_of_modes, fast, slow : numpy.ndarray, shape (points, ·)
         Columns of the zeros and initial states of runs, and of the fast and slow error of the base's paths.
     """
@@ -146,8 +148,9 @@ class Points:
         self._forms: dict[str, Matrix] = {}
         self._known: dict[tuple[Hypothesis, tuple[float, ...]], Matrix] = {}
         nuisances = self.averaged(evidence.nuisances)
-        is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
-        self.zeros, self.starts_of_modes = ZERO_TIMES * self.spread_um * nuisances[:, is_zero], nuisances[:, ~is_zero]
+        self.is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
+        self.zeros = ZERO_TIMES * self.spread_um * nuisances[:, self.is_zero]
+        self.starts_of_modes = nuisances[:, ~self.is_zero]
 
     def _own_um(self) -> float:
         evidence = self.evidence

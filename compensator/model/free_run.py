@@ -82,6 +82,7 @@ def free_runs(
     *,
     from_h: float = 0.0,
     until_h: float = np.inf,
+    from_rest: bool = False,
 ) -> FreeRuns:
     """Run models over data and compare them on the samples that all of them predict.
 
@@ -93,6 +94,8 @@ def free_runs(
         With T_Q, AT and Y.
     from_h, until_h : float
         Hours of each of the data between which samples are compared; the models run from its start.
+    from_rest : bool
+        How each run begins, as `simulate` has it.
 
     Raises
     ------
@@ -108,7 +111,9 @@ def free_runs(
             require(one.name, record, ("t_q_degc", "at_degc", "y_um"))
             for model in models.values():
                 require_channels(model, record, one.name)
-            runs = {name: simulate(model, record, source=one.name) for name, model in models.items()}
+            runs = {
+                name: simulate(model, record, source=one.name, from_rest=from_rest) for name, model in models.items()
+            }
             residuals = {name: run["residual_um"] for name, run in runs.items()}
             y = next(iter(runs.values()))["y_um"]
             known = np.all([np.isfinite(values) for values in (y, *residuals.values())], axis=0)
@@ -160,9 +165,10 @@ class FreeRunErrors:
         *,
         from_h: float = 0.0,
         until_h: float = np.inf,
+        from_rest: bool = False,
     ) -> FreeRunErrors:
         """Return the errors on data; see `free_runs`."""
-        runs = free_runs(models, data, from_h=from_h, until_h=until_h)
+        runs = free_runs(models, data, from_h=from_h, until_h=until_h, from_rest=from_rest)
         labels = ", ".join(dict.fromkeys(one.label for one in data))
         if from_h:
             labels += f" from {from_h:g} h on"
