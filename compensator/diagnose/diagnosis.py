@@ -17,16 +17,19 @@ from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import advice_of, label
 from compensator.diagnose.chips import without_chips
+from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, with_paths
-from compensator.diagnose.fit import Term
+from compensator.diagnose.fit import Term, fit_terms
 from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
 from compensator.diagnose.initial_state import with_initial_state
+from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
+from compensator.diagnose.points import Points
 from compensator.diagnose.search import Candidate
 from compensator.diagnose.standard_errors import standard_errors, std_factors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials
@@ -126,13 +129,13 @@ def diagnose(
 
 
 def _as_begun(found: Findings) -> Findings:
-    """Search once more with the initial state that the named effects need, and keep what explains more."""
-    evidence = with_initial_state(found.selection.fit)
-    if evidence is None:
+    """Search once more with the initial state that the named effects need, where they explain more with it."""
+    fit, score = found.selection.fit, found.search.criterion.score
+    evidence = with_initial_state(fit)
+    if evidence is None or score(fit_terms(Likelihood(Points(evidence), fit.rest), fit.starts())) < score(fit) + MARGIN:
         return found
     again = findings_of(evidence)
-    scores = [one.search.criterion.score(one.selection.fit) for one in (found, again)]
-    return again if scores[1] > scores[0] else found
+    return again if score(again.selection.fit) > score(fit) else found
 
 
 def _worth_deploying(
