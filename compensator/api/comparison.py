@@ -48,8 +48,8 @@ class ComparisonResult(Paged):
         Hour from which samples were compared.
     samples : int
         Number of samples compared.
-    data : str
-        Names of the data.
+    data : tuple of str
+        Names of the files or tables.
     in_frame : bool
         Whether tables are DataFrames.
     """
@@ -60,7 +60,7 @@ class ComparisonResult(Paged):
     t_h: Vector
     from_h: float
     samples: int
-    data: str = ""
+    data: tuple[str, ...] = ()
     in_frame: bool = False
 
     @property
@@ -217,6 +217,6 @@ def compare(
         t_h=runs.t_h,
         from_h=from_h,
         samples=runs.samples,
-        data=", ".join(dict.fromkeys(origin.name for one in measured for origin in one.origins)),
+        data=tuple(origin.name for one in measured for origin in one.origins),
         in_frame=any(one.in_frame for one in measured),
     )
