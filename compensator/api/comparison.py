@@ -22,8 +22,8 @@ from compensator.data.measurement import DataLike, check_each_once, measurements
 from compensator.data.screening import check_deformation_scale, screen_temperatures
 from compensator.display import Table
 from compensator.errors import DataError, UsageError
-from compensator.model.free_run import NOTE, NOTHING, PERSISTENCE, TITLE, free_runs, in_words
-from compensator.model.simulation import FREE_RUN_HEAD, Scores, csv_rows
+from compensator.model.free_run import NOTHING, PERSISTENCE, free_runs, in_words, table_of_scores
+from compensator.model.simulation import Scores, csv_rows
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -88,8 +88,7 @@ class ComparisonResult(Paged):
 
     def contents(self) -> list[str | Table]:
         """Return the content: the verdict, the number of samples, and the errors of each model."""
-        rows = [[name, *row.free_run_cells()] for name, row in self.scores.items()]
-        return [self._verdict(), Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=rows, note=NOTE)]
+        return [self._verdict(), table_of_scores([self.scores])]
 
     def _verdict(self) -> str:
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)

@@ -26,6 +26,14 @@ NOTE = (
     "Free run: from the first sample, at rest; measured Y counts from its first value, as in the service. About the "
     "mean: without the residual's mean. Persistence: the last Y measured before the samples is held."
 )
+#: Added where most of an error about the zero is one constant: it is this many times the error about the mean, and this
+#: share of the deformation's spread.
+CONSTANT = (
+    "Where the error about the zero is much larger than about the mean, most of it is one constant: the data begin on "
+    "a machine that is not at rest, or their first Y is wrong. Judge the model by data that begin at rest, or by the "
+    "error about the mean."
+)
+CONSTANT_TIMES, CONSTANT_SHARE = 2.0, 0.05
 
 
 class Measured(Protocol):
@@ -184,12 +192,33 @@ class FreeRunErrors:
 
 def table_of(rows: Sequence[FreeRunErrors]) -> Table:
     """Return the errors as a table, the same on every page and in every command."""
+    return table_of_scores([one.scores for one in rows], [f"{one.name} ({one.role})" for one in rows])
+
+
+def table_of_scores(scores: Sequence[Mapping[str, Scores]], names: Sequence[str] = ("",)) -> Table:
+    """Return the errors of models on one or several data as a table.
+
+    Parameters
+    ----------
+    scores : sequence of mapping of str to Scores
+        For each of the data, errors by the name of the model.
+    names : sequence of str
+        Of the data; a single one is not shown.
+    """
     lines: list[list[str]] = []
-    for one in rows:
-        if len(rows) > 1:
-            lines.append([f"{one.name} ({one.role})", *[""] * len(FREE_RUN_HEAD)])
-        lines += [[name, *row.free_run_cells()] for name, row in one.scores.items()]
-    return Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=lines, note=NOTE)
+    for name, by_model in zip(names, scores, strict=True):
+        if len(scores) > 1:
+            lines.append([name, *[""] * len(FREE_RUN_HEAD)])
+        lines += [[model, *row.free_run_cells()] for model, row in by_model.items()]
+    note = f"{NOTE} {CONSTANT}" if any(map(_is_constant, scores)) else NOTE
+    return Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=lines, note=note)
+
+
+def _is_constant(scores: Mapping[str, Scores]) -> bool:
+    """Whether most of the error of a model is one constant that matters beside the deformation."""
+    least_um = CONSTANT_SHARE * scores[NOTHING].rms_about_mean_um
+    models = [row for name, row in scores.items() if name not in (NOTHING, PERSISTENCE)]
+    return any(row.rms_um > max(CONSTANT_TIMES * row.rms_about_mean_um, least_um) for row in models)
 
 
 def in_words(scores: Mapping[str, Any], model: str) -> str:
