@@ -470,6 +470,11 @@ class ModelWarning(Code):
         "The standard error of a parameter is larger than the parameter.",
         "Before relying on it, record data in which the input of the effect changes more.",
     )
+    WARM_START = (
+        "warm_start",
+        "The record begins on a machine that is not at rest, and an effect depends on how warm the machine is.",
+        "Confirm the effect with a record that begins at rest, and set the zero of the service at rest.",
+    )
     NEARLY_AS_GOOD = (
         "nearly_as_good",
         "Another effect explains the residual almost as well.",

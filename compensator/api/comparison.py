@@ -22,8 +22,8 @@ from compensator.data.measurement import DataLike, check_each_once, measurements
 from compensator.data.screening import check_deformation_scale, screen_temperatures
 from compensator.display import Table
 from compensator.errors import DataError, UsageError
-from compensator.model.free_run import NOTE, NOTHING, PERSISTENCE, TITLE, free_runs, in_words
-from compensator.model.simulation import FREE_RUN_HEAD, Scores, csv_rows
+from compensator.model.free_run import NOTHING, PERSISTENCE, free_runs, in_words, table_of_scores
+from compensator.model.simulation import Scores, csv_rows
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -48,8 +48,8 @@ class ComparisonResult(Paged):
         Hour from which samples were compared.
     samples : int
         Number of samples compared.
-    data : str
-        Names of the data.
+    data : tuple of str
+        Names of the files or tables.
     in_frame : bool
         Whether tables are DataFrames.
     """
@@ -60,7 +60,7 @@ class ComparisonResult(Paged):
     t_h: Vector
     from_h: float
     samples: int
-    data: str = ""
+    data: tuple[str, ...] = ()
     in_frame: bool = False
 
     @property
@@ -88,8 +88,7 @@ class ComparisonResult(Paged):
 
     def contents(self) -> list[str | Table]:
         """Return the content: the verdict, the number of samples, and the errors of each model."""
-        rows = [[name, *row.free_run_cells()] for name, row in self.scores.items()]
-        return [self._verdict(), Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=rows, note=NOTE)]
+        return [self._verdict(), table_of_scores([self.scores])]
 
     def _verdict(self) -> str:
         best = min(self.scores, key=lambda name: self.scores[name].rms_um)
@@ -217,6 +216,6 @@ def compare(
         t_h=runs.t_h,
         from_h=from_h,
         samples=runs.samples,
-        data=", ".join(dict.fromkeys(origin.name for one in measured for origin in one.origins)),
+        data=tuple(origin.name for one in measured for origin in one.origins),
         in_frame=any(one.in_frame for one in measured),
     )

@@ -198,15 +198,16 @@ def diagnose(
     found = find_effects(base, runs, progress=progress, executor_map=executor_map if executor else map)
     extended = as_in_file(found.model, _provenance(base, measured, found))
     models = {BASE: base} if found.model is base else {BASE: base, EXTENDED: extended}
-    free_run = [FreeRunErrors.of(models, measured, SEARCHED)]
+    errors = partial(FreeRunErrors.of, from_rest=found.counts_from_rest)
+    free_run = [errors(models, measured, SEARCHED)]
     if fit_until_h is not None:
-        free_run += [FreeRunErrors.of(models, [one], HELD_OUT, from_h=fit_until_h) for one in whole]
+        free_run += [errors(models, [one], HELD_OUT, from_h=fit_until_h) for one in whole]
     for one in validation:
         absent = [name for name in extended.channels if name not in one.table.columns]
         if absent:
             words = f"{one.label}: the extended model is not validated on it: no column {', '.join(absent)}."
             remarks.append(Remark(DataRemark.NOT_VALIDATED, words))
-        free_run.append(FreeRunErrors.of({BASE: base} if absent else models, [one], HELD_OUT))
+        free_run.append(errors({BASE: base} if absent else models, [one], HELD_OUT))
     shown = tuple(one for one in free_run if one.samples)
     return DiagnosisResult(model=extended, diagnosis=found, remarks=tuple(remarks), free_run=shown)
 

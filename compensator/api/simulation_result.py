@@ -13,8 +13,8 @@ from compensator.arrays import Vector
 from compensator.atomic_write import atomic_write
 from compensator.codes import Remark
 from compensator.display import Shown, Table, Words, text_of_all, warnings_of
-from compensator.model.free_run import NOTE, NOTHING, TITLE, in_words
-from compensator.model.simulation import FREE_RUN_HEAD, SCORE_HEAD, Scores, csv_rows
+from compensator.model.free_run import NOTHING, in_words, table_of_scores
+from compensator.model.simulation import SCORE_HEAD, Scores, csv_rows
 
 if TYPE_CHECKING:
     from compensator.api.plotting import Plot
@@ -80,8 +80,7 @@ class SimulationResult(Shown, Mapping[str, Vector]):
             by_name = {"model": self.scores, NOTHING: self.nothing}
             words = in_words({name: asdict(row) for name, row in by_name.items()}, "model")
             parts.append(f"{words[0].upper()}{words[1:]}.")
-            cells = [[name, *row.free_run_cells()] for name, row in by_name.items()]
-            parts.append(Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=cells, note=NOTE))
+            parts.append(table_of_scores([by_name]))
         elif "y_free_um" in self.table:
             parts.append("No errors: after the first measured Y, which is the zero, none was measured and taken.")
         return [*parts, *warnings_of(self.remarks, "Remarks")]

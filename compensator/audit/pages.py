@@ -31,7 +31,6 @@ from compensator.report.page import (
     Table,
     Tone,
     Words,
-    data_of,
     sentence_of,
 )
 
@@ -71,7 +70,7 @@ def audit_page(found: Audit) -> Page:
         blocks.append(Words(title="Remarks", lines=lines))
     blocks.append(_hashes(found))
     title = f"Audit: {found.machines}{_span(found)}"
-    data = data_of([file.file for file in found.files])
+    data = tuple(file.file for file in found.files)
     return Page(title=title, verdict=verdict(found), blocks=blocks, tone=_tone(found), data=data)
 
 

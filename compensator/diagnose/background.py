@@ -33,6 +33,8 @@ ALIKE = 0.2
 SIZE_SHARE = 0.1
 #: Standard deviation of the logarithm of the mean size about that, and of the sizes of the base's own paths.
 MEAN_FOLDS, PATH_FOLDS = 2.0, 1.0
+#: A column that moves by less than this share of its largest value is one of rounding.
+STILL = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +120,8 @@ class _Problem:
         self.background, self.points = background, points
         table = points.averaged(background.columns)
         self.scale = np.std(table, axis=0)
-        self.scale[self.scale < 1e-12] = np.inf
+        # What is left of a channel that moves only in what is held out says nothing.
+        self.scale[self.scale < np.maximum(STILL * np.max(np.abs(background.columns), axis=0), 1e-12)] = np.inf
         self.table = table / self.scale
         random = np.concatenate([points.zeros, points.starts_of_modes], axis=1)
         self._fixed = random.shape[1]

@@ -12,8 +12,8 @@ from compensator.arrays import Vector
 from compensator.data.runs import Run, noise_std
 from compensator.diagnose.noise import drive_of
 from compensator.diagnose.smoothing import course
-from compensator.model.effects.hypothesis import DEGC, Context
-from compensator.model.effects.signals import RecordSignals
+from compensator.model.effects.hypothesis import COOLEST, DEGC, EQUAL, Context
+from compensator.model.effects.signals import COLD, RecordSignals, Warmth
 from compensator.model.engine import Engine
 from compensator.model.late_observer import observe
 from compensator.model.thermal_model import ThermalModel
@@ -23,6 +23,8 @@ from compensator.model.transfer_function import SampledTransferFunction
 _DISPLACEMENT = "_um"
 #: A channel whose span is less than this many of its noise deviations does not move.
 MOVES = 8.0
+#: A record begins warm if what the machine had at its start is more than this share of the span of the DTF's share.
+WARM_SHARE = 0.05
 
 
 def without_noise(run: Run) -> Run:
@@ -68,6 +70,28 @@ def signals_of(model: ThermalModel, run: Run, number: int = 0, begins_min: float
         number=number,
         begins_min=begins_min,
     )
+
+
+def with_warmths(model: ThermalModel, runs: Sequence[Run], signals: Sequence[RecordSignals]) -> list[RecordSignals]:
+    """Return the signals of runs with what the machine may have had at the start of each.
+
+    T_Q − AT there would be held by a heat whose share of y is known. How the machine became so warm is not, so the
+    initial state of the paths is left out; it dies away.
+    """
+    heat_per_k = 1.0 / model.ttf.sampled.dc_gain if model.ttf else 1.0
+    um_per_k = model.dtf.sampled.dc_gain * heat_per_k
+    starts_k = [run.reference[0] - run.reference[1] for run in runs]
+    least_um = WARM_SHARE * max(float(np.ptp(record.y_dtf_um)) for record in signals)
+
+    def warmth(above_k: float) -> Warmth:
+        warm = Warmth(drive=heat_per_k * above_k, y_dtf_um=um_per_k * above_k)
+        return warm if abs(warm.y_dtf_um) > least_um else COLD
+
+    coolest = min(starts_k)
+    return [
+        dataclasses.replace(record, warmths={COOLEST: warmth(start - coolest), EQUAL: warmth(start)})
+        for start, record in zip(starts_k, signals, strict=True)
+    ]
 
 
 def effects_of(model: ThermalModel, run: Run) -> Vector:
@@ -124,4 +148,5 @@ def context_of(model: ThermalModel, signals: Sequence[RecordSignals]) -> Context
         has_late_t_q=model.late_t_q is not None,
         functions={name: (path.b, path.a) for name, path in paths.items()},
         gains=gains,
+        begins_warm=all(record.warmths.get(EQUAL, COLD) != COLD for record in signals),
     )

@@ -17,15 +17,19 @@ from compensator.codes import ModelWarning, Remark
 from compensator.data.runs import Run
 from compensator.diagnose.advice import advice_of, label
 from compensator.diagnose.chips import without_chips
+from compensator.diagnose.criterion import MARGIN
 from compensator.diagnose.deciding import Deciding, PlannedTest
 from compensator.diagnose.detection_limit import detection_limits
 from compensator.diagnose.evidence import Evidence, evidence_of
 from compensator.diagnose.findings import Findings, findings_of, with_paths
-from compensator.diagnose.fit import Term
+from compensator.diagnose.fit import Term, fit_terms
 from compensator.diagnose.found_effect import FoundEffect, described, rivals_of, seen_of
 from compensator.diagnose.held_out import HeldOut, held_out_of, how_held_out
+from compensator.diagnose.initial_state import with_initial_state
+from compensator.diagnose.likelihood import Likelihood
 from compensator.diagnose.noise import VERDICT_TIMES
 from compensator.diagnose.outcome import FOLDS, Ceiling, Diagnosis, Remainder, Verdict, rms_of, warnings_of
+from compensator.diagnose.points import Points
 from compensator.diagnose.search import Candidate
 from compensator.diagnose.standard_errors import standard_errors, std_factors, time_words, with_time_errors
 from compensator.diagnose.trials import Trials
@@ -69,7 +73,8 @@ def diagnose(
     found, left_out = findings_of(evidence), list[Remark]()
     if evidence.is_sparse:
         found, left_out = without_chips(found, partial(_evidence, model))
-        evidence = found.search.evidence
+    found = _as_begun(found)
+    evidence = found.search.evidence
     deciding = Deciding(Trials(evidence))
     effects = _effects(found, deciding)
     # Paths that were refitted with all effects say nothing beside only some of them.
@@ -97,7 +102,9 @@ def diagnose(
             found, deciding, between_rivals=tests, explained_pct=explained_pct, is_explained=is_explained
         )
     left = evidence.left(evidence.residual, found.whole, at_rest=False)
-    warnings = warnings_of(effects, held_out.nothing, held_out.whole, deployed=deployed, few=few)
+    warnings = warnings_of(
+        effects, held_out.nothing, held_out.whole, deployed=deployed, few=few, start_k=evidence.start_k
+    )
     return Diagnosis(
         verdict="unexplained" if hides or reverses else verdict,
         effects=effects,
@@ -119,6 +126,16 @@ def diagnose(
         advice=advice,
         could_hide=could_hide,
     )
+
+
+def _as_begun(found: Findings) -> Findings:
+    """Search once more with the initial state that the named effects need, where they explain more with it."""
+    fit, score = found.selection.fit, found.search.criterion.score
+    evidence = with_initial_state(fit)
+    if evidence is None or score(fit_terms(Likelihood(Points(evidence), fit.rest), fit.starts())) < score(fit) + MARGIN:
+        return found
+    again = findings_of(evidence)
+    return again if score(again.selection.fit) > score(fit) else found
 
 
 def _worth_deploying(

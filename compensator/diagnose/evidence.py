@@ -20,7 +20,15 @@ from scipy.linalg import block_diag
 
 from compensator.arrays import Mask, Matrix, Vector
 from compensator.data.runs import Run, noise_of
-from compensator.diagnose.base_run import beginnings, context_of, effects_of, late_error_um, signals_of, without_noise
+from compensator.diagnose.base_run import (
+    beginnings,
+    context_of,
+    effects_of,
+    late_error_um,
+    signals_of,
+    with_warmths,
+    without_noise,
+)
 from compensator.diagnose.noise import NoiseTest, noise_floor, own_error
 from compensator.diagnose.nuisances import STATE_PRIOR, basis_of, freedom_of, nuisances_of
 from compensator.errors import DataError
@@ -83,6 +91,12 @@ class Evidence:
     def count(self) -> int:
         """Number of samples used."""
         return self.noise.count
+
+    @property
+    def start_k(self) -> float:
+        """T_Q − AT at the coolest start, K; 0 where no record begins so warm that it matters."""
+        starts = [run.reference[0] - run.reference[1] for run in self.runs]
+        return min(starts) if self.context.begins_warm else 0.0
 
     @property
     def is_sparse(self) -> bool:
@@ -171,11 +185,20 @@ class Evidence:
         """Return the evidence for a base that is far off, whose paths are estimated with everything else."""
         return dataclasses.replace(self, residual=self.deformation_um, free_paths=True)
 
+    def with_initial_state(self, initial_um: Vector) -> Evidence:
+        """Return the evidence with what the initial state of the paths adds on every sample, µm."""
+        parts = np.split(initial_um, np.cumsum([record.size for record in self.signals])[:-1])
+        signals = [dataclasses.replace(own, initial_um=part) for own, part in zip(self.signals, parts, strict=True)]
+        return dataclasses.replace(self, signals=tuple(signals))
+
     def corrected(self, late: Effect) -> tuple[Evidence, Vector]:
         """Return the evidence with a late T_Q corrected as the engine does, and what that adds to y on every sample."""
         model = dataclasses.replace(self.model, effects=(*self.model.effects, late))
         signals = tuple(
-            signals_of(model, run, own.number, own.begins_min) for run, own in zip(self.runs, self.signals, strict=True)
+            dataclasses.replace(
+                signals_of(model, run, own.number, own.begins_min), warmths=own.warmths, initial_um=own.initial_um
+            )
+            for run, own in zip(self.runs, self.signals, strict=True)
         )
         before, after = (
             np.concatenate([r.share("all") + effects_of(m, run) for r, run in zip(rs, self.runs, strict=True)])
@@ -228,6 +251,7 @@ def evidence_of(model: ThermalModel, runs: Sequence[Run]) -> Evidence:
     courses = [without_noise(run) for run in runs]
     begins = beginnings(runs)
     signals = [signals_of(model, run, i, begins[i]) for i, run in enumerate(courses)]
+    signals = with_warmths(model, runs, signals)
     parts = [
         run.y_um - own.y_dtf_um - own.y_tdtf_um - effects_of(model, run)
         for run, own in zip(courses, signals, strict=True)

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import least_squares
 
 from compensator.arrays import Matrix, Vector
 from compensator.diagnose.evidence import Evidence
-from compensator.diagnose.likelihood import Likelihood, learned_rest
+from compensator.diagnose.likelihood import Likelihood, factor_of, learned_rest, solution
 from compensator.diagnose.points import Points, Rest, raw_columns
 from compensator.model.effects import Effect
 from compensator.model.effects.hypothesis import Free, Hypothesis, Place
@@ -91,6 +90,11 @@ class Fit:
     def places(self) -> frozenset[Place]:
         """Kind, path and channel of each effect."""
         return frozenset(term.hypothesis.place for term in self.terms)
+
+    @property
+    def forms(self) -> frozenset[str]:
+        """Place and form of each effect."""
+        return frozenset(term.hypothesis.label for term in self.terms)
 
     def projected(self, likelihood: Likelihood) -> tuple[Matrix, Vector]:
         """Return the columns of the amplitudes, and the data without what has none, as a likelihood projects them."""
@@ -181,7 +185,7 @@ class _Problem:
                 columns.append(part.projected)
         table = np.concatenate(columns, axis=1)
         precision = np.eye(table.shape[1]) + table.T @ table
-        amplitudes = cho_solve(cho_factor(precision, lower=True), table.T @ target) if table.shape[1] else np.zeros(0)
+        amplitudes = solution(factor_of(precision), table.T @ target) if table.shape[1] else np.zeros(0)
         return np.concatenate([target - table @ amplitudes, -amplitudes]), amplitudes, precision
 
     def fun(self, x: Vector) -> Vector:

@@ -17,7 +17,7 @@ import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.optimize import minimize
 
 from compensator.arrays import Matrix, Vector
@@ -54,12 +54,12 @@ class RandomColumns:
         self._columns, self._target, self._log_det = columns, target, log_det
         moment = columns.T @ target
         self._factor = factored(columns.T @ columns)
-        self.mean = cho_solve(self._factor, moment, check_finite=False)
+        self.mean = solution(self._factor, moment)
         self.surprise = 0.5 * float(target @ target - moment @ self.mean + log_det + log_det_of(self._factor))
 
     def surplus(self, count: int) -> Vector:
         """Return the slope of the log evidence by the logarithm of the size of each of the first columns."""
-        known = np.diag(cho_solve(self._factor, np.eye(self.mean.size)[:, :count], check_finite=False))
+        known = np.diag(solution(self._factor, np.eye(self.mean.size)[:, :count]))
         return np.asarray(self.mean[:count] ** 2 + known - 1.0)
 
     def slopes(self, moved: Iterable[tuple[Matrix, Vector, float]], step: float) -> Vector:
@@ -73,7 +73,7 @@ class RandomColumns:
             The step.
         """
         left = self._target - self._columns @ self.mean
-        spread = cho_solve(self._factor, self._columns.T, check_finite=False).T
+        spread = solution(self._factor, self._columns.T).T
         found = []
         for columns, target, log_det in moved:
             change = columns - self._columns
@@ -113,10 +113,14 @@ class Likelihood:
         """Return what effects that add so much to the points leave of the target."""
         return self.target - self.projected(added[:, None])[:, 0]
 
+    def weights(self, added: Vector) -> Vector:
+        """Return the most probable weights of `Points.random` beside effects that add so much to the points."""
+        return -self.left_by(added)[self.points.count :]
+
     def projected(self, table: Matrix) -> Matrix:
         """Return averaged columns without noise correlation, nuisances and own error."""
         white = self._whitening.of(table)
-        weights = cho_solve(self._factor, self._random.T @ white)
+        weights = solution(self._factor, self._random.T @ white)
         return np.concatenate([white - self._random @ weights, -weights])
 
     def whitened(self, table: Matrix) -> tuple[Matrix, Matrix]:
@@ -126,8 +130,7 @@ class Likelihood:
         cheaper than to project them.
         """
         white = self._whitening.of(table)
-        factor, lower = self._factor
-        taken = solve_triangular(factor, self._random.T @ white, lower=lower, check_finite=False)
+        taken, _ = dtrtrs(self._factor, self._random.T @ white, lower=1)
         return white, np.asarray(taken)
 
 
@@ -186,13 +189,37 @@ def dense(likelihood: Likelihood) -> Matrix:
     return likelihood.projected(np.eye(likelihood.points.count))
 
 
-def factored(gram: Matrix) -> tuple[Matrix, bool]:
-    """Return the Cholesky factor of a Gram matrix and the unit matrix, which rounding must not take away."""
+def factored(gram: Matrix) -> Matrix:
+    """Return the Cholesky factor of a Gram matrix and the unit matrix, which rounding must not take away.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If it is not positive definite.
+    """
     unit = 1.0 + 1e-12 * float(np.trace(gram))
-    matrix, lower = cho_factor(gram + unit * np.eye(gram.shape[0]), lower=True, check_finite=False)
-    return np.asarray(matrix), bool(lower)
+    return factor_of(gram + unit * np.eye(gram.shape[0]))
 
 
-def log_det_of(factor: tuple[Matrix, bool]) -> float:
+def factor_of(matrix: Matrix) -> Matrix:
+    """Return the lower Cholesky factor of a matrix: LAPACK by itself, the checks around it cost more than it.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If it is not positive definite.
+    """
+    factor, info = dpotrf(matrix, lower=1)
+    if info:
+        raise np.linalg.LinAlgError(f"not positive definite at {info}")
+    return np.asarray(factor)
+
+
+def solution(factor: Matrix, right: Matrix | Vector) -> Matrix:
+    """Return the solution of equations by the Cholesky factor of their matrix."""
+    return np.asarray(dpotrs(factor, right, lower=1)[0]) if right.size else np.zeros(right.shape)
+
+
+def log_det_of(factor: Matrix) -> float:
     """Return the logarithm of the determinant of a matrix from its Cholesky factor."""
-    return 2.0 * float(np.log(np.diag(factor[0])).sum())
+    return 2.0 * float(np.log(np.diag(factor)).sum())

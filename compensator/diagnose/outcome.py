@@ -15,6 +15,7 @@ from compensator.diagnose.advice import Advice
 from compensator.diagnose.detection_limit import DetectionLimits
 from compensator.diagnose.evidence import Evidence
 from compensator.diagnose.found_effect import FoundEffect
+from compensator.model.effects.hypothesis import EQUAL
 from compensator.model.simulation import Scores, scores
 from compensator.model.thermal_model import ThermalModel
 
@@ -150,6 +151,11 @@ class Diagnosis:
         """What the sensors' noise alone makes of the residual, µm."""
         return self.evidence.noise.noise_um
 
+    @property
+    def counts_from_rest(self) -> bool:
+        """Whether an effect counts from where T_Q is AT, because the data begin warm."""
+        return any(effect.term.hypothesis.rest == EQUAL for effect in self.effects)
+
     def deploys(self, effect: FoundEffect) -> bool:
         """Return whether the extended model has an effect."""
         # There it also has what the data leave open of all parameters together.
@@ -168,7 +174,13 @@ def rms_of(values: Vector) -> float:
 
 
 def warnings_of(
-    effects: Sequence[FoundEffect], before: Vector, after: Vector, *, deployed: bool, few: bool = False
+    effects: Sequence[FoundEffect],
+    before: Vector,
+    after: Vector,
+    *,
+    deployed: bool,
+    few: bool = False,
+    start_k: float = 0.0,
 ) -> tuple[Remark, ...]:
     """Return what to know before relying on the effects that were found.
 
@@ -182,6 +194,8 @@ def warnings_of(
         Whether the extended model has any.
     few : bool
         Whether Y was measured now and then, so that held-out blocks do not decide what is deployed.
+    start_k : float
+        T_Q − AT at the coolest start, K, where that is not at rest as far as T_Q shows; 0 where it is.
     """
     warnings = []
     rms_before, rms_after = rms_of(before), rms_of(after)
@@ -196,6 +210,17 @@ def warnings_of(
     for effect in effects:
         kind, named = effect.place[0], effect.named
         loose = [name for name, std in effect.std.items() if std > abs(named[name]) > 0.0]
+        if start_k and effect.term.effect.counts_from_rest and effect.place[1] == "DTF":
+            text = (
+                f"{kind}: the record begins with T_Q − AT at {start_k:.1f} K; the effect counts from its start, as if "
+                "the machine were at rest there. On a run that begins cooler it is wrong."
+            )
+            if effect.term.hypothesis.rest == EQUAL:
+                text = (
+                    f"{kind}: the record begins with T_Q − AT at {start_k:.1f} K; the effect counts from {EQUAL}, "
+                    "where the machine is taken to be at rest. The free runs here begin as warm as their data."
+                )
+            warnings.append(Remark(ModelWarning.WARM_START, text))
         if effect.reverses_path:
             text = f"{kind}: Y moves against the {effect.place[1]}, so the model was left unchanged."
             warnings.append(Remark(ModelWarning.PATH_REVERSED, text))

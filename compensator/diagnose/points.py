@@ -7,6 +7,7 @@ its own.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -105,6 +106,8 @@ class Points:
         First point of each run that has any.
     period_min : float
         Time between two points, min; where Y was measured now and then the median.
+    alike : list of (int, int)
+        Stretches of points with one noise and one time to the next, from the first to behind the last.
     relative_variance : numpy.ndarray, shape (points,)
         Variance of the noise of each point, relative to a full one.
     is_exact : bool
@@ -113,6 +116,8 @@ class Points:
         Standard deviation of the deformation, and the own error of the base's paths, µm.
     typical_logs : numpy.ndarray, shape (5,)
         `Rest.logs` as it is expected before the data are seen.
+    is_zero : numpy.ndarray of bool
+        Which columns of the nuisances are zeros of runs.
     zeros, starts_of_modes, fast, slow : numpy.ndarray, shape (points, ·)
         Columns of the zeros and initial states of runs, and of the fast and slow error of the base's paths.
     """
@@ -137,6 +142,7 @@ class Points:
             self.period_min = max(self.period_min, float(np.median(minutes[:-1])))
         self._lengths = np.unique(minutes, return_inverse=True)
         self.relative_variance = stride / counts[kept]
+        self.alike = self._alike()
         self._mean = _means(used, first, kept)
         self.residual = self.averaged(evidence.residual[:, None])[:, 0]
         self.spread_um = max(evidence.spread_um, 1e-9)
@@ -146,8 +152,9 @@ class Points:
         self._forms: dict[str, Matrix] = {}
         self._known: dict[tuple[Hypothesis, tuple[float, ...]], Matrix] = {}
         nuisances = self.averaged(evidence.nuisances)
-        is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
-        self.zeros, self.starts_of_modes = ZERO_TIMES * self.spread_um * nuisances[:, is_zero], nuisances[:, ~is_zero]
+        self.is_zero = np.arange(nuisances.shape[1]) % (nuisances.shape[1] // len(evidence.signals)) == 0
+        self.zeros = ZERO_TIMES * self.spread_um * nuisances[:, self.is_zero]
+        self.starts_of_modes = nuisances[:, ~self.is_zero]
 
     def _own_um(self) -> float:
         evidence = self.evidence
@@ -163,6 +170,14 @@ class Points:
             noise_um = math.hypot(noise_um, self.own_um)
         slow_um = SLOW_SHARE * self.spread_um if self.evidence.free_paths else self.own_um
         return np.log([max(noise_um, 1e-3), slow_um, REST_MIN, START_SHARE * self.spread_um, self.own_um])
+
+    def _alike(self) -> list[tuple[int, int]]:
+        """Return stretches of points with one noise and one time to the next; the last of a run is by itself."""
+        what = np.column_stack([self.relative_variance, self._lengths[1]])
+        new = np.any(np.diff(what, axis=0) != 0.0, axis=1)
+        last = self.starts[1:] - 1
+        edges = np.unique(np.concatenate([[0], np.flatnonzero(new) + 1, last, last + 1, [self.count]]))
+        return list(itertools.pairwise(edges.tolist()))
 
     def decays(self, tau_min: float) -> Vector:
         """Return what is left of a slow process from each point to the next, shape (points,)."""

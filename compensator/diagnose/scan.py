@@ -90,11 +90,11 @@ class Scan:
             What a hypothesis costs before the data are seen.
         """
         likelihood = Likelihood(self._points, rest)
-        gains = self._gains(likelihood, fit)
+        gains, taken = self._gains(likelihood, fit), fit.places
         best: dict[int, tuple[float, Start]] = {}
         for (hypothesis, values), gain in zip(self._starts, gains.tolist(), strict=True):
             known = best.get(id(hypothesis))
-            if hypothesis.place not in fit.places and (known is None or gain > known[0]):
+            if (known is None or gain > known[0]) and hypothesis.place not in taken:
                 best[id(hypothesis)] = (gain, (hypothesis, values))
         ranking = sorted(best.values(), key=lambda item: cost(item[1][0]) - item[0])
         return [start for _, start in ranking]

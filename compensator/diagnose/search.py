@@ -225,7 +225,7 @@ class Search:
         for i in range(min(len(fit.terms), len(fit.terms) - 1 if count is None else count)):
             others = fit_terms(fit.likelihood, fit.starts(i), evaluations=1)
             proposed = self._proposed(others, unobserved=False)
-            forms = [one for one in proposed if one.places == fit.places and not _has_forms_of(one, fit)]
+            forms = [one for one in proposed if one.places == fit.places and one.forms != fit.forms]
             for candidate in (*forms[:1], *[one for one in proposed[:2] if one.places != fit.places]):
                 better = settled(candidate)
                 fit = better if self.criterion.score(better) > self.criterion.score(fit) else fit
@@ -282,11 +282,6 @@ class Search:
                 other = fit_terms(fit.likelihood, [*kept, (hypothesis, values)], evaluations=6)
                 found[hypothesis.place] = Candidate(term=other.terms[-1], fit=other, rms_um=self.criterion.rms(other))
         return tuple(sorted(found.values(), key=lambda item: item.rms_um))
-
-
-def _has_forms_of(one: Fit, other: Fit) -> bool:
-    """Return whether two fits have the same hypotheses, in whatever order."""
-    return {id(term.hypothesis) for term in one.terms} == {id(term.hypothesis) for term in other.terms}
 
 
 def _above(hypothesis: Hypothesis, shortest_min: float) -> Hypothesis:

@@ -30,10 +30,16 @@ class Whitening:
         # What is left of a slow process from each point to the next; nothing from run to run.
         phis = points.decays(rest.tau_min)
         phis[points.starts[1:] - 1] = 0.0
-        predicted, p = [], stationary
-        for noise, kept in zip(points.relative_variance.tolist(), (phis**2).tolist(), strict=True):
-            predicted.append(p)
-            p = stationary + kept * (p * noise / (p + noise) - stationary)
+        decays, p = phis**2, stationary
+        predicted: list[float] = []
+        for first, end in points.alike:
+            noise, kept = float(points.relative_variance[first]), float(decays[first])
+            for i in range(first, end):
+                predicted.append(p)
+                before, p = p, stationary + kept * (p * noise / (p + noise) - stationary)
+                if p == before:  # it stays there, to the last bit
+                    predicted += [p] * (end - i - 1)
+                    break
         variances = np.array(predicted) + points.relative_variance
         gains = np.array(predicted) / variances
         self._into = (phis * gains)[:-1, None]

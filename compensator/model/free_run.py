@@ -26,6 +26,14 @@ NOTE = (
     "Free run: from the first sample, at rest; measured Y counts from its first value, as in the service. About the "
     "mean: without the residual's mean. Persistence: the last Y measured before the samples is held."
 )
+#: Added where most of an error about the zero is one constant: it is this many times the error about the mean, and this
+#: share of the deformation's spread.
+CONSTANT = (
+    "Where the error about the zero is much larger than about the mean, most of it is one constant: the data begin on "
+    "a machine that is not at rest, or their first Y is wrong. Judge the model by data that begin at rest, or by the "
+    "error about the mean."
+)
+CONSTANT_TIMES, CONSTANT_SHARE = 2.0, 0.05
 
 
 class Measured(Protocol):
@@ -82,6 +90,7 @@ def free_runs(
     *,
     from_h: float = 0.0,
     until_h: float = np.inf,
+    from_rest: bool = False,
 ) -> FreeRuns:
     """Run models over data and compare them on the samples that all of them predict.
 
@@ -93,6 +102,8 @@ def free_runs(
         With T_Q, AT and Y.
     from_h, until_h : float
         Hours of each of the data between which samples are compared; the models run from its start.
+    from_rest : bool
+        How each run begins, as `simulate` has it.
 
     Raises
     ------
@@ -108,7 +119,9 @@ def free_runs(
             require(one.name, record, ("t_q_degc", "at_degc", "y_um"))
             for model in models.values():
                 require_channels(model, record, one.name)
-            runs = {name: simulate(model, record, source=one.name) for name, model in models.items()}
+            runs = {
+                name: simulate(model, record, source=one.name, from_rest=from_rest) for name, model in models.items()
+            }
             residuals = {name: run["residual_um"] for name, run in runs.items()}
             y = next(iter(runs.values()))["y_um"]
             known = np.all([np.isfinite(values) for values in (y, *residuals.values())], axis=0)
@@ -160,9 +173,10 @@ class FreeRunErrors:
         *,
         from_h: float = 0.0,
         until_h: float = np.inf,
+        from_rest: bool = False,
     ) -> FreeRunErrors:
         """Return the errors on data; see `free_runs`."""
-        runs = free_runs(models, data, from_h=from_h, until_h=until_h)
+        runs = free_runs(models, data, from_h=from_h, until_h=until_h, from_rest=from_rest)
         labels = ", ".join(dict.fromkeys(one.label for one in data))
         if from_h:
             labels += f" from {from_h:g} h on"
@@ -178,12 +192,33 @@ class FreeRunErrors:
 
 def table_of(rows: Sequence[FreeRunErrors]) -> Table:
     """Return the errors as a table, the same on every page and in every command."""
+    return table_of_scores([one.scores for one in rows], [f"{one.name} ({one.role})" for one in rows])
+
+
+def table_of_scores(scores: Sequence[Mapping[str, Scores]], names: Sequence[str] = ("",)) -> Table:
+    """Return the errors of models on one or several data as a table.
+
+    Parameters
+    ----------
+    scores : sequence of mapping of str to Scores
+        For each of the data, errors by the name of the model.
+    names : sequence of str
+        Of the data; a single one is not shown.
+    """
     lines: list[list[str]] = []
-    for one in rows:
-        if len(rows) > 1:
-            lines.append([f"{one.name} ({one.role})", *[""] * len(FREE_RUN_HEAD)])
-        lines += [[name, *row.free_run_cells()] for name, row in one.scores.items()]
-    return Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=lines, note=NOTE)
+    for name, by_model in zip(names, scores, strict=True):
+        if len(scores) > 1:
+            lines.append([name, *[""] * len(FREE_RUN_HEAD)])
+        lines += [[model, *row.free_run_cells()] for model, row in by_model.items()]
+    note = f"{NOTE} {CONSTANT}" if any(map(_is_constant, scores)) else NOTE
+    return Table(title=TITLE, head=["", *FREE_RUN_HEAD], rows=lines, note=note)
+
+
+def _is_constant(scores: Mapping[str, Scores]) -> bool:
+    """Whether most of the error of a model is one constant that matters beside the deformation."""
+    least_um = CONSTANT_SHARE * scores[NOTHING].rms_about_mean_um
+    models = [row for name, row in scores.items() if name not in (NOTHING, PERSISTENCE)]
+    return any(row.rms_um > max(CONSTANT_TIMES * row.rms_about_mean_um, least_um) for row in models)
 
 
 def in_words(scores: Mapping[str, Any], model: str) -> str:

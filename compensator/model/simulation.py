@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,9 @@ from compensator.data.record import SampledRecord, require
 from compensator.errors import DataError
 from compensator.model.engine import Engine, Estimate
 from compensator.model.thermal_model import ThermalModel
+
+#: A machine that is warmed for a time constant does not change any more after this many of them.
+SETTLED = 8
 
 #: Columns of a free run in the order of its CSV.
 COLUMNS = ("t_s", "heat_w", "y_pred_um", "residual_um", "y_um", "y_dtf_um", "y_tdtf_um", "y_std_um")
@@ -64,7 +67,9 @@ def require_channels(model: ThermalModel, record: SampledRecord, name: str) -> N
     require(name, record, model.channels, why=f", which an effect of model {model.name} needs")
 
 
-def simulate(model: ThermalModel, record: SampledRecord, *, source: str = "") -> dict[str, Vector]:
+def simulate(
+    model: ThermalModel, record: SampledRecord, *, source: str = "", from_rest: bool = False
+) -> dict[str, Vector]:
     """Run a model over a record.
 
     The first sample with both temperatures is the reference; measured deformation counts from its first value.
@@ -77,6 +82,9 @@ def simulate(model: ThermalModel, record: SampledRecord, *, source: str = "") ->
         Needs `t_q_degc` and `at_degc`.
     source : str
         Name of the data, for the message.
+    from_rest : bool
+        Whether the machine was warmed from rest, with T_Q = AT, until nothing changed at the first sample's
+        temperatures, for effects that count from rest. Otherwise that sample is at rest.
 
     Returns
     -------
@@ -89,10 +97,11 @@ def simulate(model: ThermalModel, record: SampledRecord, *, source: str = "") ->
         If no sample has both temperatures.
     """
     engine, first = engine_at_start(model, record, source)
-    t_q, at = record.columns["t_q_degc"], record.columns["at_degc"]
-    names = [name for name in engine.channels if name in record.columns]
-    estimates = engine.run(t_q[first:], at[first:], {name: record.columns[name][first:] for name in names})
-    result = {"t_s": record.t_s} | columns_of(estimates, first)
+    t_q, at = record.columns["t_q_degc"][first:], record.columns["at_degc"][first:]
+    channels = {name: record.columns[name][first:] for name in engine.channels if name in record.columns}
+    at_start_um = _warmed(engine, t_q[0], at[0], {name: u[0] for name, u in channels.items()}) if from_rest else 0.0
+    result = {"t_s": record.t_s} | columns_of(engine.run(t_q, at, channels), first)
+    result["y_pred_um"] -= at_start_um
     if "y_um" in record.columns:
         result |= _residual(record.columns["y_um"], result["y_pred_um"])
     return result
@@ -114,6 +123,20 @@ def engine_at_start(model: ThermalModel, record: SampledRecord, source: str = ""
     engine = Engine(model)
     engine.set_reference(float(t_q[first]), float(at[first]))
     return engine, first
+
+
+def _warmed(engine: Engine, t_q_degc: float, at_degc: float, channels: Mapping[str, float]) -> float:
+    """Warm a machine from rest until nothing changes, and return y there, µm."""
+    engine.set_reference(at_degc, at_degc)
+    model = engine.model
+    paths = [path for path in (model.ttf, model.dtf, model.tdtf) if path is not None]
+    taus = [tau for path in paths for tau in path.sampled.time_constants_min()]
+    slowest = max([*taus, *(tau for effect in model.effects for tau in effect.time_constants_min)])
+    samples = math.ceil(60.0 * slowest / model.period_s)
+    share = np.minimum(np.arange(SETTLED * samples) / samples, 1.0)
+    still = {name: np.full(share.size, value) for name, value in channels.items()}
+    air = np.full(share.size, at_degc)
+    return engine.run(air + share * (t_q_degc - at_degc), air, still)[-1].y_um
 
 
 def columns_of(estimates: Sequence[Estimate], first: int) -> dict[str, Vector]:

@@ -38,6 +38,7 @@ from compensator.report.page import (
     Table,
     Tone,
     Words,
+    files_of,
     warnings_of,
 )
 
@@ -96,8 +97,7 @@ def page_of(
     blocks.append(_details(time, diagnosis, model, remarks))
     title = f"Diagnosis: what {model.name} lacks"
     sources = model.provenance.get("diagnosis", {}).get("data", [])
-    data = ", ".join(str(one.get("file") or one["table"]) for one in sources)
-    return Page(title=title, verdict=headline(found), blocks=blocks, tone=tone_of(found), data=data)
+    return Page(title=title, verdict=headline(found), blocks=blocks, tone=tone_of(found), data=files_of(sources))
 
 
 def _picture(time: TimeAxis, diagnosis: Diagnosis) -> Figure:

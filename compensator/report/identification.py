@@ -39,6 +39,7 @@ from compensator.report.page import (
     Table,
     Tone,
     Words,
+    files_of,
     warnings_of,
 )
 
@@ -77,9 +78,12 @@ def page_of(
     blocks.append(Section(title="Residual analysis", blocks=[_correlations(view) for view in criticism.residuals]))
     blocks.append(_choice(calibration))
     blocks.append(_provenance(calibration, model))
-    data = ", ".join(str(entry.get("file") or entry["table"]) for entry in model.provenance.get("data", []))
     return Page(
-        title=f"Calibration: {model.name}", verdict=verdict(errors), blocks=blocks, tone=tone_of(errors), data=data
+        title=f"Calibration: {model.name}",
+        verdict=verdict(errors),
+        blocks=blocks,
+        tone=tone_of(errors),
+        data=files_of(model.provenance.get("data", [])),
     )
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from importlib import resources
 from itertools import chain, count, repeat
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from compensator import __version__
 from compensator.atomic_write import atomic_write
@@ -32,6 +32,8 @@ _NARROW_IN = 4.8
 #: Longest cell on one line, and longest unbroken word (a file name, a hash), characters.
 _LONGEST_CELL, _LONGEST_WORD = 36, 24
 TONE_WORDS: Mapping[Tone, str] = {"good": "✓ Passed", "warn": "⚠ Caution", "bad": "✗ Failed"}
+#: Most names of files in the last line of a page; of more, the first and the last.
+MOST_NAMES = 3
 #: A command in a text, shown as the code that it is.
 _COMMAND = re.compile(r"`([^`]+)`")
 #: A page needs inline styles only, and the script by its hash.
@@ -76,15 +78,15 @@ class Page:
         The content, in order.
     tone : {"good", "warn", "bad"} or None
         Shown with the verdict as a sign, a word and a colour.
-    data : str
-        Names of the data that it is made from, for its last line.
+    data : sequence of str
+        Names of the files or tables that it is made from, for its last line.
     """
 
     title: str
     verdict: str
     blocks: Sequence[Block] = field(default_factory=tuple)
     tone: Tone | None = "good"
-    data: str = ""
+    data: Sequence[str] = ()
 
 
 def html_of(page: Page, *, date: str = "", can_zoom: bool = True) -> str:
@@ -116,20 +118,28 @@ def html_of(page: Page, *, date: str = "", can_zoom: bool = True) -> str:
     )
 
 
-def data_of(files: Sequence[str]) -> str:
-    """Return the names of several files for the last line of a page: the first and the last.
+def files_of(provenance: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return the names of files, or of tables in memory, that a model states as its data."""
+    return tuple(str(one.get("file") or one["table"]) for one in provenance)
+
+
+def _names(files: Sequence[str]) -> str:
+    """Return the names of files, each once; of many the first and the last.
 
     Examples
     --------
-    >>> data_of(["monday.mcap", "tuesday.mcap", "friday.mcap"])
-    'monday.mcap to friday.mcap (3 files)'
+    >>> _names(["a.csv", "b.csv", "a.csv"])
+    'a.csv, b.csv'
+    >>> _names(["monday.mcap", "tuesday.mcap", "wednesday.mcap", "friday.mcap"])
+    'monday.mcap to friday.mcap (4 files)'
     """
-    return f"{files[0]} to {files[-1]} ({len(files)} files)" if len(files) > 1 else "".join(files)
+    names = list(dict.fromkeys(files))
+    return f"{names[0]} to {names[-1]} ({len(names)} files)" if len(names) > MOST_NAMES else ", ".join(names)
 
 
 def _origin(page: Page, date: str) -> str:
     """Return the last line: version, date, data."""
-    parts = [f"quill-compensator {__version__}", date, f"data: {page.data}" if page.data else ""]
+    parts = [f"quill-compensator {__version__}", date, f"data: {_names(page.data)}" if page.data else ""]
     return f'<p class="note">{html.escape(", ".join(filter(None, parts)))}.</p>'
 
 

@@ -40,7 +40,6 @@ from compensator.report.page import (
     Table,
     Tone,
     Words,
-    data_of,
     warnings_of,
 )
 from compensator.report.story import figures_of, in_words, story_section
@@ -108,7 +107,7 @@ def page_of(history: History) -> Page:
         verdict=verdict(history),
         blocks=blocks,
         tone=_tone(history),
-        data=data_of([file.name for file in history.files]),
+        data=tuple(file.name for file in history.files),
     )
 
 

@@ -26,6 +26,7 @@ from tests.bench import (
     shop,
     speed,
     spindle,
+    warm,
 )
 from tests.bench.figures import surroundings, table
 
@@ -40,6 +41,7 @@ AREAS = {
     "probe_naming": probe_naming.report,
     "spindle": spindle.report,
     "hidden": hidden.report,
+    "warm": warm.report,
     "probes": probes.report,
     "faults": faults.report,
     "sensor_faults": sensor_faults.report,

@@ -18,7 +18,7 @@ from tests.bench.figures import Figure, rows, told
 
 FILE = Path(__file__).resolve().parents[3] / "shared/data/measured-spindle/spindle-15s.csv"
 #: Hours of the fit, hours that judge.
-SPLITS = (((0, 16), (16, 32)), ((0, 20), (20, 32)), ((0, 24), (24, 32)), ((0, 28), (28, 32)))
+SPLITS = (((0, 12), (12, 32)), ((0, 16), (16, 32)), ((0, 20), (20, 32)), ((0, 24), (24, 32)), ((0, 28), (28, 32)))
 ROWS_PER_H = 240
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from compensator.diagnose import diagnosis, held_out
 from compensator.diagnose.background import Background
 from compensator.diagnose.diagnosis import diagnose
+from compensator.diagnose.evidence import evidence_of
 from compensator.diagnose.findings import findings_of
 from compensator.diagnose.summary import figures, verdict
 from compensator.model.model_file import load_model
@@ -70,3 +71,11 @@ def test_what_only_the_blocks_named_is_no_error_after(monkeypatch):
     table = figures(diagnose(QUILL, day()))
     assert table["effects"] == [] and table["remainder"] is None
     assert table["after"] == table["before"]
+
+
+def test_a_channel_that_moves_only_in_what_is_held_out_predicts_nothing_there():
+    columns, _, _ = record([], 1400, 12.0)
+    columns["fan_rpm"] = np.where(np.arange(720) < 75, 3000.0, 0.0)
+    evidence = evidence_of(QUILL, runs_from(columns))
+    found = findings_of(evidence.without(next(evidence.blocks(3))))
+    assert np.ptp(found.ceiling) < 1.0

@@ -63,7 +63,7 @@ def test_time_is_counted_once_and_wholly(history: History) -> None:
 
 def test_its_last_line_names_the_recordings(folder: Path, text: str) -> None:
     names = [path.name for path in sorted(folder.glob("*.mcap"))]
-    assert len(names) == 2 and f"data: {names[0]} to {names[1]} (2 files)." in text
+    assert len(names) == 2 and f"data: {names[0]}, {names[1]}." in text
 
 
 def test_what_was_lost_is_no_value_and_is_counted(history: History) -> None:

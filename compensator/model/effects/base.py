@@ -114,6 +114,8 @@ class Effect:
     starts_anywhere: ClassVar[bool] = False
     #: Whether it acts before all of its channels were seen, each from when it is.
     acts_in_part: ClassVar[bool] = False
+    #: Whether it is another on a machine that is warm: a record that begins warm must say how warm.
+    counts_from_rest: ClassVar[bool] = False
     #: Whether its linear parameters are those of a filter bank that may have any form, so that they may cancel.
     has_any_form: ClassVar[bool] = False
 

@@ -22,6 +22,8 @@ from compensator.model.effects.signals import RecordSignals
 
 #: Lags in a filter bank, and the longest of them, min.
 BANK, BANK_LONGEST_MIN = 6, 600.0
+#: Where a machine may be at rest: at the coolest start of all records, or where T_Q is AT.
+RESTS = COOLEST, EQUAL = "coolest start", "T_Q = AT"
 #: End of the names of channels in °C, whose zero is arbitrary: the square of such a value means nothing.
 DEGC = "_degc"
 
@@ -77,6 +79,8 @@ class Hypothesis:
         Path that the diagnosis names, where it is not the effect's own.
     ordered : bool
         Whether the searched parameters are interchangeable, so that only ascending ones are tried.
+    rest : str
+        Where the machine is at rest, of the `RESTS`, for an effect that counts from there.
     """
 
     effect: Effect
@@ -86,6 +90,7 @@ class Hypothesis:
     sizes: tuple[float, ...] = ()
     path: str = ""
     ordered: bool = False
+    rest: str = COOLEST
 
     @property
     def place(self) -> Place:
@@ -119,7 +124,11 @@ class Hypothesis:
     def columns(self, record: RecordSignals, values: Sequence[float]) -> Matrix:
         """Return one column for each amplitude over a record, shape (n, ·), µm; without amplitudes the fixed part."""
         effect = self.with_values(values)
-        return effect.columns(record, effect.blocks(record.period_min))
+        blocks = effect.blocks(record.period_min)
+        if not effect.counts_from_rest or (warm := record.begun(self.rest)).begins_at_rest:
+            return effect.columns(record, blocks)
+        # Y counts from the start of the record, too: what the effect had there is in its zero and initial state.
+        return np.asarray(effect.columns(warm, blocks) - effect.columns(warm.held(), blocks))
 
     def named(self, values: Sequence[float], amplitudes: Sequence[float]) -> dict[str, float]:
         """Return every parameter by the name and unit that people read."""
@@ -159,6 +168,8 @@ class Context:
         filter banks are then proposed in addition to the exact forms.
     has_late_t_q : bool
         Whether the model corrects a late T_Q already.
+    begins_warm : bool
+        Whether even the coolest start has a T_Q that is not AT.
     """
 
     has_ambient: bool
@@ -174,6 +185,7 @@ class Context:
     gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     approximate: bool = False
     has_late_t_q: bool = False
+    begins_warm: bool = False
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -227,7 +239,12 @@ def proposes(proposer: Proposer) -> Proposer:
 def proposals(context: Context, *, background: bool = False) -> list[Hypothesis]:
     """Return every hypothesis of every kind for this data: the background ones, or all others."""
     forms()
-    return [h for propose in _PROPOSERS for h in propose(context) if h.effect.background == background]
+    found = [h for propose in _PROPOSERS for h in propose(context) if h.effect.background == background]
+    if not context.begins_warm:
+        return found
+    # Couples may differ at rest, or the machine was at work: the data say which.
+    warm = [h for h in found if h.effect.counts_from_rest and h.effect.path == "DTF"]
+    return found + [dataclasses.replace(h, rest=EQUAL, form=f"{h.form}, warm start") for h in warm]
 
 
 def numbered(name: str, count: int) -> tuple[str, ...]:

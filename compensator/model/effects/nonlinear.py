@@ -26,13 +26,14 @@ class Nonlinear(Effect):
     """A curve of the path's share."""
 
     kind = "nonlinear"
+    counts_from_rest = True
     linear = ("change",)
     path: str = text("DTF", "TDTF")
     form: str = text(*FORMS)
     change: float = number()
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        share = signals.share(self.path)
+        share = signals.share_from_rest(self.path)
         part = share / 100.0
         if self.form == "cube":
             return self.change * (share * part * part)
@@ -58,7 +59,7 @@ class NonlinearDrive(Nonlinear):
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        drive = signals.source(self.path)
+        drive = signals.source_from_rest(self.path)
         return self.change * run[0](drive * abs(drive) / 100.0)
 
 

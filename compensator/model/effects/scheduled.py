@@ -33,6 +33,7 @@ class Scheduled(Effect):
     """Base of all forms: the channel as a share of its span."""
 
     kind = "scheduled"
+    counts_from_rest = True
     linear: ClassVar[tuple[str, ...]] = ("change",)
     #: What of the path changes, in words.
     what: ClassVar[str] = "gain"
@@ -70,7 +71,7 @@ class ShareScheduled(Scheduled):
     change: float = number()
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        return self.change * self.scale(signals, run) * signals.share(self.path)
+        return self.change * self.scale(signals, run) * signals.share_from_rest(self.path)
 
 
 @register
@@ -86,7 +87,7 @@ class DriveScheduled(Scheduled):
         return (Function(SampledTransferFunction(b=self.b, a=self.a, period_s=60.0 * period_min)),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        return self.change * run[1](self.scale(signals, run) * signals.source(self.path))
+        return self.change * run[1](self.scale(signals, run) * signals.source_from_rest(self.path))
 
 
 @register
@@ -102,7 +103,7 @@ class SpeedScheduled(Scheduled):
         return (Lag(self.tau_min, period_min),)
 
     def law(self, signals: Signals[S], run: Sequence[Run[S]]) -> S:
-        share = signals.share(self.path)
+        share = signals.share_from_rest(self.path)
         return self.change * self.scale(signals, run) * (run[1](share) - share)
 
 
@@ -129,7 +130,7 @@ class BankScheduled(BankEffect, Scheduled):
 
     def inputs(self, signals: Signals[S], run: Sequence[Run[S]]) -> tuple[S, ...]:
         c = self.scale(signals, run)
-        return c * signals.source(self.path), c * signals.share(self.path)
+        return c * signals.source_from_rest(self.path), c * signals.share_from_rest(self.path)
 
     def named(self, given: dict[str, float]) -> dict[str, float]:
         """Return the change of the gain at rest over the channel's span, as a share of it."""

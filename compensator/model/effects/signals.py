@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Generic
@@ -44,6 +45,33 @@ class Signals(Generic[S]):
         """Return what drives a path: heat, W (or T_Q − AT, K), or the change of the ambient, K."""
         return self.ambient_k if path == "TDTF" else self.drive
 
+    def share_from_rest(self, path: str) -> S:
+        """Return the share of a path counted from where the machine is at rest: where the service has its zero."""
+        return self.share(path)
+
+    def source_from_rest(self, path: str) -> S:
+        """Return what drives a path, counted from where the machine is at rest."""
+        return self.source(path)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Warmth:
+    """What a machine that is not at rest has at the start of a record.
+
+    Parameters
+    ----------
+    drive : float
+        Heat that would hold its T_Q − AT, W (T_Q − AT itself, K, in a direct model).
+    y_dtf_um : float
+        Share of the DTF that this heat has in the end, µm.
+    """
+
+    drive: float = 0.0
+    y_dtf_um: float = 0.0
+
+
+COLD = Warmth()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordSignals(Signals[Vector]):
@@ -59,12 +87,53 @@ class RecordSignals(Signals[Vector]):
         Which of several records this is.
     begins_min : float
         When it begins after the start of the first, min.
+    warmth : Warmth
+        What the machine has at its start.
+    warmths : mapping of str to Warmth
+        The same by where the machine may be at rest, see `Hypothesis.rest`.
+    initial_um : numpy.ndarray, optional, shape (n,)
+        What the initial state of the paths adds to that, µm, where it is known.
     """
 
     period_min: float
     share_of_ambient: Vector = field(default_factory=lambda: np.zeros(1))
     number: int = 0
     begins_min: float = 0.0
+    warmth: Warmth = COLD
+    warmths: Mapping[str, Warmth] = field(default_factory=dict)
+    initial_um: Vector | None = None
+
+    @property
+    def begins_at_rest(self) -> bool:
+        """Whether nothing is known to be left from before the record."""
+        return self.warmth == COLD and self.initial_um is None
+
+    def begun(self, rest: str) -> RecordSignals:
+        """Return the record as it begins if the machine is at rest there."""
+        warmth = self.warmths.get(rest, COLD)
+        return self if warmth == self.warmth else dataclasses.replace(self, warmth=warmth)
+
+    def share_from_rest(self, path: str) -> Vector:
+        """Return the share of a path with what it had at the start.
+
+        Once the initial state has died away this is exact, because the paths are linear.
+        """
+        if path == "TDTF":
+            return self.share(path)
+        found = self.share(path) + self.warmth.y_dtf_um
+        return found if self.initial_um is None else found + self.initial_um
+
+    def source_from_rest(self, path: str) -> Vector:
+        """Return what drives a path with what it had at the start."""
+        return self.source(path) if path == "TDTF" else self.source(path) + self.warmth.drive
+
+    def held(self) -> RecordSignals:
+        """Return the record of a machine that stays as it was at the start."""
+        still = np.zeros(self.size)
+        channels = {name: np.full(self.size, values[0]) for name, values in self.channels.items()}
+        return dataclasses.replace(
+            self, drive=still, ambient_k=still, y_dtf_um=still, y_tdtf_um=still, channels=channels, initial_um=None
+        )
 
     @property
     def size(self) -> int:
