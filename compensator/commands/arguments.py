@@ -204,6 +204,7 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add("--validate", type=Path, action="append", default=[], metavar="DATA", help=words)
     _page(parser)
     _column(parser)
+    _axis(parser, "all that model and data have")
     _y_std(parser)
     add("--scheduler", metavar="ADDRESS", help=_SCHEDULER)
 

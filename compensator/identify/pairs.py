@@ -46,6 +46,11 @@ class Pair:
     ratio: float
     share: bool
 
+    @property
+    def both_ways(self) -> tuple[tuple[str, str], tuple[str, str]]:
+        """Each probe with the other one."""
+        return (self.first, self.second), (self.second, self.first)
+
     def __str__(self) -> str:
         way = "alike" if self.correlation > 0.0 else "against each other"
         beside = f", with any other probe by {self.others:.2f} at most" if self.others else ""
