@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from compensator.axes import label_of
 from compensator.report.page import Block, Page, Section, Tone, Words
 
 #: Tones from the best to the worst.
-_TONES: tuple[Tone | None, ...] = (None, "good", "warn", "bad")
+_TONES: tuple[Tone, ...] = ("good", "warn", "bad")
 
 
 def page_of_axes(pages: Mapping[str, Page], verdict: str = "", blocks: Sequence[Block] = ()) -> Page:
@@ -29,7 +29,7 @@ def page_of_axes(pages: Mapping[str, Page], verdict: str = "", blocks: Sequence[
         title=next(iter(pages.values())).title,
         verdict=verdict or verdicts,
         blocks=[*blocks, *(_section(axis, page, bool(verdict)) for axis, page in pages.items())],
-        tone=max((page.tone for page in pages.values()), key=_TONES.index),
+        tone=worst(page.tone or "good" for page in pages.values()),
         data=", ".join(data),
     )
 
@@ -37,3 +37,8 @@ def page_of_axes(pages: Mapping[str, Page], verdict: str = "", blocks: Sequence[
 def _section(axis: str, page: Page, says_verdict: bool) -> Section:
     own: list[Block] = [Words(title="Result", lines=[page.verdict])] if says_verdict else []
     return Section(title=f"Axis {label_of(axis)}", blocks=[*own, *page.blocks])
+
+
+def worst(tones: Iterable[Tone]) -> Tone:
+    """Return the worst of some tones."""
+    return max(tones, key=_TONES.index)

@@ -12,6 +12,7 @@ from compensator.display import Table, Words
 from compensator.errors import DataError
 from compensator.model.model_file import load_axes, load_model, parse_axes
 from compensator.model.model_writer import dump_axes, dump_model
+from compensator.report.results import pages_in
 from tests.identify.axes_data import machine
 
 
@@ -42,6 +43,8 @@ def test_one_command_makes_one_model_and_one_page_of_all_axes(folder):
     assert list(load_axes(folder / "machine.toml")) == ["x", "y", "z"]
     page = (folder / "machine-calibration.html").read_text(encoding="utf-8")
     assert "Axis X" in page and "Z, µm" in page and "common time constants" in page
+    [listed] = pages_in(folder)
+    assert listed.verdict.startswith("X: ") and " Z: " in listed.verdict
 
 
 def test_a_table_has_the_columns_of_all_axes_and_those_of_y_as_ever(folder, capsys):

@@ -15,6 +15,7 @@ from compensator.diagnose.evidence import evidence_of
 from compensator.model.effects.hypothesis import proposals
 from compensator.model.model_file import load_axes
 from compensator.model.model_writer import write_axes
+from compensator.report.results import pages_in
 from tests.cli.test_axes import write
 from tests.diagnose.axes_data import machine, models
 
@@ -91,3 +92,5 @@ def test_the_command_writes_the_axis_of_each_effect(tmp_path, capsys):
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "<h2>Axis Z" in page and "What each effect moves" in page
     assert list(load_axes(out / "model.toml")) == ["y", "z"]
+    [listed] = pages_in(out)
+    assert listed.verdict.startswith("coolant_degc (input) moves Z by −") and listed.tone == "good"
